@@ -1,0 +1,39 @@
+"""The simplest agent: one speed, never another lane."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+from crashhunt.space import Argument, Range
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+
+__all__ = ["KeepLaneWithSpeed"]
+
+
+class KeepLaneWithSpeed:
+    """Keeps its lane at a constant speed, whatever is in front of it.
+
+    Args:
+        speed: in m/s.
+        action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+    """
+
+    def __init__(
+        self,
+        speed: Annotated[float, Argument("speed", distribution=Range(5.0, 30.0), unit="m/s", help="held for ever")] = 15.0,
+        action_space: Space[Any] | None = None,
+    ) -> None:
+        self.speed = speed
+        self._discrete = getattr(action_space, "n", None) is not None
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Any) -> Any:
+        """Return (speed, 0), or the meta-action that brings the speed nearer."""
+        if not self._discrete:
+            return self.speed, 0
+        error = self.speed - float(observation[0, 3])
+        return 3 if error > 2.5 else 4 if error < -2.5 else 1

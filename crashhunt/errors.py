@@ -1,0 +1,115 @@
+"""Every error that crashhunt raises on purpose.
+
+::
+
+    CrashhuntError                 exit code 2 unless said otherwise
+    ├── UsageError                 a command line, call or setting that cannot be meant
+    │   └── ArgumentError          an argument specification or value
+    ├── ScenarioError              a scenario file: which file, which key, which value
+    ├── PluginError                a name or ``module:attribute`` that leads nowhere
+    ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
+    ├── BundleError                a crash bundle or log that is damaged or incomplete
+    ├── NoValidTrialError          exit code 3: not one trial could be set up
+    └── EpisodeError               raised inside an episode; becomes the trial's outcome
+        ├── InvalidEpisodeError    the episode could not be set up
+        ├── ActionError            the agent returned something outside its action space
+        └── SimulatorError         the simulator gave up
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "ActionError",
+    "ArgumentError",
+    "BundleError",
+    "CrashhuntError",
+    "EpisodeError",
+    "HuntDirectoryError",
+    "InvalidEpisodeError",
+    "NoValidTrialError",
+    "PluginError",
+    "ScenarioError",
+    "SimulatorError",
+    "UsageError",
+]
+
+
+class CrashhuntError(Exception):
+    """An error with the mistake, the fix, and where it is.
+
+    Args:
+        message: what is wrong, with the offending value.
+        fix: what to do about it, as an imperative.
+        where: the file, key or option that is meant.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, fix: str = "", where: str = "") -> None:
+        super().__init__(message, fix, where)
+        self.message = message
+        self.fix = fix
+        self.where = where
+
+    def __str__(self) -> str:
+        """Everything in one line: ``where: message; fix``."""
+        text = f"{self.where}: {self.message}" if self.where else self.message
+        return f"{text}; {self.fix}" if self.fix else text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep the three parts when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.message, self.fix, self.where)
+
+    def to_json(self) -> dict[str, dict[str, str]]:
+        """Return the shape that every command prints under ``--json``."""
+        return {"error": {"message": self.message, "fix": self.fix, "where": self.where}}
+
+
+def _rebuild(kind: type[CrashhuntError], message: str, fix: str, where: str) -> CrashhuntError:
+    return kind(message, fix=fix, where=where)
+
+
+class UsageError(CrashhuntError):
+    """A command line, call or setting that cannot be meant."""
+
+
+class ArgumentError(UsageError):
+    """An argument specification or value that cannot be used."""
+
+
+class ScenarioError(CrashhuntError):
+    """A scenario that cannot be used."""
+
+
+class PluginError(CrashhuntError):
+    """A name or ``module:attribute`` that leads nowhere."""
+
+
+class HuntDirectoryError(CrashhuntError):
+    """The directory of a hunt is busy, foreign, unwritable or full."""
+
+
+class BundleError(CrashhuntError):
+    """A crash bundle or log that is damaged or incomplete."""
+
+
+class NoValidTrialError(CrashhuntError):
+    """Not one trial could be set up."""
+
+    exit_code = 3
+
+
+class EpisodeError(CrashhuntError):
+    """Raised inside an episode; becomes the trial's outcome."""
+
+
+class InvalidEpisodeError(EpisodeError):
+    """The episode could not be set up."""
+
+
+class ActionError(EpisodeError):
+    """The agent returned something outside its action space."""
+
+
+class SimulatorError(EpisodeError):
+    """The simulator gave up."""

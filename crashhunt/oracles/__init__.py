@@ -1,0 +1,21 @@
+"""Oracles: whether a step is a crash, and how near to one it came."""
+
+from crashhunt.oracles._approach import ApproachMeter, approaches, closest_approach
+from crashhunt.oracles._crashes import OffRoad, Overlap, ReportedCollision
+from crashhunt.oracles._geometry import outlines_overlap, rectangle_gap, time_to_contact
+from crashhunt.oracles._protocol import Finding, Oracle, merge_findings
+
+__all__ = [
+    "ApproachMeter",
+    "approaches",
+    "closest_approach",
+    "Finding",
+    "merge_findings",
+    "OffRoad",
+    "Oracle",
+    "outlines_overlap",
+    "Overlap",
+    "rectangle_gap",
+    "ReportedCollision",
+    "time_to_contact",
+]

@@ -1,0 +1,53 @@
+"""The oracle protocol: whether a step is a crash."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from crashhunt.trial import Collision, Outcome
+
+if TYPE_CHECKING:
+    from crashhunt.scene import Scene
+
+__all__ = ["Finding", "Oracle", "merge_findings"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A traffic crash that an oracle saw.
+
+    Args:
+        outcome: ``collision`` or ``off_road``.
+        collision: the evidence.
+    """
+
+    outcome: Outcome
+    collision: Collision
+
+
+class Oracle(Protocol):
+    """Looks at scenes and says when one is a crash. It draws no random numbers and keeps no clock."""
+
+    name: str
+    """As it appears in ``seen_by``."""
+
+    def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
+        """Return the crashes of these controlled vehicles in this scene; usually none."""
+
+
+def merge_findings(findings: Sequence[Finding]) -> Finding | None:
+    """Return the first finding, credited to every oracle that saw the same; None where there is none."""
+    if not findings:
+        return None
+    first = findings[0]
+    parties = {first.collision.collider, first.collision.victim}
+    same = [other for other in findings if {other.collision.collider, other.collision.victim} == parties]
+    seen_by = tuple(sorted({name for other in same for name in other.collision.seen_by}))
+    hit = first.collision
+    merged = Collision(
+        hit.agent, hit.role, hit.collider, hit.victim, seen_by, hit.kind, hit.x, hit.y, hit.lane,
+        hit.collider_speed, hit.victim_speed,
+    )  # fmt: skip
+    return Finding(first.outcome, merged)

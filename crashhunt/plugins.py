@@ -1,0 +1,156 @@
+"""Names to objects: entry points of installed packages, and ``module:attribute`` everywhere."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import os
+import sys
+import types
+import typing
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashhunt.errors import ArgumentError, PluginError
+from crashhunt.space import Argument, Kind, kind_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+__all__ = ["Group", "Signature", "locate", "registered", "signature_of"]
+
+Group = Literal["agents", "executors", "oracles", "samplers", "simulators"]
+
+_KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
+
+
+def registered(group: Group) -> dict[str, EntryPoint]:
+    """Return the entry points of a group, by name; nothing is imported."""
+    return {point.name: point for point in sorted(entry_points(group=f"crashhunt.{group}"), key=lambda p: p.name)}
+
+
+def locate(group: Group, name: str) -> Any:
+    """Return what a registered name or a ``module:attribute`` stands for.
+
+    Modules are looked for in the current directory as well, as with ``python -m``.
+
+    Raises:
+        PluginError: there is no such thing, or importing it failed.
+    """
+    points = registered(group)
+    target = points[name].value if name in points else name
+    module_name, colon, attribute = target.partition(":")
+    if not colon or not module_name or not attribute:
+        close = difflib.get_close_matches(name, points, 1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise PluginError(
+            f"{name!r} is not a registered name of {group}",
+            fix=f"{hint}give one of {', '.join(points) or '(none)'}, or module:attribute",
+        )
+    if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
+        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise PluginError(
+            f"{name!r} cannot be imported: {type(error).__name__}: {error}",
+            fix="run from the folder that holds the module, install it, or mend the name",
+        ) from error
+    except Exception as error:
+        raise PluginError(
+            f"importing {name!r} raised {type(error).__name__}: {error}", fix="mend the module"
+        ) from error
+    found: Any = module
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
+            close = difflib.get_close_matches(part, public, 1)
+            raise PluginError(
+                f"{name!r}: {module_name} has no attribute {attribute!r}",
+                fix=f"did you mean {close[0]!r}?" if close else "mend the name",
+            )
+        found = getattr(found, part)
+    if not callable(found):
+        raise PluginError(f"{name!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """What a factory takes.
+
+    Args:
+        arguments: by name, in order.
+        open: whether it takes any other keyword as well (``**kwargs``).
+        spaces: which of ``observation_space`` and ``action_space`` it asks for.
+    """
+
+    arguments: dict[str, Argument]
+    open: bool
+    spaces: tuple[str, ...]
+
+    def check(self, names: Iterable[str], *, where: str) -> None:
+        """Refuse arguments that it does not take.
+
+        Raises:
+            ArgumentError: with the accepted ones.
+        """
+        for name in names:
+            if name not in self.arguments and not self.open:
+                close = difflib.get_close_matches(name, self.arguments, 1)
+                hint = f"did you mean {close[0]!r}? " if close else ""
+                accepted = ", ".join(self.arguments) or "no arguments"
+                raise ArgumentError(f"{where} takes no argument {name!r}", fix=f"{hint}it takes {accepted}")
+
+
+def signature_of(factory: Callable[..., Any]) -> Signature:
+    """Read the arguments of a factory off its signature.
+
+    A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
+    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle.
+    """
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError):
+        return Signature({}, open=True, spaces=())
+    target = factory.__init__ if isinstance(factory, type) else factory  # type: ignore[misc]
+    names = getattr(target, "__globals__", {})
+    arguments: dict[str, Argument] = {}
+    spaces: list[str] = []
+    is_open = False
+    for parameter in parameters:
+        if parameter.kind is parameter.VAR_KEYWORD:
+            is_open = True
+        elif parameter.kind in (parameter.VAR_POSITIONAL, parameter.POSITIONAL_ONLY):
+            continue
+        elif parameter.name in ("observation_space", "action_space"):
+            spaces.append(parameter.name)
+        else:
+            arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
+    return Signature(arguments, is_open, tuple(spaces))
+
+
+def _annotation(parameter: inspect.Parameter, names: dict[str, Any]) -> Any:
+    """The annotation as an object; None where it cannot be had, such as a name imported for type checkers only."""
+    if not isinstance(parameter.annotation, str):
+        return parameter.annotation
+    try:
+        return eval(parameter.annotation, names)
+    except Exception:  # noqa: BLE001 - an annotation may be any expression
+        return None
+
+
+def _argument(parameter: inspect.Parameter, hint: Any) -> Argument:
+    default = parameter.default if isinstance(parameter.default, bool | int | float | str) else None
+    declared = None
+    if typing.get_origin(hint) is typing.Annotated:
+        hint, *extras = typing.get_args(hint)
+        declared = next((extra for extra in extras if isinstance(extra, Argument)), None)
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        hint = next((part for part in typing.get_args(hint) if part in _KINDS), None)
+    kind = _KINDS.get(hint) or (kind_of(default) if default is not None else None)
+    if declared is None:
+        return Argument(parameter.name, kind, default)
+    return Argument(parameter.name, kind, default, declared.distribution, declared.unit, declared.help)

@@ -1,0 +1,273 @@
+"""The black box: compact binary records in a memory-mapped scratch file.
+
+Nothing is encoded while the episode runs, and the pages belong to the kernel, so that the records outlive a process
+that is killed in the middle of a step. Layout: a header of 64 bytes, then records, each of 8 bytes of head (tag, aux,
+length) and its payload, padded to 8 bytes. Everything is little-endian. Only what lies before the header's
+``committed`` offset counts. The header also says where the process was: which step, which phase, which agent.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import chain
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from crashhunt.errors import BundleError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.scene import Frame, Roster, Scene
+
+__all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
+
+_MAGIC = b"CRASHBB1"
+_HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
+_WHERE = struct.Struct("<QqiI")  # the last four of them
+_WHERE_OFFSET = _HEADER.size - _WHERE.size
+_FIRST = 64
+_HEAD = struct.Struct("<BxHI")
+_CHUNK = 1 << 20
+_MAPPED = 64 << 20
+
+
+class Tag(IntEnum):
+    """What a record holds."""
+
+    PROLOGUE = 1  # JSON: the agents with their array shapes, the step length
+    ACTORS = 2  # JSON: actors that were not seen before; each is numbered in order of appearance
+    ROSTER = 3  # uint32[]: the numbers of the actors present from here on
+    OBSERVATION = 4  # raw bytes of what the agent ``aux`` is shown
+    ACTION = 5  # raw bytes of what the agent ``aux`` answers
+    STEP = 6  # int64 step, float64 time, float64 reward of each agent, then the scene's data
+    LANES = 7  # text: the lane of each actor of the roster, one a line
+    EVENTS = 8  # JSON: what touched, who left the road
+
+
+class Phase(IntEnum):
+    """What the process was doing."""
+
+    SETUP = 0
+    ACT = 1
+    SIMULATE = 2
+    DONE = 3
+
+
+# Members of an enum are looked up and converted at every use; these are used in every step.
+_STEP, _OBSERVATION, _ACTION = int(Tag.STEP), int(Tag.OBSERVATION), int(Tag.ACTION)
+_ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
+
+
+class Record(NamedTuple):
+    """One record."""
+
+    tag: int
+    aux: int
+    payload: bytes
+
+    def encode(self) -> bytes:
+        """Return the bytes that stand for it in the black box; the trace digest runs over these."""
+        return _HEAD.pack(self.tag, self.aux, len(self.payload)) + self.payload + bytes(-len(self.payload) % 8)
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBoxHeader:
+    """Where a process was when it last wrote."""
+
+    pid: int
+    trial: int
+    started: float
+    committed: int
+    step: int
+    phase: Phase
+    agent: int
+
+
+class BlackBox:
+    """Writes the records of one trial after another into one scratch file, whose warm pages are used again.
+
+    Args:
+        path: the file to create.
+
+    Raises:
+        OSError: the disk is full, or the folder is not writable. Room is reserved before it is written to, so that
+            a full disk is an error here and not a signal later.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+        self._reserved = 0
+        self._mapped = 0
+        self._map: mmap.mmap
+        self._offset = _FIRST
+        self._step = 0
+        self._agents = 0
+        self._roster: object = None
+        self._steps: dict[int, struct.Struct] = {}
+        self._trail: list[tuple[Roster, int]] = []
+        try:
+            self._reserve(_FIRST)
+        except OSError:
+            os.close(self._file)
+            raise
+
+    def begin(self, *, pid: int, trial: int, started: float) -> None:
+        """Forget the previous trial and open the next."""
+        _HEADER.pack_into(self._map, 0, _MAGIC, pid, 0, trial, started, _FIRST, 0, Phase.SETUP, 0)
+        self._offset = _FIRST
+        self._step = 0
+        self._roster = None
+        self._trail.clear()
+
+    def prologue(self, payload: bytes, agents: int) -> None:
+        """Record what the trial consists of; ``agents`` is how many rewards each step has."""
+        self._agents = agents
+        self._steps = {}
+        self.append(Tag.PROLOGUE, 0, payload)
+
+    def append(self, tag: int, aux: int, payload: bytes) -> None:
+        """Record something rare."""
+        offset, length = self._offset, len(payload)
+        if offset + length + 16 > self._reserved:
+            self._reserve(offset + length + 16)
+        _HEAD.pack_into(self._map, offset, tag, aux, length)
+        start = offset + 8
+        self._map[start : start + length] = payload
+        self._finish(start + length)
+        self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
+
+    def observation(self, agent: int, array: NDArray[np.generic]) -> None:
+        """Record what an agent is about to be shown."""
+        self._raw(_OBSERVATION, agent, array, _ACT)
+
+    def action(self, agent: int, array: NDArray[np.generic]) -> None:
+        """Record what an agent answered."""
+        self._raw(_ACTION, agent, array, _SIMULATE)
+
+    def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
+        offset, length = self._offset, array.nbytes
+        if offset + length + 16 > self._reserved:
+            self._reserve(offset + length + 16)
+        mapped = self._map
+        _HEAD.pack_into(mapped, offset, tag, agent, length)
+        start = offset + 8
+        end = start + length
+        mapped[start:end] = array.tobytes()
+        if length & 7:
+            mapped[end : end + (-length & 7)] = bytes(-length & 7)
+            end += -length & 7
+        self._offset = end
+        _WHERE.pack_into(mapped, _WHERE_OFFSET, end, self._step, phase, agent)
+
+    def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Record that a step is complete; the scene's roster must have been recorded."""
+        offset, count = self._offset, len(scene.points)
+        packer = self._steps.get(count)
+        if packer is None:
+            packer = self._steps[count] = struct.Struct(f"<BxHIqd{self._agents + 4 * count}d")
+        if offset + packer.size > self._reserved:
+            self._reserve(offset + packer.size)
+        packer.pack_into(
+            self._map,
+            offset,
+            _STEP,
+            0,
+            packer.size - 8,
+            step,
+            scene.time_s,
+            *rewards,
+            *chain.from_iterable(scene.points),
+            *scene.headings,
+            *scene.speeds,
+        )
+        self._roster = scene.roster
+        self._trail.append((scene.roster, offset + packer.size - 32 * count))
+        self._offset = offset + packer.size
+        self._step = step
+        _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, step, _SIMULATE, 0)
+
+    def mark(self, phase: int, agent: int = 0) -> None:
+        """Say where the process is, and commit."""
+        _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, self._step, phase, agent)
+
+    def take_frames(self) -> list[Frame]:
+        """Return the scenes recorded since the last call, as bare columns."""
+        frames = [
+            (roster, np.frombuffer(self._map, "<f8", 4 * len(roster), offset).copy()) for roster, offset in self._trail
+        ]
+        self._trail.clear()
+        return frames
+
+    def committed(self) -> memoryview:
+        """The bytes of all records so far."""
+        return memoryview(self._map)[_FIRST : self._offset]
+
+    def close(self) -> None:
+        """Unmap and close the file."""
+        self._map.close()
+        os.close(self._file)
+
+    def _finish(self, end: int) -> None:
+        padded = end + (-end % 8)
+        if padded != end:
+            self._map[end:padded] = bytes(padded - end)
+        self._offset = padded
+
+    def _reserve(self, end: int) -> None:
+        while self._reserved < end:
+            written = os.pwrite(self._file, bytes(_CHUNK), self._reserved)
+            self._reserved += written
+        if self._reserved > self._mapped:
+            # The old mapping, where there is one, is unmapped when its last view is gone.
+            self._mapped = max(_MAPPED, 2 * self._reserved)
+            os.ftruncate(self._file, self._mapped)
+            self._map = mmap.mmap(self._file, self._mapped)
+
+
+def read_header(path: Path) -> BlackBoxHeader | None:
+    """Return the header of a black box, or None where there is none (yet)."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(_HEADER.size)
+    except OSError:
+        return None
+    if len(data) < _HEADER.size or not data.startswith(_MAGIC):
+        return None
+    _, pid, _, trial, started, committed, step, phase, agent = _HEADER.unpack(data)
+    return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent)
+
+
+def read_black_box(path: Path) -> Iterator[Record]:
+    """Yield all committed records of a black box.
+
+    Raises:
+        BundleError: the file is missing or not a black box.
+    """
+    header = read_header(path)
+    if header is None:
+        raise BundleError("no black box here", fix="the trial left no recording", where=str(path))
+    with path.open("rb") as file:
+        file.seek(_FIRST)
+        data = file.read(max(0, header.committed - _FIRST))
+    yield from decode_records(data)
+
+
+def decode_records(data: bytes | memoryview) -> Iterator[Record]:
+    """Yield the records in ``data``; an incomplete last one is left out."""
+    offset = 0
+    while offset + _HEAD.size <= len(data):
+        tag, aux, length = _HEAD.unpack_from(data, offset)
+        start = offset + _HEAD.size
+        if tag == 0 or start + length > len(data):
+            return
+        yield Record(tag, aux, bytes(data[start : start + length]))
+        offset = start + length + (-length % 8)

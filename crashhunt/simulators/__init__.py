@@ -1,0 +1,15 @@
+"""Simulators: the world that agents drive in. Nothing here imports libsumo; `crashhunt.simulators.sumo` does."""
+
+from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpaceAction, SpeedAndLaneChange
+from crashhunt.simulators._protocol import ActionForm, Observations, Simulator, StepResult
+
+__all__ = [
+    "ActionForm",
+    "META_ACTIONS",
+    "MetaAction",
+    "Observations",
+    "Simulator",
+    "SpaceAction",
+    "SpeedAndLaneChange",
+    "StepResult",
+]

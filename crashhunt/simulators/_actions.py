@@ -1,0 +1,81 @@
+"""How actions are written: continuous, highway-env's meta-actions, and whatever a Gymnasium space allows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.errors import ActionError
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange"]
+
+MAX_TARGET_SPEED = 100.0
+META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+"""In the order of highway-env's DiscreteMetaAction."""
+
+
+class SpeedAndLaneChange:
+    """``(target_speed, lane_change)``: m/s in [0, 100], and -1, 0 or 1 (1 is to the left); a tuple or an array."""
+
+    names = ("target_speed", "lane_change")
+
+    def __init__(self) -> None:
+        from gymnasium import spaces
+
+        speed = spaces.Box(0.0, MAX_TARGET_SPEED, (), np.float64)
+        self.space: Space[Any] = spaces.Tuple((speed, spaces.Discrete(3, start=-1)))
+
+    def encode(self, action: Any) -> NDArray[np.float64]:
+        """Return float64, shape (2,)."""
+        try:
+            speed, lane_change = action
+            # NaN fails both comparisons.
+            if 0.0 <= speed <= MAX_TARGET_SPEED and lane_change in (-1, 0, 1):
+                return np.array((speed, lane_change), np.float64)
+        except (TypeError, ValueError):
+            pass
+        raise ActionError(
+            f"the action {action!r} is not (target_speed, lane_change)",
+            fix=f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1",
+        )
+
+
+class SpaceAction:
+    """Anything inside a Box or Discrete space."""
+
+    names: tuple[str, ...] = ()
+
+    def __init__(self, space: Space[Any]) -> None:
+        self.space = space
+        self._dtype = space.dtype
+
+    def encode(self, action: Any) -> NDArray[np.generic]:
+        """Return an array of the space's type and shape."""
+        try:
+            array = np.asarray(action, dtype=self._dtype)
+            inside = self.space.contains(array) if self.space.shape else self.space.contains(array[()])
+        except (TypeError, ValueError):
+            inside = False
+        if not inside:
+            raise ActionError(f"the action {action!r} is not in {self.space}", fix="return one that is")
+        return array
+
+
+class MetaAction(SpaceAction):
+    """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER."""
+
+    names = ("meta_action",)
+
+    def __init__(self) -> None:
+        from gymnasium import spaces
+
+        super().__init__(spaces.Discrete(len(META_ACTIONS)))
+
+    def encode(self, action: Any) -> NDArray[np.generic]:
+        """Return int64, shape (1,)."""
+        return super().encode(np.reshape(action, ()) if isinstance(action, np.ndarray) else action).reshape(1)

@@ -1,0 +1,90 @@
+"""The simulator protocol: Gymnasium's vocabulary, keyed by agent as in PettingZoo's parallel API."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+
+    from crashhunt.scene import Scene
+
+__all__ = ["ActionForm", "Observations", "Simulator", "StepResult"]
+
+Observations = dict[str, NDArray[Any]]
+StepResult = tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+
+
+class ActionForm(Protocol):
+    """How the actions of one agent are written."""
+
+    @property
+    def space(self) -> Space[Any]:
+        """The Gymnasium space."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the elements of an encoded action are."""
+
+    def encode(self, action: Any) -> NDArray[np.generic]:
+        """Return the action as an array of fixed shape and type; an encoded action is encoded to itself.
+
+        Raises:
+            ActionError: it is not inside the space.
+        """
+
+
+class Simulator(Protocol):
+    """Runs one episode after another.
+
+    Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
+    bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
+    A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`.
+    """
+
+    agents: Sequence[str]
+    """The agents that act in the next step; those that have terminated are gone."""
+
+    observation_spaces: Mapping[str, Space[Any]]
+    """For every possible agent."""
+
+    actions: Mapping[str, ActionForm]
+    """For every possible agent."""
+
+    step_length_s: float
+    """Simulation time between two steps."""
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Begin an episode; return the first observation of every agent, and infos.
+
+        Args:
+            seed: of everything random.
+            options: ``{"arguments": {name: value}}``, the scenario arguments.
+
+        Raises:
+            InvalidEpisodeError: it cannot be set up.
+        """
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Advance one control step.
+
+        Args:
+            actions: of every agent in `agents`, as ``actions[agent].encode`` returned it.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of the agents that acted. An agent is
+            terminated when it has arrived or crashed; a simulator never truncates on its own account of time.
+
+        Raises:
+            SimulatorError: the simulator gave up.
+        """
+
+    def scene(self) -> Scene:
+        """Return the state of all actors after the last `reset` or `step`."""
+
+    def close(self) -> None:
+        """Let go of everything. May be called twice."""

@@ -1,0 +1,334 @@
+"""SUMO as a simulator, through libsumo. Import this in a worker only: libsumo is one simulation per process."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import libsumo
+import numpy as np
+
+# The package's own functions each wrap one of these in a Python call, which doubles the cost of a getter; a step reads
+# some two hundred values.
+from libsumo import _libsumo as sumo
+
+from crashhunt.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
+from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._sumo_files import StagedFiles
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.simulators._protocol import Observations, StepResult
+
+__all__ = ["SumoSimulator"]
+
+SIGHT_M = 150.0
+"""A scene has the vehicles that were within this distance of a controlled one when it last looked around. What is
+further away has no part in a crash, and a town has thousands of vehicles."""
+
+LOOK_AROUND_EVERY = 10
+"""Steps from one look around to the next, and whenever a vehicle enters or leaves. Also how often a scene says the
+lane of each vehicle: a string each is too dear for every step."""
+
+_SIGHT_SQUARED = SIGHT_M**2
+_RADIANS = math.pi / 180.0
+_TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
+_current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
+
+
+class SumoSimulator:
+    """Runs the episodes of a scenario on SUMO, one after another in one warm process.
+
+    Args:
+        scenario: what to run.
+        stage: a folder for the files of this process; it must exist.
+    """
+
+    def __init__(self, scenario: Scenario, stage: Path) -> None:
+        self.step_length_s = scenario.step_length_s
+        self._scenario = scenario
+        self._files = StagedFiles(scenario, stage)
+        self._kinematics = Kinematics(scenario.observation)
+        self.observation_names = self._kinematics.features
+        self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
+        self.actions: dict[str, SpeedAndLaneChange | MetaAction] = {
+            agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
+            for agent, setup in scenario.agents.items()
+        }
+        self.agents: list[str] = []
+        self._known: dict[str, Actor] = {}
+        self._edges: dict[str, tuple[int, float]] = {}
+        self._closed_lanes: dict[tuple[str, str], bool] = {}
+        self._lanes: list[Lane] | None = None
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
+        global _current  # noqa: PLW0603 - see there
+        arguments = (options or {}).get("arguments", {})
+        command = self._files.arguments(seed, arguments)
+        try:
+            if libsumo.isLoaded():
+                libsumo.load(command)
+            else:
+                libsumo.start(["sumo", *command])
+            _current = weakref.ref(self)
+            self._enter()
+        except _TRACI_ERRORS as error:
+            raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
+        self.agents = list(self._scenario.agents)
+        self._targets = {agent: -1 for agent in self.agents}
+        self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
+        self._steps = 0
+        self._touched: set[tuple[str, str]] = set()
+        self._ids: tuple[str, ...] = ()
+        self._known.clear()  # the same id may be another vehicle now
+        self._off_road: list[str] = []
+        self._look()
+        return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}, {}
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
+        self._off_road = []
+        try:
+            for agent, action in actions.items():
+                self._apply(agent, action)
+            libsumo.simulationStep()
+            self._steps += 1
+            self._look()
+            scene, present = self._scene, self._scene.roster.index
+            observations: Observations = {}
+            rewards: dict[str, float] = {}
+            terminations: dict[str, bool] = {}
+            for agent in actions:
+                row = present.get(agent)
+                observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
+                rewards[agent] = 0.0 if row is None else scene.speeds[row] * self.step_length_s
+                terminations[agent] = row is None
+        except _TRACI_ERRORS as error:
+            raise SimulatorError(f"SUMO gave up: {_one_line(error)}") from error
+        if scene.contacts or self._off_road:
+            hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}
+            terminations |= dict.fromkeys(hit.union(self._off_road).intersection(actions), True)
+        if True in terminations.values():
+            self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
+        return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
+
+    def scene(self) -> Scene:
+        """Return the state of the vehicles in sight."""
+        return self._scene
+
+    def lanes(self) -> list[Lane]:
+        """Return all lanes of the network, those inside junctions too."""
+        if self._lanes is None:
+            self._lanes = [
+                Lane(lane, sumo.lane_getWidth(lane), tuple(tuple(point) for point in sumo.lane_getShape(lane)))
+                for lane in sumo.lane_getIDList()
+            ]
+        return self._lanes
+
+    def close(self) -> None:
+        """End the simulation, unless another simulator of this process has begun one since."""
+        if _current is not None and _current() is self and libsumo.isLoaded():
+            libsumo.close()
+
+    def _enter(self) -> None:
+        """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road."""
+        setups = self._scenario.agents
+        begin = libsumo.simulation.getTime()
+        if self._scenario.warmup_s > 0:
+            libsumo.simulationStep(begin + self._scenario.warmup_s)
+        for agent, setup in setups.items():
+            if not setup.existing:
+                self._add(agent, setup)
+        waiting = set(setups) - set(sumo.vehicle_getIDList())
+        latest = max((setup.depart_s or 0.0 for setup in setups.values()), default=0.0)
+        deadline = max(libsumo.simulation.getTime(), latest) + self._scenario.insertion_timeout_s
+        while waiting:
+            if libsumo.simulation.getTime() >= deadline:
+                raise InvalidEpisodeError(
+                    f"the vehicle {min(waiting)!r} was not on the road {self._scenario.insertion_timeout_s:g} s after "
+                    "it should have entered",
+                    fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
+                )
+            libsumo.simulationStep()
+            waiting -= set(libsumo.simulation.getDepartedIDList())
+        gone = set(setups) - set(sumo.vehicle_getIDList())
+        if gone:
+            raise InvalidEpisodeError(
+                f"the vehicle {min(gone)!r} had left again before all controlled vehicles were on the road",
+                fix="let them enter closer together",
+            )
+        for agent, setup in setups.items():
+            sumo.vehicle_setSpeedMode(agent, setup.speed_mode)
+            sumo.vehicle_setLaneChangeMode(agent, 0)
+
+    def _add(self, agent: str, setup: AgentSetup) -> None:
+        route = setup.route
+        if not route:
+            edges = list(setup.edges)
+            if len(edges) == 2:
+                edges = list(libsumo.simulation.findRoute(edges[0], edges[1], setup.type).edges)
+                if not edges:
+                    raise InvalidEpisodeError(f"there is no way from {setup.edges[0]!r} to {setup.edges[1]!r}")
+            route = f"crashhunt.{agent}"
+            libsumo.route.add(route, edges)
+        depart = "now" if setup.depart_s is None else str(max(setup.depart_s, libsumo.simulation.getTime()))
+        libsumo.vehicle.add(
+            agent,
+            route,
+            setup.type,
+            depart=depart,
+            departLane=setup.depart_lane,
+            departPos=setup.depart_pos,
+            departSpeed=setup.depart_speed,
+        )
+
+    def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
+        setup = self._scenario.agents[agent]
+        if setup.action == "meta":
+            self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
+            return
+        speed, change = action.tolist()
+        sumo.vehicle_setSpeed(agent, speed)
+        if change and not self._change_lane(agent, int(change)):
+            self._off_road.append(agent)
+
+    def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
+        """As highway-env does it: FASTER and SLOWER step from the nearest of the target speeds."""
+        targets = setup.target_speeds
+        if self._targets[agent] < 0:
+            speed = sumo.vehicle_getSpeed(agent)
+            self._targets[agent] = min(range(len(targets)), key=lambda index: abs(targets[index] - speed))
+        shift = {"FASTER": 1, "SLOWER": -1}.get(action, 0)
+        self._targets[agent] = max(0, min(len(targets) - 1, self._targets[agent] + shift))
+        sumo.vehicle_setSpeed(agent, targets[self._targets[agent]])
+        change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
+        if change:
+            self._change_lane(agent, change)  # into nothing is ignored, as in highway-env
+
+    def _change_lane(self, agent: str, change: int) -> bool:
+        """Change to a neighbouring lane at once; False where there is none that the vehicle may use."""
+        edge = sumo.vehicle_getRoadID(agent)
+        if edge.startswith(":"):
+            return True  # inside a junction there is nothing to change to, and nothing to leave either
+        lanes, _ = self._edge(edge)
+        target = sumo.vehicle_getLaneIndex(agent) + change
+        if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
+            return False
+        sumo.vehicle_changeLane(agent, target, self.step_length_s)
+        return True
+
+    def _edge(self, edge: str) -> tuple[int, float]:
+        """The number of lanes of an edge, and the width of its first."""
+        found = self._edges.get(edge)
+        if found is None:
+            found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
+        return found
+
+    def _is_closed(self, lane: str, vehicle_class: str) -> bool:
+        found = self._closed_lanes.get((lane, vehicle_class))
+        if found is None:
+            allowed = sumo.lane_getAllowed(lane)
+            found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
+            self._closed_lanes[lane, vehicle_class] = found
+        return found
+
+    def _look(self) -> None:
+        """Read the state of the vehicles in sight."""
+        if (
+            self._steps % LOOK_AROUND_EVERY == 0
+            or sumo.simulation_getDepartedNumber()
+            or sumo.simulation_getArrivedNumber()
+            or sumo.simulation_getStartingTeleportNumber()
+            or sumo.simulation_getEndingTeleportNumber()
+        ):
+            self._look_around()
+        ids = self._ids
+        contacts = self._contacts()
+        lanes: tuple[str, ...] = ()
+        if self._steps % LOOK_AROUND_EVERY == 0 or contacts or self._off_road:
+            lanes = tuple(map(sumo.vehicle_getLaneID, ids))
+        self._scene = Scene(
+            sumo.simulation_getTime(),
+            self._roster,
+            list(map(sumo.vehicle_getPosition, ids)),
+            # SUMO's angles are in degrees, clockwise from north.
+            [(90.0 - angle) * _RADIANS for angle in map(sumo.vehicle_getAngle, ids)],
+            list(map(sumo.vehicle_getSpeed, ids)),
+            contacts,
+            tuple(self._off_road),
+            lanes,
+        )
+
+    def _look_around(self) -> None:
+        """Choose the vehicles in sight: those near a controlled one, and the controlled ones themselves."""
+        everybody = sumo.vehicle_getIDList()
+        points = list(map(sumo.vehicle_getPosition, everybody))
+        controlled = self._scenario.agents
+        seen: set[str] = set()
+        for eye in controlled:
+            if eye in everybody:
+                ex, ey = points[everybody.index(eye)]
+                seen.update(
+                    [
+                        vehicle
+                        for vehicle, (x, y) in zip(everybody, points, strict=True)
+                        if (x - ex) * (x - ex) + (y - ey) * (y - ey) < _SIGHT_SQUARED
+                    ]
+                )
+        ids = tuple([vehicle for vehicle in everybody if vehicle in seen])
+        if ids != self._ids:
+            self._ids = ids
+            self._roster = Roster(tuple(self._actor(vehicle) for vehicle in ids))
+
+    def _actor(self, vehicle: str) -> Actor:
+        found = self._known.get(vehicle)
+        if found is None:
+            length, width = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle)
+            found = self._known[vehicle] = Actor(vehicle, sumo.vehicle_getVehicleClass(vehicle), length, width)
+        return found
+
+    def _contacts(self) -> tuple[Contact, ...]:
+        """The collisions that began in this step; SUMO repeats one as long as it lasts."""
+        found = []
+        for collision in sumo.simulation_getCollisions():
+            pair = (collision.collider, collision.victim)
+            if pair not in self._touched:
+                self._touched.add(pair)
+                found.append(
+                    Contact(
+                        collision.collider,
+                        collision.victim,
+                        collision.type,
+                        collision.lane,
+                        collision.colliderSpeed,
+                        collision.victimSpeed,
+                    )
+                )
+        return tuple(found)
+
+    def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
+        edge = sumo.vehicle_getRoadID(agent)
+        lanes, width = self._edge(edge)
+        # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
+        from_left = (lanes - 1 - sumo.vehicle_getLaneIndex(agent)) * width - sumo.vehicle_getLateralLanePosition(agent)
+        return self._kinematics.observe(
+            self._scene,
+            row,
+            distance=sumo.vehicle_getDistance(agent) - self._start[agent],
+            from_left=from_left,
+            lateral_speed=-sumo.vehicle_getLateralSpeed(agent),
+            lanes=lanes,
+        )
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,209 @@
+"""What a trial is asked (`TrialSpec`) and what it answers (`TrialResult`): plain, frozen, small, expressible as JSON."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.space import Value
+
+__all__ = ["CRASHES", "ClosestApproach", "Collision", "Failure", "Outcome", "TrialResult", "TrialSpec"]
+
+
+class Outcome(StrEnum):
+    """How a trial ended."""
+
+    SURVIVED = "survived"
+    FINISHED = "finished"
+    COLLISION = "collision"
+    OFF_ROAD = "off_road"
+    AGENT_ERROR = "agent_error"
+    SIMULATOR_ERROR = "simulator_error"
+    PROCESS_DIED = "process_died"
+    HANG = "hang"
+    INVALID = "invalid"
+
+    @property
+    def is_traffic_crash(self) -> bool:
+        """Whether the vehicle did harm on the road."""
+        return self in (Outcome.COLLISION, Outcome.OFF_ROAD)
+
+    @property
+    def is_software_fault(self) -> bool:
+        """Whether a program failed, not the driving."""
+        return self in (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
+
+    @property
+    def category(self) -> str:
+        """What a report calls it: ``traffic crash``, ``software fault`` or ``no crash``."""
+        if self.is_traffic_crash:
+            return "traffic crash"
+        return "software fault" if self.is_software_fault else "no crash"
+
+
+CRASHES = tuple(outcome for outcome in Outcome if outcome.is_traffic_crash or outcome.is_software_fault)
+"""The outcomes that count as a crash unless ``--crash-on`` says otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSpec:
+    """Everything that determines one trial.
+
+    Args:
+        number: its place in the hunt, from 0.
+        seed: for the simulator, the agents and the global generators; 0 to 2**31 - 1.
+        arguments: agent id to argument name to value.
+        scenario_arguments: name to value.
+        max_steps: the bound on its length, in steps.
+    """
+
+    number: int
+    seed: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    max_steps: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dicts and numbers."""
+        return {
+            "number": self.number,
+            "seed": self.seed,
+            "arguments": {agent: dict(values) for agent, values in self.arguments.items()},
+            "scenario_arguments": dict(self.scenario_arguments),
+            "max_steps": self.max_steps,
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> TrialSpec:
+        """Rebuild what `to_json` returned."""
+        return cls(
+            data["number"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ClosestApproach:
+    """How near to a crash a trial came, each over all steps, controlled vehicles and other actors.
+
+    Args:
+        time_to_collision_s: the least, at constant velocities; infinite where no course ever crossed.
+        gap_m: the least distance between two outlines; 0 where they touched.
+        required_deceleration: the greatest needed to avoid a collision, in m/s².
+    """
+
+    time_to_collision_s: float = math.inf
+    gap_m: float = math.inf
+    required_deceleration: float = 0.0
+
+    def to_json(self) -> dict[str, float | None]:
+        """Return plain numbers; JSON has no infinity, so an approach that never happened is null."""
+        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, float | None]) -> ClosestApproach:
+        """Rebuild what `to_json` returned."""
+        return cls(**{name: math.inf if value is None else value for name, value in data.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Collision:
+    """Who hit whom, or who left the road.
+
+    Args:
+        agent: the controlled vehicle that it happened to.
+        role: its part: ``collider`` (it drove into the other), ``victim``, or ``alone``.
+        collider: the actor that drove into the other.
+        victim: the actor that was hit; empty where there was none.
+        seen_by: the oracles that saw it, in order of their names. Where one of the simulator's own
+            report and the overlap of outlines is missing, the two disagree.
+        kind: the simulator's word for it, such as ``collision`` or ``junction``.
+        x: of the controlled vehicle's front bumper, in m.
+        y: likewise.
+        lane: where the controlled vehicle was.
+        collider_speed: in m/s.
+        victim_speed: in m/s.
+    """
+
+    agent: str
+    role: str
+    collider: str
+    victim: str = ""
+    seen_by: tuple[str, ...] = ()
+    kind: str = ""
+    x: float = math.nan
+    y: float = math.nan
+    lane: str = ""
+    collider_speed: float = math.nan
+    victim_speed: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What a program did wrong.
+
+    Args:
+        kind: the exception's type, ``exit code``, ``signal`` or ``timeout``.
+        message: in one line.
+        traceback: of the exception, or the stack of the stuck thread.
+        agent: the agent in whose code it happened; empty where it was not an agent's.
+        exit_code: of a process that died; negative for a signal, as in `subprocess`.
+        last_output: what the process printed last.
+    """
+
+    kind: str
+    message: str
+    traceback: str = ""
+    agent: str = ""
+    exit_code: int | None = None
+    last_output: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult:
+    """What came of one trial.
+
+    Args:
+        spec: what was asked.
+        outcome: how it ended.
+        steps: how many steps were completed; for a crash, the step at which it happened.
+        sim_time_s: simulation time at the end, in s.
+        digest: BLAKE2b over everything recorded, in hexadecimal; equal digests mean runs equal to the bit.
+        closest: how near to a crash it came.
+        collision: the evidence of a traffic crash.
+        failure: the evidence of a software fault, or why the episode is invalid.
+        wall_s: how long it took, in s of wall time.
+        setup_s: the part of it before the first step.
+        worker: the process id.
+        kept: whether the worker left its scratch folder for the hunt to collect.
+    """
+
+    spec: TrialSpec
+    outcome: Outcome
+    steps: int = 0
+    sim_time_s: float = 0.0
+    digest: str = ""
+    closest: ClosestApproach = field(default_factory=ClosestApproach)
+    collision: Collision | None = None
+    failure: Failure | None = None
+    wall_s: float = 0.0
+    setup_s: float = 0.0
+    worker: int = 0
+    kept: bool = False
+
+    @property
+    def summary(self) -> str:
+        """The outcome in one line, for people."""
+        if self.collision is not None:
+            hit = self.collision
+            other = hit.victim if hit.role == "collider" else hit.collider
+            verb = {"collider": "drove into", "victim": "was hit by"}.get(hit.role, "left the road")
+            return f"{hit.agent} {verb}{f' {other}' if hit.role != 'alone' else ''} at step {self.steps}"
+        if self.failure is not None:
+            agent = f"{self.failure.agent}: " if self.failure.agent else ""
+            return f"{agent}{self.failure.kind}: {self.failure.message}"
+        return f"{self.outcome} after {self.steps} steps"
