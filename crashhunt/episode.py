@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 __all__ = ["run_episode", "seed_everything"]
 
 
-
 _MEASURE_EVERY = 256
 """Steps; how near to a crash it was is measured over many at a time, which costs a tenth of one at a time."""
 
@@ -99,6 +98,7 @@ def run_episode(
 
     Returns:
         The result. Whatever agent or simulator raise is in it; errors of the recorder (a full disk) are raised.
+
     """
     began = time.monotonic()
     seed_everything(spec.seed)
@@ -136,7 +136,12 @@ def seed_everything(seed: int) -> None:
 
 class _Run:
     def __init__(
-        self, spec: TrialSpec, simulator: Simulator, box: BlackBox, oracles: tuple[Oracle, ...], crash_on: frozenset[Outcome]
+        self,
+        spec: TrialSpec,
+        simulator: Simulator,
+        box: BlackBox,
+        oracles: tuple[Oracle, ...],
+        crash_on: frozenset[Outcome],
     ) -> None:
         self.spec = spec
         self.simulator = simulator
@@ -159,7 +164,7 @@ class _Run:
             self.observations, _ = self.simulator.reset(seed=self.spec.seed, options=options)
             self.names = self.scribe.begin(self.simulator)
             self.meter = ApproachMeter(self.names)
-            for number, agent in enumerate(self.names):  # noqa: B007 - named in the failure
+            for number, agent in enumerate(self.names):
                 agents[agent] = make_agent(agent, self.simulator, self.spec.arguments.get(agent, {}))
                 agents[agent].reset(_agent_seed(self.spec.seed, number))
             agent = ""
@@ -167,7 +172,7 @@ class _Run:
             self.scribe.scene(0, scene, (0.0,) * len(self.names))
         except (OSError, MemoryError):
             raise
-        except BaseException as error:  # noqa: BLE001 - an agent may raise anything, SystemExit too
+        except BaseException as error:
             return self._result(Outcome.INVALID, failure=_failure(error, agent))
         finding = self._check(scene)
         if finding is not None:
@@ -192,14 +197,14 @@ class _Run:
                 box.observation(number, observation)
                 try:
                     action = forms[number](agents[name].act(observation))
-                except BaseException as error:  # noqa: BLE001 - an agent may raise anything, SystemExit too
+                except BaseException as error:
                     return self._result(Outcome.AGENT_ERROR, failure=_failure(error, name))
                 box.action(number, action)
                 actions[name] = action
             try:
                 observations, rewards, terminations, truncations, _ = simulator.step(actions)
                 scene = simulator.scene()
-            except Exception as error:  # noqa: BLE001 - a third party's simulator may raise anything
+            except Exception as error:
                 return self._result(Outcome.SIMULATOR_ERROR, failure=_failure(error, ""))
             scribe.scene(step, scene, tuple([rewards.get(name, 0.0) for name in names]))
             self.step = step
@@ -252,5 +257,5 @@ def _failure(error: BaseException, agent: str) -> Failure:
 def _quietly(close: Callable[[], None]) -> None:
     try:
         close()
-    except Exception:  # noqa: BLE001 - the trial is over; the log says what happened
+    except Exception:
         traceback.print_exc()

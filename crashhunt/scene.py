@@ -26,6 +26,7 @@ class Actor:
         kind: the simulator's word for it, such as SUMO's vehicle class (``passenger``, ``truck``).
         length: in m.
         width: in m.
+
     """
 
     id: str
@@ -45,6 +46,7 @@ class Contact:
         lane: where.
         collider_speed: in m/s.
         victim_speed: in m/s.
+
     """
 
     collider: str
@@ -63,6 +65,7 @@ class Lane:
         id: the simulator's name of it.
         width: in m.
         shape: its centre line, as (x, y) pairs in m.
+
     """
 
     id: str
@@ -75,6 +78,7 @@ class Roster:
 
     Args:
         actors: all actors.
+
     """
 
     def __init__(self, actors: tuple[Actor, ...]) -> None:
@@ -120,6 +124,7 @@ class Scene:
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
         lanes: the lane of each actor, or empty where this step did not look.
+
     """
 
     __slots__ = ("_neighbors", "contacts", "headings", "lanes", "off_road", "points", "roster", "speeds", "time_s")

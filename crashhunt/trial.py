@@ -60,6 +60,7 @@ class TrialSpec:
         arguments: agent id to argument name to value.
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
+
     """
 
     number: int
@@ -94,6 +95,7 @@ class ClosestApproach:
         time_to_collision_s: the least, at constant velocities; infinite where no course ever crossed.
         gap_m: the least distance between two outlines; 0 where they touched.
         required_deceleration: the greatest needed to avoid a collision, in m/s².
+
     """
 
     time_to_collision_s: float = math.inf
@@ -127,6 +129,7 @@ class Collision:
         lane: where the controlled vehicle was.
         collider_speed: in m/s.
         victim_speed: in m/s.
+
     """
 
     agent: str
@@ -141,6 +144,12 @@ class Collision:
     collider_speed: float = math.nan
     victim_speed: float = math.nan
 
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Collision:
+        """Rebuild it from plain data, in which null stands for a number that nobody knows."""
+        values = {name: math.nan if value is None else value for name, value in data.items()}
+        return cls(**{**values, "seen_by": tuple(data["seen_by"])})
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
@@ -153,6 +162,7 @@ class Failure:
         agent: the agent in whose code it happened; empty where it was not an agent's.
         exit_code: of a process that died; negative for a signal, as in `subprocess`.
         last_output: what the process printed last.
+
     """
 
     kind: str
@@ -180,6 +190,7 @@ class TrialResult:
         setup_s: the part of it before the first step.
         worker: the process id.
         kept: whether the worker left its scratch folder for the hunt to collect.
+
     """
 
     spec: TrialSpec
@@ -195,6 +206,31 @@ class TrialResult:
     worker: int = 0
     kept: bool = False
 
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dicts, strings and numbers; what is not a finite number is null."""
+        data = {name: getattr(self, name) for name in _PLAIN}
+        return {
+            **data,
+            "outcome": str(self.outcome),
+            "spec": self.spec.to_json(),
+            "closest": self.closest.to_json(),
+            "collision": _finite(asdict(self.collision)) if self.collision else None,
+            "failure": asdict(self.failure) if self.failure else None,
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> TrialResult:
+        """Rebuild what `to_json` returned."""
+        hit, failure = data["collision"], data["failure"]
+        return cls(
+            spec=TrialSpec.from_json(data["spec"]),
+            outcome=Outcome(data["outcome"]),
+            closest=ClosestApproach.from_json(data["closest"]),
+            collision=Collision.from_json(hit) if hit else None,
+            failure=Failure(**failure) if failure else None,
+            **{name: data[name] for name in _PLAIN},
+        )
+
     @property
     def summary(self) -> str:
         """The outcome in one line, for people."""
@@ -207,3 +243,12 @@ class TrialResult:
             agent = f"{self.failure.agent}: " if self.failure.agent else ""
             return f"{agent}{self.failure.kind}: {self.failure.message}"
         return f"{self.outcome} after {self.steps} steps"
+
+
+_PLAIN = ("steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept")
+
+
+def _finite(data: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in data.items()
+    }

@@ -1,0 +1,170 @@
+"""A process of its own for every trial: slower than a pool, and nothing that ran before can matter."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.errors import CrashhuntError
+from crashhunt.executors._protocol import WorkerSettings
+from crashhunt.executors._remains import died, hung, where_it_is
+from crashhunt.executors._worker import Worker, worker_environment
+from crashhunt.trial import TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["FreshProcessExecutor"]
+
+_LOOK_EVERY_S = 0.01
+_LAST_WORDS_S = 0.2
+_START_UP_S = 60.0
+
+
+@dataclass(slots=True)
+class _Running:
+    spec: TrialSpec
+    process: subprocess.Popen[bytes]
+    answer: Path
+    began: float
+    asked_at: float | None = None
+    killed: bool = False
+
+
+class FreshProcessExecutor:
+    """Runs every trial in a fresh process, and with it the code that the settings name.
+
+    Args:
+        settings: of the hunt.
+        parallel: how many processes at a time.
+        recycle_after: not used; a process is never used twice.
+
+    """
+
+    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:  # noqa: ARG002
+        self._settings = settings
+        self._parallel = parallel
+        self._waiting: deque[TrialSpec] = deque()
+        self._running: dict[int, _Running] = {}
+
+    def submit(self, spec: TrialSpec) -> None:
+        """Queue a trial."""
+        self._waiting.append(spec)
+        self._start()
+
+    def completed(self, timeout_s: float) -> Iterator[TrialResult]:
+        """Yield the trials that have ended, waiting so long for a first one."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            found = [result for number in list(self._running) if (result := self._look(number)) is not None]
+            self._start()
+            yield from found
+            if found or time.monotonic() >= deadline:
+                return
+            time.sleep(_LOOK_EVERY_S)
+
+    def cancel(self, *, above: int = -1) -> None:
+        """Give up all trials whose number is greater than ``above``, at once."""
+        self._waiting = deque(spec for spec in self._waiting if spec.number <= above)
+        for number in [number for number in self._running if number > above]:
+            _kill(self._running.pop(number).process)
+
+    def close(self) -> None:
+        """Kill every process."""
+        self.cancel()
+
+    def _start(self) -> None:
+        while self._waiting and len(self._running) < self._parallel:
+            spec = self._waiting.popleft()
+            answer = self._settings.scratch / f"answer-{spec.number:06d}.json"
+            answer.unlink(missing_ok=True)
+            job = {"settings": self._settings.to_json(), "spec": spec.to_json(), "answer": str(answer)}
+            environment = {**os.environ, **worker_environment()}
+            if self._settings.code:
+                # Before anything is imported, so that crashhunt itself comes from there too, where it is there.
+                before = environment.get("PYTHONPATH")
+                environment["PYTHONPATH"] = os.pathsep.join(filter(None, (self._settings.code, before)))
+            with (self._settings.scratch / f"start-{spec.number:06d}.log").open("wb") as log:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "crashhunt.executors._fresh"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=log,
+                    env=environment,
+                    start_new_session=True,
+                )
+            assert process.stdin is not None
+            with suppress(BrokenPipeError):
+                process.stdin.write(json.dumps(job).encode())
+                process.stdin.close()
+            self._running[spec.number] = _Running(spec, process, answer, time.monotonic())
+
+    def _look(self, number: int) -> TrialResult | None:
+        running = self._running[number]
+        exit_code, now = running.process.poll(), time.monotonic()
+        if exit_code is not None:
+            del self._running[number]
+            return self._result(running, exit_code)
+        header = where_it_is(self._settings.scratch, number)
+        limit = self._settings.timeout_s
+        late = now - header.started > limit if header else now - running.began > limit + _START_UP_S
+        if late and running.asked_at is None:
+            running.asked_at = now
+            running.process.send_signal(signal.SIGUSR1 if header else signal.SIGKILL)
+        elif running.asked_at is not None and now - running.asked_at > _LAST_WORDS_S:
+            running.killed = True
+            _kill(running.process)
+        return None
+
+    def _result(self, running: _Running, exit_code: int) -> TrialResult:
+        scratch, spec = self._settings.scratch, running.spec
+        if running.killed:
+            return hung(spec, scratch, self._settings.timeout_s)
+        try:
+            answer = json.loads(running.answer.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            if exit_code > 0 and where_it_is(scratch, spec.number) is None:
+                log = scratch / f"start-{spec.number:06d}.log"
+                lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+                raise CrashhuntError(
+                    f"the process of trial {spec.number} could not start: {lines[-1] if lines else exit_code}",
+                    fix="read the whole message there",
+                    where=str(log),
+                ) from None
+            return died(spec, scratch, exit_code)
+        if "error" in answer:
+            raise CrashhuntError(answer["error"], fix="free some space and run the same command again")
+        return TrialResult.from_json(answer["result"])
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def main() -> None:
+    """Run the one trial that standard input describes."""
+    job = json.load(sys.stdin)
+    settings = WorkerSettings.from_json(job["settings"])
+    try:
+        answer = {"result": Worker(settings).run(TrialSpec.from_json(job["spec"])).to_json()}
+    except OSError as error:
+        answer = {"error": f"the trial could not be recorded: {error}"}
+    temporary = f"{job['answer']}.part"
+    with open(temporary, "w", encoding="utf-8") as file:
+        json.dump(answer, file)
+    os.replace(temporary, job["answer"])  # noqa: PTH105 - one rename
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""The executor protocol: where trials run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import TrialResult, TrialSpec
+
+__all__ = ["Executor", "WorkerSettings", "scratch_of"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerSettings:
+    """Everything that a worker needs to run the trials of one hunt. It crosses process boundaries.
+
+    Args:
+        scenario: where the trials take place.
+        oracles: names of registered oracles, or ``module:attribute``.
+        crash_on: the outcomes that end a trial as a crash.
+        scratch: the folder in which workers keep black boxes and output while trials run.
+        code: a folder whose modules win over installed ones: the snapshot. Empty for none.
+        timeout_s: wall-clock limit of a trial, in s.
+        keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
+
+    """
+
+    scenario: Scenario
+    oracles: tuple[str, ...]
+    crash_on: tuple[Outcome, ...]
+    scratch: Path
+    code: str = ""
+    timeout_s: float = 60.0
+    keep_trials: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dicts, strings and numbers."""
+        data = asdict(self)
+        data["scenario"]["folder"] = str(self.scenario.folder)
+        return {**data, "scratch": str(self.scratch), "crash_on": [str(outcome) for outcome in self.crash_on]}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
+        """Rebuild what `to_json` returned."""
+        from crashhunt.scenario import scenario_from_dict
+
+        scenario = dict(data["scenario"])
+        folder = Path(scenario.pop("folder"))
+        notes = tuple(scenario.pop("notes", ()))
+        return cls(
+            scenario=scenario_from_dict({**scenario, "notes": notes}, where="worker settings", folder=folder),
+            oracles=tuple(data["oracles"]),
+            crash_on=tuple(Outcome(name) for name in data["crash_on"]),
+            scratch=Path(data["scratch"]),
+            code=data["code"],
+            timeout_s=data["timeout_s"],
+            keep_trials=data["keep_trials"],
+        )
+
+
+class Executor(Protocol):
+    """Runs trials somewhere else.
+
+    Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
+    that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted.
+    """
+
+    def submit(self, spec: TrialSpec) -> None:
+        """Queue a trial."""
+
+    def completed(self, timeout_s: float) -> Iterator[TrialResult]:
+        """Yield the trials that have ended since the last call, waiting so long for a first one."""
+
+    def cancel(self, *, above: int = -1) -> None:
+        """Give up all trials whose number is greater than ``above``, running or not, at once."""
+
+    def close(self) -> None:
+        """Stop every process, whatever it is doing. May be called twice."""
+
+
+def scratch_of(scratch: Path, number: int) -> Path:
+    """Return the folder that a running trial writes to, and that stays if it is kept."""
+    return scratch / f"trial-{number:06d}"

@@ -1,0 +1,203 @@
+"""What runs in a worker process: one simulator, kept warm, and one trial after another."""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import gc
+import io
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.episode import run_episode
+from crashhunt.executors._protocol import WorkerSettings, scratch_of
+from crashhunt.plugins import locate, signature_of
+from crashhunt.recording import BlackBox
+from crashhunt.scene import Lane
+from crashhunt.trial import TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from crashhunt.agents import Agent
+    from crashhunt.oracles import Oracle
+    from crashhunt.simulators import Simulator
+
+__all__ = ["BLACK_BOX", "MAP", "OUTPUT", "STACK", "Worker", "read_map", "worker_environment"]
+
+BLACK_BOX, OUTPUT, STACK, MAP = "blackbox.bin", "run.log", "stack.txt", "map.json"
+_PR_SET_PDEATHSIG = 1
+
+
+def worker_environment() -> dict[str, str]:
+    """Return the environment variables that make a worker's results depend on its trial alone.
+
+    Hashes of strings are fixed, and every library that would start a thread a core keeps to one: with a worker on
+    every core, more would only get in each other's way, and sums in parallel are not reproducible to the bit.
+    """
+    names = (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    )
+    return {"PYTHONHASHSEED": "0", **dict.fromkeys(names, "1")}
+
+
+class Worker:
+    """Runs the trials of one hunt in this process, and takes the process over: its output, its signals.
+
+    Args:
+        settings: of the hunt.
+
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._settings = settings
+        self._simulator: Simulator | None = None
+        self._factories: dict[str, Any] = {}
+        self._box: BlackBox | None = None
+        self._folder: Path | None = None
+        self._fresh = 0
+        _die_with_parent()
+        # Ctrl-C reaches the whole terminal; the hunt decides what becomes of its workers. A request to end must work
+        # even while the simulator does not return to Python.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if settings.code:
+            sys.path.insert(0, settings.code)
+        # Line by line, so that what a dying process printed last is in the file.
+        sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
+        sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
+        self._oracles: list[Oracle] = [locate("oracles", name)() for name in settings.oracles]
+        gc.freeze()  # what is loaded by now is never garbage
+
+    def run(self, spec: TrialSpec) -> TrialResult:
+        """Run a trial. Its scratch folder stays where the result says ``kept``.
+
+        Raises:
+            OSError: the disk is full.
+
+        """
+        box, folder = self._prepare(spec)
+        began = time.monotonic()
+        simulator = self._simulator
+        if simulator is None:
+            stage = self._settings.scratch / f"stage-{os.getpid()}"
+            stage.mkdir(exist_ok=True)
+            factory = locate("simulators", self._settings.scenario.simulator)
+            simulator = self._simulator = factory(self._settings.scenario, stage)
+        result = run_episode(
+            spec,
+            simulator=simulator,
+            make_agent=self._make_agent,
+            box=box,
+            oracles=self._oracles,
+            crash_on=self._settings.crash_on,
+        )
+        self._draw_map(simulator)
+        kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
+        result = replace(result, worker=os.getpid(), kept=kept, wall_s=time.monotonic() - began)
+        if kept:
+            # The next trial gets a folder of its own; this one now belongs to the hunt.
+            self._folder = None
+            if result.failure is not None and result.failure.traceback:
+                (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
+        return result
+
+    def _draw_map(self, simulator: Simulator) -> None:
+        """Write the map down, once for all workers, so that whoever keeps a trial can show it."""
+        path = self._settings.scratch / MAP
+        lanes = getattr(simulator, "lanes", None)
+        if lanes is None or path.exists():
+            return
+        temporary = path.with_suffix(f".{os.getpid()}")
+        temporary.write_text(json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes()]), encoding="utf-8")
+        temporary.replace(path)
+
+    def _prepare(self, spec: TrialSpec) -> tuple[BlackBox, Path]:
+        """Give the trial its scratch folder: that of the last one, whose pages are warm, or a new one."""
+        folder = scratch_of(self._settings.scratch, spec.number)
+        if folder.exists():
+            _clear(folder)  # of an earlier attempt at the same trial
+        if self._folder is None:
+            self._fresh += 1
+            made = self._settings.scratch / f"new-{os.getpid()}-{self._fresh}"
+            made.mkdir()
+            if self._box is not None:
+                self._box.close()
+            self._box = BlackBox(made / BLACK_BOX)
+            output = os.open(made / OUTPUT, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            os.dup2(output, 1)
+            os.dup2(output, 2)
+            os.close(output)
+            self._stack = (made / STACK).open("w")
+            faulthandler.enable(self._stack)
+            faulthandler.register(signal.SIGUSR1, self._stack)
+            self._folder = made
+        assert self._box is not None
+        self._box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
+        os.ftruncate(1, 0)
+        os.rename(self._folder, folder)  # noqa: PTH104 - Path.rename builds a path for nothing
+        self._folder = folder
+        return self._box, folder
+
+    def _make_agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+        found = self._factories.get(agent)
+        if found is None:
+            factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            found = self._factories[agent] = factory, signature_of(factory).spaces
+        factory, wanted = found
+        spaces: dict[str, Any] = {}
+        if "observation_space" in wanted:
+            spaces["observation_space"] = simulator.observation_spaces[agent]
+        if "action_space" in wanted:
+            spaces["action_space"] = simulator.actions[agent].space
+        made: Agent = factory(**arguments, **spaces)
+        return made
+
+
+def read_map(scratch: Path) -> list[Lane]:
+    """Return the map that the workers of a hunt have written down; nothing where none has."""
+    try:
+        data = json.loads((scratch / MAP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+
+
+def _die_with_parent() -> None:
+    """Have the kernel end this process when its parent is gone, whatever it is doing; where that can be had."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _clear(folder: Path) -> None:
+    import shutil
+
+    shutil.rmtree(folder)
+
+
+# A pool's task is a function, and what the process keeps warm has to live somewhere between two of them.
+_worker: Worker | None = None
+
+
+def start_worker(settings: WorkerSettings) -> None:
+    """Make this process a worker; a pool's initializer."""
+    global _worker
+    _worker = Worker(settings)
+
+
+def run_trial(spec: TrialSpec) -> TrialResult:
+    """Run a trial in the worker that this process is; a pool's task."""
+    assert _worker is not None
+    return _worker.run(spec)

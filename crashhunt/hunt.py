@@ -1,0 +1,449 @@
+"""The hunt: samples trials, runs them in parallel, stops at the first crash, and saves it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from crashhunt.bundle import Bundle, list_bundles, write_bundle, write_trial
+from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_of
+from crashhunt.ledger import Ledger
+from crashhunt.plan import with_settings
+from crashhunt.plugins import locate
+from crashhunt.replay import confirm
+from crashhunt.settings import HuntSettings, read_settings, write_settings
+from crashhunt.snapshot import Snapshot, take_snapshot
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.recording import BlackBoxHeader
+    from crashhunt.samplers import Sampler
+    from crashhunt.scenario import Scenario
+
+__all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause", "spec_of"]
+
+StoppedBecause = Literal["crash", "all_trials", "interrupted", "no_valid_trial"]
+
+_TICK_S = 0.1
+_HEARTBEAT_S = 1.0
+_INVALID_BEFORE_GIVING_UP = 10
+_QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
+
+
+@dataclass(frozen=True, slots=True)
+class HuntStatus:
+    """How a hunt is going, for people who watch.
+
+    Args:
+        phase: ``hunting``, ``saving``, ``confirming`` or ``done``.
+        planned: trials in all.
+        done: trials that have ended, in earlier runs of the hunt too.
+        outcomes: how they ended.
+        rate_per_s: trials a second in this run.
+        elapsed_s: wall time of this run.
+        nearest: the trial that came nearest to a crash without one.
+        workers: trial number to where it is.
+        crashes: saved so far.
+
+    """
+
+    phase: str
+    planned: int
+    done: int
+    outcomes: dict[str, int]
+    rate_per_s: float
+    elapsed_s: float
+    nearest: TrialResult | None
+    workers: dict[int, BlackBoxHeader]
+    crashes: int
+
+
+@dataclass(frozen=True, slots=True)
+class HuntReport:
+    """What came of a hunt.
+
+    Args:
+        directory: of the hunt.
+        settings: what was asked.
+        stopped_because: why it ended.
+        outcomes: how the trials ended.
+        steps_total: steps of all trials.
+        wall_s: wall time of this run.
+        crashes: what was found, the one with the fewest steps first.
+        reason: in words, where not one trial was valid.
+
+    """
+
+    directory: Path
+    settings: HuntSettings
+    stopped_because: StoppedBecause
+    outcomes: dict[str, int]
+    steps_total: int
+    wall_s: float
+    crashes: tuple[Bundle, ...]
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "dir": str(self.directory),
+            "hunt_seed": self.settings.seed,
+            "trials_planned": self.settings.trials,
+            "trials_run": sum(self.outcomes.values()),
+            "outcomes": self.outcomes,
+            "stopped_because": self.stopped_because,
+            "wall_s": round(self.wall_s, 3),
+            "steps_total": self.steps_total,
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+def spec_of(number: int, settings: HuntSettings, sampler: Sampler) -> TrialSpec:
+    """Return a trial of a hunt; it depends on the hunt's seed and on the number only."""
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
+    seed = int(rng.integers(2**31))
+    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
+    scenario_arguments: dict[str, Any] = {}
+    for (agent, name), value in sorted(sampler.ask(number, rng).items()):
+        (arguments[agent] if agent else scenario_arguments)[name] = value
+    return TrialSpec(number, seed, arguments, scenario_arguments, max_steps=settings.max_steps)
+
+
+@dataclass(slots=True)
+class _Progress:
+    """What this run of the hunt has seen."""
+
+    began: float = field(default_factory=time.monotonic)
+    ended_here: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    steps_total: int = 0
+    crashes: list[Bundle] = field(default_factory=list)
+    found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
+    nearest: TrialResult | None = None
+    last_invalid: TrialResult | None = None
+
+
+class Hunt:
+    """One hunt in one directory.
+
+    The same hunt on the same directory goes on where it was; with settings that make other trials it refuses.
+
+    Args:
+        directory: made where it does not exist.
+        scenario: where the trials take place.
+        settings: what was asked.
+        command: the command line, as a comment in ``hunt.toml``.
+        overwrite: begin anew, whatever is there.
+        seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
+
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        scenario: Scenario,
+        settings: HuntSettings,
+        *,
+        command: list[str] | None = None,
+        overwrite: bool = False,
+        seed_given: bool = True,
+    ) -> None:
+        self.directory = directory
+        self.scenario = scenario
+        self.settings = settings
+        self._command = command or ["crashhunt", "run", str(directory)]
+        self._overwrite = overwrite
+        self._seed_given = seed_given
+        self._interrupted = False
+
+    def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
+        """Hunt until a crash, the last trial or an interrupt.
+
+        Args:
+            watch: called about ten times a second.
+
+        Raises:
+            HuntDirectoryError: the directory is busy, foreign, unwritable or full.
+            CrashhuntError: the machinery failed.
+
+        """
+        with self._locked(), self._signals():
+            self._open()
+            ledger = Ledger(self.directory / "ledger.sqlite", writable=True)
+            try:
+                return self._run(ledger, watch or (lambda _: None))
+            except OSError as error:
+                raise HuntDirectoryError(
+                    f"{error.strerror or error}",
+                    fix="free some space or make the folder writable, and run the same command again",
+                    where=str(error.filename or self.directory),
+                ) from error
+            finally:
+                with suppress(CrashhuntError):
+                    ledger.note(pid=None, heartbeat=time.time())
+                ledger.close()
+                shutil.rmtree(self._scratch, ignore_errors=True)
+
+    @property
+    def _scratch(self) -> Path:
+        return self.directory / ".scratch"
+
+    def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
+        settings = self.settings
+        snapshot = take_snapshot(self.directory / "snapshots", self.scenario)
+        sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
+        progress = _Progress()
+        finished = ledger.finished()
+        progress.outcomes.update(ledger.outcomes())
+        progress.nearest = ledger.nearest_miss()
+        progress.crashes = list_bundles(self.directory)
+        ledger.note(state="running", pid=os.getpid(), heartbeat=time.time(), planned=settings.trials)
+        stopped: StoppedBecause | None = None
+        if progress.crashes and not settings.run.keep_going:
+            stopped = "crash"
+        if stopped is None:
+            stopped = self._hunt(ledger, sampler, snapshot, progress, finished, watch)
+        watch(self._status(progress, "confirming"))
+        self._confirm(progress, snapshot)
+        ledger.note(state=stopped, heartbeat=time.time())
+        watch(self._status(progress, "done"))
+        reason = progress.last_invalid.summary if stopped == "no_valid_trial" and progress.last_invalid else ""
+        crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+        return HuntReport(
+            self.directory,
+            settings,
+            stopped,
+            ledger.outcomes(),
+            ledger.steps_total(),
+            time.monotonic() - progress.began,
+            tuple(crashes),
+            reason,
+        )
+
+    def _hunt(
+        self,
+        ledger: Ledger,
+        sampler: Sampler,
+        snapshot: Snapshot,
+        progress: _Progress,
+        finished: set[int],
+        watch: Callable[[HuntStatus], None],
+    ) -> StoppedBecause:
+        settings, run = self.settings, self.settings.run
+        # The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
+        worker_settings = WorkerSettings(
+            scenario=with_settings(snapshot.scenario(), settings),
+            oracles=settings.oracles,
+            crash_on=settings.crash_on,
+            scratch=self._scratch,
+            code=str(snapshot.code.resolve()),
+            timeout_s=run.timeout_s,
+            keep_trials=run.keep_trials,
+        )
+        waiting = iter(number for number in range(settings.trials) if number not in finished)
+        executor = PoolExecutor(worker_settings, parallel=run.parallel, recycle_after=run.recycle_after)
+        in_flight: set[int] = set()
+        heartbeat = 0.0
+        try:
+            while True:
+                stopping = bool(progress.found)
+                while not stopping and len(in_flight) < run.parallel * (1 + _QUEUED_PER_WORKER):
+                    number = next(waiting, None)
+                    if number is None:
+                        break
+                    executor.submit(spec_of(number, settings, sampler))
+                    in_flight.add(number)
+                if not in_flight:
+                    break
+                for result in executor.completed(_TICK_S):
+                    in_flight.discard(result.spec.number)
+                    self._take(result, ledger, snapshot, sampler, progress)
+                    if result.outcome in settings.crash_on and not run.keep_going:
+                        above = min(progress.found) if run.deterministic else -1
+                        executor.cancel(above=above)
+                        in_flight = {number for number in in_flight if number <= above}
+                        if not run.deterministic:
+                            break
+                if self._interrupted:
+                    break
+                if self._hopeless(progress, finished):
+                    return "no_valid_trial"
+                if time.monotonic() - heartbeat > _HEARTBEAT_S:
+                    heartbeat = time.monotonic()
+                    ledger.note(heartbeat=time.time())
+                watch(self._status(progress, "hunting", executor.where()))
+            executor.cancel()
+            if progress.found:
+                watch(self._status(progress, "saving"))
+                lowest = min(progress.found)
+                self._save(progress.found[lowest], ledger, snapshot, progress)
+                return "crash"
+        finally:
+            executor.close()
+        if self._interrupted:
+            return "interrupted"
+        if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
+            return "no_valid_trial"
+        return "all_trials"
+
+    def _take(
+        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: _Progress
+    ) -> None:
+        """Account for a trial that has ended."""
+        settings = self.settings
+        sampler.tell(result)
+        progress.ended_here += 1
+        progress.outcomes[str(result.outcome)] += 1
+        if result.outcome in settings.crash_on:
+            if settings.run.keep_going:
+                self._save(result, ledger, snapshot, progress)
+            else:
+                progress.found[result.spec.number] = result
+            return
+        if result.outcome is Outcome.INVALID:
+            progress.last_invalid = result
+        elif result.collision is None and result.failure is None:
+            nearest = progress.nearest
+            if nearest is None or result.closest.time_to_collision_s < nearest.closest.time_to_collision_s:
+                progress.nearest = result
+        if result.kept:
+            write_trial(self.directory, result, scratch_of(self._scratch, result.spec.number))
+        ledger.record(result, snapshot=snapshot.digest)
+
+    def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: _Progress) -> None:
+        """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
+        bundle = write_bundle(
+            self.directory,
+            result,
+            scratch_of(self._scratch, result.spec.number),
+            hunt_seed=self.settings.seed,
+            snapshot=snapshot.digest,
+            lanes=read_map(self._scratch),
+        )
+        progress.crashes.append(bundle)
+        ledger.record(result, snapshot=snapshot.digest)
+
+    def _confirm(self, progress: _Progress, snapshot: Snapshot) -> None:
+        """Run every crash that nobody has confirmed yet once more, in a fresh process."""
+        for place, bundle in enumerate(progress.crashes):
+            if bundle.confirmed is None and not self._interrupted:
+                confirmed = confirm(bundle, Snapshot(snapshot.path.parent / bundle.snapshot), self.settings)
+                confirmed.write()
+                progress.crashes[place] = confirmed
+
+    def _hopeless(self, progress: _Progress, finished: set[int]) -> bool:
+        enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
+        invalid = progress.outcomes[str(Outcome.INVALID)]
+        return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
+
+    def _status(self, progress: _Progress, phase: str, workers: dict[int, BlackBoxHeader] | None = None) -> HuntStatus:
+        elapsed = time.monotonic() - progress.began
+        return HuntStatus(
+            phase,
+            self.settings.trials,
+            sum(progress.outcomes.values()),
+            dict(progress.outcomes),
+            progress.ended_here / elapsed if elapsed > 0 else 0.0,
+            elapsed,
+            progress.nearest,
+            workers or {},
+            len(progress.crashes) + (1 if progress.found else 0),
+        )
+
+    def _open(self) -> None:
+        """Make the directory this hunt's, or see that it is already."""
+        path = self.directory / "hunt.toml"
+        if self._overwrite:
+            for name in ("hunt.toml", "ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm"):
+                (self.directory / name).unlink(missing_ok=True)
+            for name in ("snapshots", "crashes", "trials"):
+                shutil.rmtree(self.directory / name, ignore_errors=True)
+        if path.exists():
+            before = read_settings(path)
+            if not self._seed_given:
+                self.settings = replace(self.settings, seed=before.seed)
+            differences = before.differences(self.settings)
+            if differences:
+                raise HuntDirectoryError(
+                    f"another hunt is there: {'; '.join(differences)}",
+                    fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
+                    where=str(self.directory),
+                )
+        elif self._foreign():
+            raise HuntDirectoryError(
+                f"the folder is not empty and not a hunt: it has {self._foreign()[0]!r}",
+                fix="give an empty or a new folder",
+                where=str(self.directory),
+            )
+        shutil.rmtree(self._scratch, ignore_errors=True)
+        try:
+            self._scratch.mkdir()
+            write_settings(path, self.settings, self._command)
+        except OSError as error:
+            raise self._unusable(error) from error
+
+    def _foreign(self) -> list[str]:
+        return sorted(path.name for path in self.directory.iterdir() if path.name not in (".lock", ".scratch"))
+
+    def _unusable(self, error: OSError) -> HuntDirectoryError:
+        return HuntDirectoryError(
+            f"the directory cannot be used: {error.strerror}",
+            fix="choose one below a folder that exists and is writable",
+            where=str(error.filename or self.directory),
+        )
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep other hunts out, by a lock that dies with this process."""
+        try:
+            self.directory.mkdir(exist_ok=True)
+            lock = (self.directory / ".lock").open("a+")
+        except OSError as error:
+            raise self._unusable(error) from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.seek(0)
+                raise HuntDirectoryError(
+                    f"another hunt is running there (process {lock.read().strip() or '?'})",
+                    fix="wait for it, stop it, or choose another directory",
+                    where=str(self.directory),
+                ) from None
+            lock.truncate(0)
+            lock.write(str(os.getpid()))
+            lock.flush()
+            yield
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """Turn Ctrl-C and SIGTERM into a request to stop; a second one ends the process at once."""
+
+        def stop(number: int, _frame: object) -> None:
+            if self._interrupted:
+                signal.signal(number, signal.SIG_DFL)
+                os.kill(os.getpid(), number)
+            self._interrupted = True
+
+        try:
+            before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # not in the main thread; whoever runs us there handles signals
+            before = {}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)

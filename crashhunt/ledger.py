@@ -1,0 +1,159 @@
+"""The ledger: facts about trials in one SQLite file; one writer, any number of readers, also while the hunt runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.trial import TrialResult
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+__all__ = ["Ledger"]
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS trials (
+    number INTEGER PRIMARY KEY,
+    outcome TEXT NOT NULL,
+    steps INTEGER NOT NULL,
+    time_to_collision_s REAL,
+    gap_m REAL,
+    required_deceleration REAL,
+    wall_s REAL NOT NULL,
+    ended_at REAL NOT NULL,
+    snapshot TEXT NOT NULL,
+    result TEXT NOT NULL
+) STRICT;
+CREATE TABLE IF NOT EXISTS hunt (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID;
+"""
+
+
+class Ledger:
+    """What happened in a hunt.
+
+    Args:
+        path: of ``ledger.sqlite``.
+        writable: the one writer; creates the file.
+
+    Raises:
+        HuntDirectoryError: the file cannot be opened, or is not a ledger.
+
+    """
+
+    def __init__(self, path: Path, *, writable: bool = False) -> None:
+        self._path = path
+        if not writable and not path.exists():
+            raise HuntDirectoryError(
+                f"{str(path.parent)!r} is not the directory of a hunt: it has no ledger.sqlite",
+                fix="give the directory that crashhunt run was given",
+            )
+        try:
+            self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+            if writable:
+                # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
+                self._database.execute("PRAGMA journal_mode = WAL")
+                self._database.execute("PRAGMA synchronous = NORMAL")
+                self._database.executescript(_SCHEMA)
+            self._database.execute("SELECT count(*) FROM hunt").fetchone()
+        except sqlite3.Error as error:
+            raise self._explained(error) from error
+
+    def record(self, result: TrialResult, *, snapshot: str) -> None:
+        """Add a trial that has ended; one that ran again replaces its row.
+
+        Raises:
+            HuntDirectoryError: the disk is full.
+
+        """
+        closest = result.closest.to_json()
+        row = (
+            result.spec.number,
+            str(result.outcome),
+            result.steps,
+            closest["time_to_collision_s"],
+            closest["gap_m"],
+            closest["required_deceleration"],
+            result.wall_s,
+            time.time(),
+            snapshot,
+            json.dumps(result.to_json()),
+        )
+        try:
+            self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+        except sqlite3.Error as error:
+            raise self._explained(error) from error
+
+    def note(self, **facts: Any) -> None:
+        """Set facts about the hunt itself, such as its state; None removes one."""
+        try:
+            for key, value in facts.items():
+                if value is None:
+                    self._database.execute("DELETE FROM hunt WHERE key = ?", (key,))
+                else:
+                    self._database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?)", (key, json.dumps(value)))
+        except sqlite3.Error as error:
+            raise self._explained(error) from error
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts about the hunt itself."""
+        return {key: json.loads(value) for key, value in self._database.execute("SELECT key, value FROM hunt")}
+
+    def finished(self) -> set[int]:
+        """Return the numbers of the trials that have ended."""
+        return {number for (number,) in self._database.execute("SELECT number FROM trials")}
+
+    def outcomes(self) -> dict[str, int]:
+        """Return how many trials ended how."""
+        return dict(self._database.execute("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+
+    def steps_total(self) -> int:
+        """Return how many steps were run in all."""
+        return int(self._database.execute("SELECT coalesce(sum(steps), 0) FROM trials").fetchone()[0])
+
+    def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
+        """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
+        where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
+        for (text,) in self._database.execute(f"SELECT result FROM trials {where} ORDER BY number", outcomes):
+            yield TrialResult.from_json(json.loads(text))
+
+    def result(self, number: int) -> TrialResult | None:
+        """Return one trial, or None where it has not ended."""
+        row = self._database.execute("SELECT result FROM trials WHERE number = ?", (number,)).fetchone()
+        return TrialResult.from_json(json.loads(row[0])) if row else None
+
+    def snapshot_of(self, number: int) -> str:
+        """Return the digest of the snapshot that a trial ran from."""
+        row = self._database.execute("SELECT snapshot FROM trials WHERE number = ?", (number,)).fetchone()
+        return str(row[0]) if row else ""
+
+    def nearest_miss(self) -> TrialResult | None:
+        """Return the trial that did not crash and came nearest to it, by time to collision."""
+        row = self._database.execute(
+            "SELECT result FROM trials WHERE outcome IN ('survived', 'finished') AND time_to_collision_s IS NOT NULL "
+            "ORDER BY time_to_collision_s, number LIMIT 1"
+        ).fetchone()
+        return TrialResult.from_json(json.loads(row[0])) if row else None
+
+    def close(self) -> None:
+        """Close the file."""
+        with closing(self._database):
+            pass
+
+    def _explained(self, error: sqlite3.Error) -> HuntDirectoryError:
+        where = str(self._path)
+        text = str(error)
+        if "full" in text or "disk I/O" in text:
+            return HuntDirectoryError(
+                f"the disk is full ({text})", fix="free some space and run the same command again", where=where
+            )
+        if "unable to open" in text or "readonly" in text:
+            reason = "is not writable" if os.path.exists(self._path.parent) else "does not exist"  # noqa: PTH110
+            return HuntDirectoryError(f"the folder {reason} ({text})", fix="choose another", where=where)
+        return HuntDirectoryError(f"not a ledger of crashhunt ({text})", fix="choose another directory", where=where)

@@ -1,0 +1,233 @@
+"""From what somebody asks for to a scenario and settings that say everything."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from crashhunt.errors import ArgumentError, ScenarioError, UsageError
+from crashhunt.plugins import locate, signature_of
+from crashhunt.scenario import Scenario, load_scenario
+from crashhunt.settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.snapshot import scenario_digest
+from crashhunt.space import Argument, Constant, parse_spec
+from crashhunt.trial import CRASHES, Outcome
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from crashhunt.plugins import Signature
+
+__all__ = ["Request", "plan", "with_settings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What somebody asks of a hunt; everything else is decided by `plan`.
+
+    Args:
+        trials: how many.
+        max_steps: the bound on each, in steps.
+        scenario: a shipped name, or a path.
+        ego: which vehicle of a bare ``.sumocfg``.
+        agents: agent id to locator; the id may be empty where the scenario has one controlled vehicle.
+        arguments: ``NAME`` or ``AGENT.NAME`` to specification.
+        scenario_arguments: name to specification.
+        sampler: its name.
+        points: how many values grid and sweep try of a range without a step.
+        seed: of the hunt; drawn where it is None.
+        crash_on: the outcomes that count.
+        run: how it is run.
+
+    """
+
+    trials: int
+    max_steps: int
+    scenario: str | Path = "loop"
+    ego: str = ""
+    agents: Mapping[str, str] = field(default_factory=dict)
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    scenario_arguments: Mapping[str, str] = field(default_factory=dict)
+    sampler: str = "random"
+    points: int = 10
+    seed: int | None = None
+    crash_on: Sequence[str] = CRASHES
+    run: RunSettings = field(default_factory=RunSettings)
+
+
+def plan(request: Request) -> tuple[Scenario, HuntSettings]:
+    """Resolve a request.
+
+    Raises:
+        CrashhuntError: with what is wrong with it.
+
+    """
+    _check_numbers(request)
+    scenario = load_scenario(request.scenario, ego=request.ego)
+    scenario = scenario.with_agents(_locators(request, scenario))
+    signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
+    settings = HuntSettings(
+        scenario=str(request.scenario),
+        scenario_digest=scenario_digest(scenario),
+        trials=request.trials,
+        max_steps=request.max_steps,
+        seed=request.seed if request.seed is not None else secrets.randbits(32),
+        sampler=request.sampler,
+        points=request.points,
+        crash_on=_crash_on(request.crash_on),
+        agents=_agents(request, scenario, signatures),
+        scenario_arguments=_scenario_arguments(request, scenario),
+        run=request.run,
+    )
+    locate("samplers", request.sampler)(settings.space, points=request.points)
+    return scenario, settings
+
+
+def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
+    """Return the scenario with the agents that the settings name at the wheel."""
+    missing = scenario.agents.keys() ^ settings.agents.keys()
+    if missing:
+        raise UsageError(
+            f"hunt.toml and the scenario do not agree on the controlled vehicle {min(missing)!r}",
+            fix="name the same vehicles in both",
+        )
+    return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
+
+
+def _check_numbers(request: Request) -> None:
+    for name, value, least in (
+        ("TRIALS", request.trials, 1),
+        ("MAX_STEPS", request.max_steps, 1),
+        ("PARALLEL", request.run.parallel, 1),
+        ("--points", request.points, 1),
+        ("--recycle-after", request.run.recycle_after, 0),
+        ("--seed", request.seed or 0, 0),
+    ):
+        if value < least:
+            raise UsageError(f"{name} is {value}", fix=f"give at least {least}")
+    if not 0 < request.run.timeout_s < float("inf"):
+        raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
+
+
+def _crash_on(names: Sequence[str]) -> tuple[Outcome, ...]:
+    crashes = [str(outcome) for outcome in CRASHES]
+    for name in names:
+        if name not in crashes:
+            raise UsageError(f"--crash-on {name!r} is not a crash", fix=f"give some of {','.join(crashes)}")
+    if not names:
+        raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
+    return tuple(outcome for outcome in CRASHES if outcome in names)
+
+
+def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
+    locators: dict[str, str] = {}
+    ids = ", ".join(scenario.agents)
+    for agent, locator in request.agents.items():
+        if not agent and len(scenario.agents) > 1:
+            raise UsageError(
+                f"--agent {locator!r} does not say which vehicle, and the scenario has {ids}",
+                fix=f"write --agent {next(iter(scenario.agents))}={locator}",
+            )
+        if agent and agent not in scenario.agents:
+            raise UsageError(f"--agent: there is no controlled vehicle {agent!r}", fix=f"the scenario has {ids}")
+        locators[agent or next(iter(scenario.agents))] = locator
+    return locators
+
+
+def _agents(request: Request, scenario: Scenario, signatures: Mapping[str, Signature]) -> dict[str, AgentSettings]:
+    asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
+    for name, spec in request.arguments.items():
+        agent, argument = _owner(name, scenario, signatures)
+        asked[agent][argument] = spec
+    agents: dict[str, AgentSettings] = {}
+    for agent, setup in scenario.agents.items():
+        signature = signatures[agent]
+        known = scenario.agent_arguments(agent)
+        for name in known:
+            if name not in signature.arguments and not signature.open:
+                accepted = ", ".join(signature.arguments) or "no arguments"
+                raise ScenarioError(
+                    f"agents.{agent}.arguments.{name}: {setup.agent} takes no such argument",
+                    fix=f"it takes {accepted}",
+                    where=scenario.origin,
+                )
+        specs: dict[str, ArgumentSpec] = {}
+        for name in sorted({*signature.arguments, *known, *asked[agent]}):
+            found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name))
+            if found is not None:
+                specs[name] = found
+            elif (
+                name in signature.arguments
+                and signature.arguments[name].default is None
+                and not _has_default(setup.agent, name)
+            ):
+                raise ArgumentError(
+                    f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
+                )
+        agents[agent] = AgentSettings(agent=setup.agent, arguments=specs)
+    return agents
+
+
+def _has_default(locator: str, name: str) -> bool:
+    import inspect
+
+    parameter = inspect.signature(locate("agents", locator)).parameters[name]
+    return parameter.default is not parameter.empty
+
+
+def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
+    """Which agent an ``--arg`` is for."""
+    for agent in sorted(scenario.agents, key=len, reverse=True):
+        if name.startswith(f"{agent}."):
+            argument = name.removeprefix(f"{agent}.")
+            signatures[agent].check([argument], where=f"--arg {name}: {scenario.agents[agent].agent}")
+            return agent, argument
+    takers = [agent for agent, signature in signatures.items() if name in signature.arguments or signature.open]
+    if len(takers) > 1:
+        fix = " or ".join(f"--arg {agent}.{name}=…" for agent in takers)
+        raise ArgumentError(f"--arg {name}: several agents take it", fix=f"write {fix}")
+    if not takers:
+        if name in scenario.arguments:
+            raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
+        agent = next(iter(scenario.agents))
+        signatures[agent].check([name], where=f"--arg: {scenario.agents[agent].agent}")
+    return takers[0], name
+
+
+def _spec(name: str, declared: Argument | None, known: Argument | None, asked: str | None) -> ArgumentSpec | None:
+    kind = (declared.kind if declared else None) or (known.kind if known else None)
+    if asked is not None:
+        distribution = parse_spec(asked, kind, where=f"--arg {name}")
+        return ArgumentSpec(spec=str(distribution), kind=kind)
+    for argument in (known, declared):
+        if argument is not None and argument.distribution is not None:
+            # The same text may mean whole numbers or not, depending on the agent's own type.
+            return ArgumentSpec(spec=str(parse_spec(str(argument.distribution), kind, where=name)), kind=kind)
+    if known is not None and known.default is not None:
+        return ArgumentSpec(spec=str(parse_spec(str(Constant(known.default)), kind, where=name)), kind=kind)
+    return None
+
+
+def _scenario_arguments(request: Request, scenario: Scenario) -> dict[str, ArgumentSpec]:
+    known = scenario.scenario_arguments()
+    for name in request.scenario_arguments:
+        if name not in known:
+            accepted = ", ".join(known) or "none"
+            raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=f"it has {accepted}")
+    specs: dict[str, ArgumentSpec] = {}
+    for name, argument in known.items():
+        asked = request.scenario_arguments.get(name)
+        if asked is not None:
+            spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
+        elif argument.distribution is not None:
+            spec = str(argument.distribution)
+        elif argument.default is not None:
+            spec = str(Constant(argument.default))
+        else:
+            raise ScenarioError(
+                f"arguments.{name} has neither a default nor a range", fix="give it one", where=scenario.origin
+            )
+        specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
+    return specs

@@ -1,0 +1,129 @@
+"""What people see while a hunt runs: one status screen on a terminal, else a plain line now and then."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from crashhunt.recording import Phase
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from rich.console import Console, RenderableType
+
+    from crashhunt.hunt import HuntStatus
+    from crashhunt.trial import TrialResult
+
+__all__ = ["Watcher", "format_arguments", "format_seconds"]
+
+_LINE_EVERY_S = 5.0
+_STYLES = {"traffic crash": "bold red", "software fault": "bold magenta", "no crash": "green"}
+
+
+class Watcher:
+    """Shows how a hunt is going.
+
+    Args:
+        console: where to; a terminal gets the screen, anything else lines.
+        title: on top.
+
+    """
+
+    def __init__(self, console: Console, title: str) -> None:
+        self._console = console
+        self._title = title
+        self._last_line = -math.inf
+        self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
+
+    def __enter__(self) -> Watcher:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def __call__(self, status: HuntStatus) -> None:
+        """Show a status."""
+        if self._live is not None:
+            self._live.update(self._screen(status))
+        elif time.monotonic() - self._last_line >= _LINE_EVERY_S:
+            self._last_line = time.monotonic()
+            self._console.print(_line(status), soft_wrap=True, highlight=False)
+
+    def _screen(self, status: HuntStatus) -> RenderableType:
+        head = Text.assemble((self._title, "bold"), f"   {status.phase}   {format_seconds(status.elapsed_s)}")
+        bar = Table.grid(padding=(0, 2))
+        bar.add_row(
+            ProgressBar(total=max(1, status.planned), completed=status.done, width=30),
+            f"{status.done}/{status.planned} trials",
+            f"{status.rate_per_s:.1f}/s",
+            f"{_time_left(status)} left",
+        )
+        outcomes = Text("  ").join(
+            Text(f"{name} {count}", style=_STYLES[Outcome(name).category] if name != Outcome.INVALID else "yellow")
+            for name, count in sorted(status.outcomes.items())
+        )
+        workers = Table.grid(padding=(0, 3))
+        for number, header in sorted(status.workers.items()):
+            doing = {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}")
+            workers.add_row(f"worker {header.pid}", f"trial {number}", doing)
+        rows: list[RenderableType] = [head, bar, outcomes or Text("no trial has ended yet", style="dim")]
+        if status.nearest is not None:
+            rows.append(Text(f"nearest miss: {_near(status.nearest)}", overflow="fold"))
+        return Group(*rows, workers)
+
+
+def format_arguments(result: TrialResult) -> str:
+    """Return the arguments of a trial in one line."""
+    spec = result.spec
+    alone = len(spec.arguments) == 1
+    pairs = [
+        (name if alone else f"{agent}.{name}", value)
+        for agent, values in spec.arguments.items()
+        for name, value in values.items()
+    ]
+    pairs += list(spec.scenario_arguments.items())
+    return " ".join(f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}" for name, value in pairs)
+
+
+def format_seconds(seconds: float) -> str:
+    """Return a duration for people."""
+    if not math.isfinite(seconds):
+        return "?"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _line(status: HuntStatus) -> str:
+    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
+    line = f"{status.phase}: {status.done}/{status.planned} trials ({outcomes})"
+    if status.phase == "hunting" and status.done:
+        line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
+    return line
+
+
+def _time_left(status: HuntStatus) -> str:
+    return format_seconds((status.planned - status.done) / status.rate_per_s if status.rate_per_s > 0 else math.inf)
+
+
+def _near(result: TrialResult) -> str:
+    closest = result.closest
+    if math.isfinite(closest.time_to_collision_s):
+        how = f"{closest.time_to_collision_s:.2f} s from a collision"
+    else:
+        how = "never on a collision course"
+    return f"trial {result.spec.number}, {how}, {format_arguments(result)}"

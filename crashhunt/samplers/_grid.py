@@ -1,0 +1,73 @@
+"""Every combination in turn, and one argument in steps."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from crashhunt.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from crashhunt.samplers._protocol import Key, Space
+    from crashhunt.space import Value
+    from crashhunt.trial import TrialResult
+
+__all__ = ["GridSampler", "SweepSampler"]
+
+
+class GridSampler:
+    """Tries every combination of values in turn; after the last one it begins again, with other seeds.
+
+    Args:
+        space: the axes; the last one in order of its name varies fastest.
+        points: how many values to try of a range that has no step of its own.
+
+    Raises:
+        UsageError: ``points`` is below 1.
+
+    """
+
+    def __init__(self, space: Space, *, points: int = 10) -> None:
+        if points < 1:
+            raise UsageError(f"points is {points}", fix="give at least 1")
+        self._axes = [(key, distribution.grid(points)) for key, distribution in sorted(space.items())]
+
+    @property
+    def size(self) -> int:
+        """How many combinations there are."""
+        return math.prod(len(values) for _, values in self._axes)
+
+    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:  # noqa: ARG002 - the protocol's
+        """Return the combination whose turn it is."""
+        chosen: dict[Key, Value] = {}
+        for key, values in reversed(self._axes):
+            number, index = divmod(number, len(values))
+            chosen[key] = values[index]
+        return chosen
+
+    def tell(self, result: TrialResult) -> None:
+        """Nothing to learn."""
+
+
+class SweepSampler(GridSampler):
+    """Steps through one argument from its start to its end.
+
+    Args:
+        space: exactly one argument that varies; the others are constants.
+        points: in how many steps, where the range has no step of its own.
+
+    Raises:
+        UsageError: none or several arguments vary.
+
+    """
+
+    def __init__(self, space: Space, *, points: int = 10) -> None:
+        super().__init__(space, points=points)
+        varying = [".".join(filter(None, key)) for key, values in self._axes if len(values) > 1]
+        if len(varying) != 1:
+            raise UsageError(
+                f"a sweep is over one argument, and {', '.join(varying) or 'none'} vary",
+                fix="fix the others: --arg NAME=VALUE for an agent's, --set NAME=VALUE for the scenario's",
+            )
