@@ -185,7 +185,13 @@ class Hunt:
             ledger = Ledger(self.directory / "ledger.sqlite", writable=True)
             try:
                 return self._run(ledger, watch or (lambda _: None))
+            except CrashhuntError:
+                with suppress(CrashhuntError):
+                    ledger.note(state="error")
+                raise
             except OSError as error:
+                with suppress(CrashhuntError):
+                    ledger.note(state="error")
                 raise HuntDirectoryError(
                     f"{error.strerror or error}",
                     fix="free some space or make the folder writable, and run the same command again",
@@ -399,6 +405,8 @@ class Hunt:
         return sorted(path.name for path in self.directory.iterdir() if path.name not in (".lock", ".scratch"))
 
     def _unusable(self, error: OSError) -> HuntDirectoryError:
+        if isinstance(error, FileExistsError):
+            return HuntDirectoryError(f"{str(self.directory)!r} is a file", fix="give a new or an empty folder")
         return HuntDirectoryError(
             f"the directory cannot be used: {error.strerror}",
             fix="choose one below a folder that exists and is writable",

@@ -67,6 +67,8 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     _check_numbers(request)
     scenario = load_scenario(request.scenario, ego=request.ego)
     scenario = scenario.with_agents(_locators(request, scenario))
+    sampler = locate("samplers", request.sampler)
+    hunted = not getattr(sampler, "only_asked", False)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
     settings = HuntSettings(
         scenario=str(request.scenario),
@@ -77,11 +79,11 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         sampler=request.sampler,
         points=request.points,
         crash_on=_crash_on(request.crash_on),
-        agents=_agents(request, scenario, signatures),
-        scenario_arguments=_scenario_arguments(request, scenario),
+        agents=_agents(request, scenario, signatures, hunted=hunted),
+        scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
         run=request.run,
     )
-    locate("samplers", request.sampler)(settings.space, points=request.points)
+    sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
     return scenario, settings
 
 
@@ -136,7 +138,9 @@ def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
     return locators
 
 
-def _agents(request: Request, scenario: Scenario, signatures: Mapping[str, Signature]) -> dict[str, AgentSettings]:
+def _agents(
+    request: Request, scenario: Scenario, signatures: Mapping[str, Signature], *, hunted: bool
+) -> dict[str, AgentSettings]:
     asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
     for name, spec in request.arguments.items():
         agent, argument = _owner(name, scenario, signatures)
@@ -155,7 +159,7 @@ def _agents(request: Request, scenario: Scenario, signatures: Mapping[str, Signa
                 )
         specs: dict[str, ArgumentSpec] = {}
         for name in sorted({*signature.arguments, *known, *asked[agent]}):
-            found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name))
+            found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
             if found is not None:
                 specs[name] = found
             elif (
@@ -196,12 +200,14 @@ def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -
     return takers[0], name
 
 
-def _spec(name: str, declared: Argument | None, known: Argument | None, asked: str | None) -> ArgumentSpec | None:
+def _spec(
+    name: str, declared: Argument | None, known: Argument | None, asked: str | None, *, hunted: bool
+) -> ArgumentSpec | None:
     kind = (declared.kind if declared else None) or (known.kind if known else None)
     if asked is not None:
         distribution = parse_spec(asked, kind, where=f"--arg {name}")
         return ArgumentSpec(spec=str(distribution), kind=kind)
-    for argument in (known, declared):
+    for argument in (known, declared) if hunted else ():
         if argument is not None and argument.distribution is not None:
             # The same text may mean whole numbers or not, depending on the agent's own type.
             return ArgumentSpec(spec=str(parse_spec(str(argument.distribution), kind, where=name)), kind=kind)
@@ -210,7 +216,7 @@ def _spec(name: str, declared: Argument | None, known: Argument | None, asked: s
     return None
 
 
-def _scenario_arguments(request: Request, scenario: Scenario) -> dict[str, ArgumentSpec]:
+def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -> dict[str, ArgumentSpec]:
     known = scenario.scenario_arguments()
     for name in request.scenario_arguments:
         if name not in known:
@@ -221,7 +227,7 @@ def _scenario_arguments(request: Request, scenario: Scenario) -> dict[str, Argum
         asked = request.scenario_arguments.get(name)
         if asked is not None:
             spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
-        elif argument.distribution is not None:
+        elif argument.distribution is not None and (hunted or argument.default is None):
             spec = str(argument.distribution)
         elif argument.default is not None:
             spec = str(Constant(argument.default))

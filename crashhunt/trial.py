@@ -240,8 +240,11 @@ class TrialResult:
             verb = {"collider": "drove into", "victim": "was hit by"}.get(hit.role, "left the road")
             return f"{hit.agent} {verb}{f' {other}' if hit.role != 'alone' else ''} at step {self.steps}"
         if self.failure is not None:
-            agent = f"{self.failure.agent}: " if self.failure.agent else ""
-            return f"{agent}{self.failure.kind}: {self.failure.message}"
+            failure = self.failure
+            if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
+                whose = f"{failure.agent}: " if failure.agent else ""
+                return f"{whose}{failure.kind}: {failure.message}"
+            return failure.message
         return f"{self.outcome} after {self.steps} steps"
 
 

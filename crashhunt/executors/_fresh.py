@@ -36,7 +36,6 @@ class _Running:
     process: subprocess.Popen[bytes]
     answer: Path
     began: float
-    asked_at: float | None = None
     killed: bool = False
 
 
@@ -115,12 +114,8 @@ class FreshProcessExecutor:
             del self._running[number]
             return self._result(running, exit_code)
         header = where_it_is(self._settings.scratch, number)
-        limit = self._settings.timeout_s
-        late = now - header.started > limit if header else now - running.began > limit + _START_UP_S
-        if late and running.asked_at is None:
-            running.asked_at = now
-            running.process.send_signal(signal.SIGUSR1 if header else signal.SIGKILL)
-        elif running.asked_at is not None and now - running.asked_at > _LAST_WORDS_S:
+        limit = self._settings.timeout_s + _LAST_WORDS_S
+        if now - header.started > limit if header else now - running.began > limit + _START_UP_S:
             running.killed = True
             _kill(running.process)
         return None

@@ -30,7 +30,7 @@ __all__ = ["PoolExecutor"]
 
 _LOOK_EVERY_S = 0.1
 _GRACE_S = 1.0  # for the pool to notice by itself that a worker is gone, with its exit code
-_LAST_WORDS_S = 0.2  # for a hung worker to write down where it is stuck
+_LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
 _START_UP_S = 60.0  # for a new worker to import what it needs, before a trial counts as begun
 
 
@@ -38,7 +38,6 @@ _START_UP_S = 60.0  # for a new worker to import what it needs, before a trial c
 class _Running:
     spec: TrialSpec
     future: ProcessFuture[TrialResult]
-    asked_at: float | None = None  # when it was told to say where it hangs
     gone_at: float | None = None  # when its process was first found dead
     killed: bool = False  # at its time limit, by us
 
@@ -47,7 +46,7 @@ class PoolExecutor:
     """Runs trials on warm workers, each a process of its own.
 
     pebble sees to it that a worker that dies costs its own trial only. What pebble does not see is seen here: a worker
-    that leaves with exit code 0, and one that hangs, which is asked for its stack first.
+    that leaves with exit code 0, and one that hangs.
 
     Args:
         settings: of the hunt.
@@ -196,12 +195,7 @@ class PoolExecutor:
                         yield hung(running.spec, self._settings.scratch, self._settings.timeout_s)
                     else:
                         yield died(running.spec, self._settings.scratch, 0)
-            elif running.asked_at is None:
-                if now - header.started > self._settings.timeout_s:
-                    running.asked_at = now
-                    with suppress(ProcessLookupError):
-                        os.kill(header.pid, signal.SIGUSR1)  # faulthandler writes the stack
-            elif now - running.asked_at > _LAST_WORDS_S and not running.killed:
+            elif now - header.started > self._settings.timeout_s + _LAST_WORDS_S and not running.killed:
                 running.killed = True
                 _kill(header.pid)
 

@@ -96,6 +96,8 @@ class Worker:
             stage.mkdir(exist_ok=True)
             factory = locate("simulators", self._settings.scenario.simulator)
             simulator = self._simulator = factory(self._settings.scenario, stage)
+        # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
+        faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         result = run_episode(
             spec,
             simulator=simulator,
@@ -104,6 +106,7 @@ class Worker:
             oracles=self._oracles,
             crash_on=self._settings.crash_on,
         )
+        faulthandler.cancel_dump_traceback_later()
         self._draw_map(simulator)
         kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
         result = replace(result, worker=os.getpid(), kept=kept, wall_s=time.monotonic() - began)
@@ -147,6 +150,7 @@ class Worker:
         assert self._box is not None
         self._box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
         os.ftruncate(1, 0)
+        os.ftruncate(self._stack.fileno(), 0)
         os.rename(self._folder, folder)  # noqa: PTH104 - Path.rename builds a path for nothing
         self._folder = folder
         return self._box, folder

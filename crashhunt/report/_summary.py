@@ -70,7 +70,8 @@ def _describe_crash(bundle: Bundle) -> list[str]:
     result = bundle.result
     lines = [
         f"{bundle.id}  ({result.outcome.category})",
-        f"  {result.summary}, simulation time {result.sim_time_s:.1f} s",
+        f"  {result.summary}",
+        f"  after {result.steps} steps, simulation time {result.sim_time_s:.1f} s",
         f"  seed {result.spec.seed}, {format_arguments(result)}",
     ]
     lines += [f"  {line}" for line in _evidence(result)]
@@ -96,8 +97,10 @@ def _evidence(result: TrialResult) -> list[str]:
             speeds += f", {hit.victim} at {hit.victim_speed:.1f} m/s"
         lines.append(f"{where}; {speeds}; seen by {' and '.join(hit.seen_by)}")
     if failure is not None:
-        last = failure.traceback.strip().splitlines()
-        lines += last[-4:]
+        frames = failure.traceback.strip().splitlines()
+        # Python prints the most recent call last; faulthandler, which speaks for the dead and the stuck, first.
+        dumped = [line for line in frames if line.lstrip().startswith("File")]
+        lines += dumped[:3] if failure.kind in ("signal", "timeout") else frames[-4:]
         if failure.last_output.strip():
             lines.append(f"last output: {failure.last_output.strip().splitlines()[-1]}")
     return lines

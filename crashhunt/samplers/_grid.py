@@ -29,6 +29,8 @@ class GridSampler:
 
     """
 
+    only_asked = True
+
     def __init__(self, space: Space, *, points: int = 10) -> None:
         if points < 1:
             raise UsageError(f"points is {points}", fix="give at least 1")
@@ -68,6 +70,6 @@ class SweepSampler(GridSampler):
         varying = [".".join(filter(None, key)) for key, values in self._axes if len(values) > 1]
         if len(varying) != 1:
             raise UsageError(
-                f"a sweep is over one argument, and {', '.join(varying) or 'none'} vary",
-                fix="fix the others: --arg NAME=VALUE for an agent's, --set NAME=VALUE for the scenario's",
+                f"a sweep is over one argument, and {', '.join(varying) or 'none'} {'varies' if len(varying) < 2 else 'vary'}",
+                fix="name one, such as --arg speed=5:30:5",
             )

@@ -28,8 +28,11 @@ class Sampler(Protocol):
     that the proposals for a number are the same however many trials run at once.
 
     A sampler is called with the space and, as a keyword, ``points``: how many values to try of a range that has no
-    step of its own.
+    step of its own. One whose ``only_asked`` is true varies only what somebody asks for by name; everything else is
+    a constant in its space.
     """
+
+    only_asked: bool
 
     def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
         """Return a value for every key of the space.

@@ -23,6 +23,8 @@ class RandomSampler:
 
     """
 
+    only_asked = False
+
     def __init__(self, space: Space, *, points: int = 10) -> None:  # noqa: ARG002 - all samplers are called alike
         self._space = sorted(space.items())
 
