@@ -1,0 +1,365 @@
+"""The measurements behind every claim of speed and memory. Run it as ``scripts/bench``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+CRASHHUNT = Path(sys.executable).parent / "crashhunt"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One measured figure.
+
+    Args:
+        name: of the figure.
+        value: what was measured.
+        unit: of the value.
+        better: which way is better.
+        target: what it should be at most (lower) or at least (higher); None where nothing was promised.
+        note: how it was measured.
+    """
+
+    name: str
+    value: float
+    unit: str
+    better: str
+    target: float | None
+    note: str = ""
+
+
+@contextmanager
+def folder() -> Iterator[Path]:
+    """A scratch folder."""
+    with tempfile.TemporaryDirectory(prefix="crashhunt-bench-") as name:
+        yield Path(name)
+
+
+def in_child(function: str, *arguments: str) -> dict[str, float]:
+    """Run a function of this module in a process of its own: libsumo is one simulation per process."""
+    done = subprocess.run(
+        [sys.executable, __file__, "--child", function, *arguments], check=True, stdout=subprocess.PIPE
+    )
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def hunt(directory: Path, parallel: int, trials: int, max_steps: int, *options: str) -> dict[str, float]:
+    """Hunt through the command line; return what ``--json`` says."""
+    command = [str(CRASHHUNT), "run", str(directory), str(parallel), str(trials), str(max_steps), "--json", *options]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
+    found: dict[str, float] = json.loads(done.stdout)
+    return found
+
+
+# Episodes in which nothing but the machinery and the traffic differ from a bare loop.
+QUIET = ("--agent", "keep-lane", "--arg", "speed=5", "--seed", "1", "--keep-going")
+
+
+def child_step(scenario: str) -> dict[str, float]:
+    """A whole step against a bare libsumo loop over the same traffic, alternating in one process."""
+    import libsumo
+
+    from crashhunt import episode
+    from crashhunt.agents import KeepLaneWithSpeed
+    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+    from crashhunt.recording import BlackBox
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.trial import TrialSpec
+
+    steps, speed = 1000, 10.0
+    chosen = load_scenario(scenario)
+    agents = list(chosen.agents)
+    spent: dict[str, float] = {}
+
+    def timed(owner: object, name: str, label: str) -> None:
+        inner = getattr(owner, name)
+
+        def outer(*arguments: object, **options: object) -> object:
+            began = time.perf_counter()
+            try:
+                return inner(*arguments, **options)
+            finally:
+                spent[label] = spent.get(label, 0.0) + time.perf_counter() - began
+
+        setattr(owner, name, outer)
+
+    with folder() as stage:
+        simulator = SumoSimulator(chosen, stage)
+        box = BlackBox(stage / "blackbox.bin")
+        arguments = argument_values(chosen)
+        spec = TrialSpec(0, 1, {}, arguments, max_steps=steps)
+
+        def whole() -> float:
+            box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
+            result = episode.run_episode(
+                spec,
+                simulator=simulator,
+                make_agent=lambda *_: KeepLaneWithSpeed(speed),
+                box=box,
+                oracles=[ReportedCollision(), Overlap(), OffRoad()],
+                crash_on=(),
+            )
+            return (result.wall_s - result.setup_s) / max(1, result.steps)
+
+        def bare() -> tuple[float, float]:
+            simulator.reset(seed=spec.seed, options={"arguments": arguments})
+            present, vehicles = list(agents), 0
+            began = time.perf_counter()
+            for _ in range(steps):
+                for agent in present:
+                    libsumo.vehicle.setSpeed(agent, speed)
+                libsumo.simulationStep()
+                vehicles += libsumo.vehicle.getIDCount()
+                if libsumo.simulation.getArrivedNumber():
+                    present = [agent for agent in agents if agent in libsumo.vehicle.getIDList()]
+                    if not present:
+                        break
+            return (time.perf_counter() - began) / steps, vehicles / steps
+
+        rounds = [(whole(), *bare()) for _ in range(7)]
+        for owner, name, label in (
+            (libsumo, "simulationStep", "simulate"),
+            (SumoSimulator, "_look", "look"),
+            (SumoSimulator, "_observe", "observe"),
+            (episode._Run, "_check", "oracles"),
+            (episode._Scribe, "scene", "record"),
+            (KeepLaneWithSpeed, "act", "agent"),
+            (episode.ApproachMeter, "measure", "closest approach"),
+        ):
+            timed(owner, name, label)
+        total = whole() * steps
+    found = {f"part {label}": 1e6 * seconds / steps for label, seconds in spent.items()}
+    found["part everything else"] = 1e6 * total / steps - sum(found.values())
+    return {
+        "ratio": statistics.median(ours / theirs for ours, theirs, _ in rounds),
+        "vehicles": rounds[0][2],
+        "whole": 1e6 * min(ours for ours, _, _ in rounds),
+        "bare": 1e6 * min(theirs for _, theirs, _ in rounds),
+        **found,
+    }
+
+
+def bench_step() -> Iterator[Figure]:
+    """A whole step against a bare loop."""
+    for scenario in ("loop", "merge", "intersection"):
+        found = in_child("child_step", scenario)
+        note = f"{found['vehicles']:.0f} vehicles; whole {found['whole']:.0f} µs, bare {found['bare']:.0f} µs"
+        yield Figure(f"step_ratio_{scenario}", found["ratio"], "x", "lower", 1.35, note)
+        if scenario == "loop":
+            for label, value in found.items():
+                if label.startswith("part "):
+                    yield Figure(f"step_{label.removeprefix('part ').replace(' ', '_')}", value, "µs", "lower", None)
+
+
+def bench_parallel() -> Iterator[Figure]:
+    """Trials a second with two workers against one."""
+    ratios = []
+    for _ in range(3):
+        rates = {}
+        for parallel in (1, 2):
+            with folder() as place:
+                found = hunt(place / "h", parallel, 60, 1000, *QUIET, "--crash-on", "hang")
+                rates[parallel] = found["trials_run"] / found["wall_s"]
+        ratios.append(rates[2] / rates[1])
+    yield Figure("parallel_speedup", statistics.median(ratios), "x", "higher", 1.8, "trials a second, 2 workers to 1")
+
+
+def bench_orchestration() -> Iterator[Figure]:
+    """Everything that is not the episode, with few and with many trials in the ledger."""
+    from crashhunt.ledger import Ledger
+    from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
+    costs = {}
+    for already in (100, 100_000):
+        with folder() as place:
+            directory = place / "h"
+            trials = 400
+            options = ("--scenario", str(_toy(place)), "--seed", "1", "--keep-going")
+            hunt(directory, 1, 1, 1, *options)
+            ledger = Ledger(directory / "ledger.sqlite", writable=True)
+            ledger._database.execute("BEGIN")
+            for number in range(1, already):
+                spec = TrialSpec(number, number, {"ego": {"speed": 1.0}}, {}, max_steps=1)
+                ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=1, wall_s=0.0), snapshot="")
+            ledger._database.execute("COMMIT")
+            ledger.close()
+            few = hunt(directory, 1, already + 1, 1, *options)["wall_s"]
+            many = hunt(directory, 1, already + 1 + trials, 1, *options)["wall_s"]
+            ledger = Ledger(directory / "ledger.sqlite")
+            episodes = sum(result.wall_s for result in ledger.results() if result.spec.number > already)
+            ledger.close()
+            costs[already] = 1e3 * (many - few - episodes) / trials
+            note = f"ms of wall time a trial beyond its episode, {already} trials in the ledger"
+            yield Figure(f"orchestration_{already}", costs[already], "ms", "lower", 2.0, note)
+    yield Figure("orchestration_growth", costs[100_000] / costs[100], "x", "lower", 1.5, "100,000 against 100 trials")
+
+
+def bench_waves() -> Iterator[Figure]:
+    """Against a process per trial in waves, on short episodes."""
+    steps, trials, parallel = 85, 40, 2
+    with folder() as place:
+        found = hunt(place / "h", parallel, 10 * trials, steps, *QUIET, "--crash-on", "hang")
+        ours = found["trials_run"] / found["wall_s"]
+    began = time.monotonic()
+    for first in range(0, trials, parallel):
+        wave = [
+            subprocess.Popen([sys.executable, __file__, "--child", "child_trial", str(number), str(steps)],
+                             stdout=subprocess.DEVNULL)
+            for number in range(first, first + parallel)
+        ]  # fmt: skip
+        for process in wave:
+            if process.wait() != 0:
+                raise RuntimeError("a trial of the wave failed")
+    theirs = trials / (time.monotonic() - began)
+    note = f"{60 * ours:.0f} against {60 * theirs:.0f} trials a minute, {steps} steps each"
+    yield Figure("waves_ratio", ours / theirs, "x", "higher", 5.0, note)
+
+
+def child_trial(number: str, steps: str) -> dict[str, float]:
+    """One trial as the ancestor runs it: a process that imports, starts SUMO, runs and exits."""
+    import libsumo
+
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.simulators.sumo import SumoSimulator
+
+    scenario = load_scenario("loop")
+    with folder() as stage:
+        simulator = SumoSimulator(scenario, stage)
+        simulator.reset(seed=int(number), options={"arguments": argument_values(scenario)})
+        for _ in range(int(steps)):
+            libsumo.vehicle.setSpeed("ego", 5.0)
+            libsumo.simulationStep()
+        simulator.close()
+    return {}
+
+
+def bench_help() -> Iterator[Figure]:
+    """How fast the command line answers."""
+    times = []
+    for _ in range(7):
+        began = time.perf_counter()
+        subprocess.run([str(CRASHHUNT), "--help"], stdout=subprocess.DEVNULL, check=True)
+        times.append(time.perf_counter() - began)
+    yield Figure("help_s", statistics.median(times), "s", "lower", 0.3, "crashhunt --help")
+
+
+def child_memory(trials: str) -> dict[str, float]:
+    """Resident memory of a worker after a tenth and after all of its trials."""
+    from crashhunt.executors._protocol import WorkerSettings
+    from crashhunt.executors._worker import Worker
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.trial import TrialSpec
+
+    scenario = load_scenario("loop")
+    with folder() as scratch:
+        # The worker takes standard output over; the answer goes to where it was.
+        answer = os.dup(1)
+        oracles = ("reported-collision", "overlap", "off-road")
+        worker = Worker(WorkerSettings(scenario=scenario, oracles=oracles, crash_on=(), scratch=scratch))
+        sizes = {}
+        for number in range(1, int(trials) + 1):
+            values = argument_values(scenario)
+            worker.run(TrialSpec(number, number, {"ego": {"speed": 8.0}}, values, max_steps=50))
+            if number in (int(trials) // 10, int(trials)):
+                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                sizes[number] = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+        os.dup2(answer, 1)
+    first, last = sizes.values()
+    return {"first": first, "last": last}
+
+
+def bench_memory() -> Iterator[Figure]:
+    """A worker's memory over 2,000 trials."""
+    found = in_child("child_memory", "2000")
+    note = f"{found['first']:.0f} MiB after 200 trials, {found['last']:.0f} MiB after 2,000"
+    yield Figure("worker_memory_growth", found["last"] / found["first"], "x", "lower", 1.05, note)
+
+
+def bench_bundle() -> Iterator[Figure]:
+    """The size of a log, and how long it takes from the crash to everything stopped and saved."""
+    with folder() as place:
+        options = ("--agent", "keep-lane", "--arg", "speed=14:18", "--seed", "3", "--crash-on", "collision")
+        found = hunt(place / "h", 2, 500, 1500, *options)
+        crash = json.loads(next((place / "h" / "crashes").glob("*/crash.json")).read_text())
+        size = sum(path.stat().st_size for path in (place / "h" / "crashes").glob("*/log.mcap"))
+        note = f"log.mcap with view channels, {crash['step']} steps, trial {crash['trial']} of {found['trials_run']}"
+        yield Figure("log_bytes_per_step", size / max(1, crash["step"]), "B", "lower", None, note)
+
+
+def _toy(place: Path) -> Path:
+    scenario = place / "toy"
+    scenario.mkdir(exist_ok=True)
+    (scenario / "scenario.toml").write_text(
+        'simulator = "toy"\n[agents.ego]\nagent = "crashhunt.agents:KeepLaneWithSpeed"\n'
+        '[agents.ego.arguments.speed]\ndefault = 1.0\nrange = "1:2"\n'
+    )
+    return scenario
+
+
+BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
+    "step": bench_step,
+    "parallel": bench_parallel,
+    "orchestration": bench_orchestration,
+    "waves": bench_waves,
+    "help": bench_help,
+    "memory": bench_memory,
+    "bundle": bench_bundle,
+}
+
+
+def main() -> int:
+    """Measure and print."""
+    if sys.argv[1:2] == ["--child"]:
+        print(json.dumps(globals()[sys.argv[2]](*sys.argv[3:])))
+        return 0
+    parser = argparse.ArgumentParser("scripts/bench", description="Measure what crashhunt promises.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(BENCHES)}; default: all")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    for name in options.names:
+        if name not in BENCHES:
+            print(f"scripts/bench: there is no {name!r}; give some of {', '.join(BENCHES)}", file=sys.stderr)
+            return 2
+    if shutil.which(str(CRASHHUNT)) is None:
+        print(f"scripts/bench: {CRASHHUNT} is not there; run scripts/bench, not bench.py", file=sys.stderr)
+        return 2
+    figures = []
+    console = Console(stderr=True)
+    for name in options.names or BENCHES:
+        with console.status(f"measuring {name}"):
+            figures += list(BENCHES[name]())
+    if options.json:
+        print(json.dumps({"results": [asdict(figure) for figure in figures]}))
+        return 0
+    table = Table("figure", "value", "target", "", "how")
+    for figure in figures:
+        sign = "≤" if figure.better == "lower" else "≥"
+        target, met = "", ""
+        if figure.target is not None:
+            target = f"{sign} {figure.target:g}"
+            good = figure.value <= figure.target if figure.better == "lower" else figure.value >= figure.target
+            met = "met" if good else "MISSED"
+        table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}", target, met, figure.note)
+    Console().print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

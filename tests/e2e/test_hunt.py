@@ -1,0 +1,271 @@
+"""The hunt as a whole: exact counts, resuming, refusing, stopping, signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+FINE = ("--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
+
+
+def ledger(folder: Path) -> dict[int, str]:
+    database = sqlite3.connect(folder / "ledger.sqlite")
+    try:
+        return dict(database.execute("SELECT number, result FROM trials"))
+    finally:
+        database.close()
+
+
+def digests(folder: Path) -> dict[int, str]:
+    return {number: json.loads(result)["digest"] for number, result in ledger(folder).items()}
+
+
+def wait_for(condition, timeout_s=60.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def count(folder: Path) -> int:
+    try:
+        return len(ledger(folder))
+    except sqlite3.Error:
+        return 0
+
+
+def session_is_gone(pid: int) -> bool:
+    """Whether no process of the session that `pid` began is left."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[3]) == pid and fields[0] != "Z":
+                return False
+    return True
+
+
+@pytest.mark.parametrize(("parallel", "trials"), [("1", 3), ("3", 2), ("0", 5)])
+def test_exactly_so_many_trials_run(shell, parallel, trials):
+    report = shell.crashhunt("run", "h", parallel, str(trials), "30", *FINE, "--json").json
+    assert report["trials_planned"] == report["trials_run"] == trials
+    assert report["stopped_because"] == "all_trials"
+    assert report["steps_total"] == 30 * trials
+    assert sorted(ledger(shell.folder / "h")) == list(range(trials))
+    assert not (shell.folder / "h" / ".scratch").exists()
+
+
+def test_trials_do_not_depend_on_how_many_run_at_once(shell):
+    for parallel in ("1", "3"):
+        words = ("run", parallel, parallel, "6", "200", "--seed", "11", "--keep-going")
+        shell.crashhunt(*words)
+    assert digests(shell.folder / "1") == digests(shell.folder / "3")
+    assert len(set(digests(shell.folder / "1").values())) == 6
+
+
+def test_deterministic_gives_the_same_crash_whatever_the_parallelism(shell):
+    found = []
+    for parallel in ("1", "3"):
+        words = ("run", parallel, parallel, "40", "700", "--arg", "speed=18:25", "--seed", "2", "--deterministic", "--json")
+        (crash,) = shell.crashhunt(*words).json["crashes"]
+        found.append((crash["trial"], crash["digest"], crash["arguments"]))
+    assert found[0] == found[1]
+
+
+def test_a_crash_stops_everything_at_once_even_hung_workers(shell):
+    words = ("run", "h", "3", "30", "2000", "--agent", "faulty:HangsUnlessFirst", "--arg", "number=0:100")
+    # Trial 0 of this seed gets number 0 with the grid; all others hang in C with the interpreter held.
+    process = shell.start(*words, "--sampler", "grid", "--points", "101", "--set", "vehicles=10", "--json")
+    crashes = shell.folder / "h" / "crashes"
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    report = json.loads(out)
+    assert [crash["trial"] for crash in report["crashes"]] == [0]
+    assert report["outcomes"] == {"agent_error": 1}
+    assert report["wall_s"] < 20, "the hung workers were waited for"
+    assert [path.name for path in crashes.iterdir()] == ["000000-agent_error"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(shell, number):
+    words = ("run", "h", "2", "60", "300", *FINE, "--json")
+    process = shell.start(*words, start_new_session=True)
+    wait_for(lambda: count(shell.folder / "h") >= 4)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    assert json.loads(out)["stopped_because"] == "interrupted"
+    wait_for(lambda: session_is_gone(process.pid), 5)
+    before = ledger(shell.folder / "h")
+    assert 4 <= len(before) < 60
+    assert shell.crashhunt(*words).json["trials_run"] == 60
+    after = ledger(shell.folder / "h")
+    assert sorted(after) == list(range(60))
+    assert {key: after[key] for key in before} == before  # nothing that had finished ran again
+
+
+def test_a_killed_hunt_leaves_no_process_and_goes_on(shell):
+    words = ("run", "h", "2", "60", "300", *FINE, "--json")
+    process = shell.start(*words, start_new_session=True)
+    wait_for(lambda: count(shell.folder / "h") >= 4)
+    process.kill()
+    process.communicate()
+    wait_for(lambda: session_is_gone(process.pid), 5)
+    before = ledger(shell.folder / "h")
+    assert shell.crashhunt(*words).json["trials_run"] == 60
+    after = ledger(shell.folder / "h")
+    assert {key: after[key] for key in before} == before
+
+
+def test_a_killed_worker_costs_its_own_trial_only(shell):
+    words = ("run", "h", "2", "30", "300", *FINE, "--crash-on", "hang", "--json")
+    process = shell.start(*words, start_new_session=True)
+    wait_for(lambda: count(shell.folder / "h") >= 3)
+    os.kill(running_worker(shell.folder / "h"), signal.SIGKILL)
+    out, err = process.communicate(timeout=90)
+    assert process.returncode == 0, err
+    report = json.loads(out)
+    assert report["trials_run"] == 30
+    outcomes = report["outcomes"]
+    assert outcomes.get("process_died", 0) + outcomes.get("invalid", 0) <= 1
+    assert outcomes["survived"] >= 29
+
+
+def running_worker(folder: Path) -> int:
+    from crashhunt.recording import Phase, read_header
+
+    found: list[int] = []
+
+    def look() -> bool:
+        headers = [read_header(path) for path in (folder / ".scratch").glob("trial-*/blackbox.bin")]
+        found[:] = [header.pid for header in headers if header is not None and header.phase != Phase.DONE]
+        return bool(found)
+
+    wait_for(look)
+    return found[0]
+
+
+def test_other_settings_are_refused_and_overwrite_begins_anew(shell):
+    shell.crashhunt("run", "h", "1", "2", "30", *FINE)
+    done = shell.crashhunt("run", "h", "1", "2", "40", *FINE, "--json", expect=2)
+    assert "max_steps was 30 and is now 40" in done.json["error"]["message"]
+    assert len(done.err.strip().splitlines()) == 1
+    assert len(ledger(shell.folder / "h")) == 2
+    # How it is run is nobody's business but the user's, and more trials go on from there.
+    assert shell.crashhunt("run", "h", "2", "3", "30", *FINE, "--timeout", "9", "--json").json["trials_run"] == 3
+    assert shell.crashhunt("run", "h", "1", "1", "40", *FINE, "--overwrite", "--json").json["trials_run"] == 1
+
+
+def test_a_second_hunt_on_one_directory_is_refused(shell):
+    process = shell.start("run", "h", "1", "500", "300", *FINE)
+    try:
+        wait_for(lambda: count(shell.folder / "h") >= 1)
+        done = shell.crashhunt("run", "h", "1", "500", "300", *FINE, expect=2)
+        assert f"process {process.pid}" in done.err
+        assert process.poll() is None
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def test_a_finished_hunt_says_again_what_it_found(shell):
+    words = ("run", "h", "1", "5", "60", "--agent", "faulty:Raises", "--set", "vehicles=10", "--json")
+    first, second = shell.crashhunt(*words).json, shell.crashhunt(*words).json
+    assert first["crashes"] == second["crashes"]
+    assert first["trials_run"] == second["trials_run"] == 1
+    assert shell.crashhunt(*words, "--fail-on-crash", expect=1).json["crashes"] == first["crashes"]
+
+
+def test_keep_going_collects_all_crashes(shell):
+    words = ("run", "h", "2", "5", "60", "--agent", "faulty:Raises", "--set", "vehicles=10", "--keep-going", "--json")
+    report = shell.crashhunt(*words).json
+    assert report["stopped_because"] == "all_trials"
+    assert [crash["trial"] for crash in report["crashes"]] == list(range(5))
+    assert all(crash["confirmed"] for crash in report["crashes"])
+    assert shell.crashhunt("replay", "h", "--crash", "3", "--json").json["crash"] == "000003-agent_error"
+
+
+def test_the_smallest_time_limit_that_fits_is_no_hang(shell):
+    report = shell.crashhunt("run", "h", "2", "4", "30", *FINE, "--timeout", "5", "--json").json
+    assert report["outcomes"] == {"survived": 4}
+
+
+def test_workers_are_recycled(shell):
+    shell.crashhunt("run", "h", "1", "6", "30", *FINE, "--recycle-after", "2")
+    workers = {json.loads(result)["worker"] for result in ledger(shell.folder / "h").values()}
+    assert len(workers) == 3
+
+
+def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
+    small = shell.folder / "small"
+    small.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(small)], capture_output=True, check=False)
+    if mounted.returncode != 0:
+        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
+    try:
+        words = ("run", str(small / "h"), "2", "40", "3000", "--set", "vehicles=30", "--arg", "speed=6", "--seed", "1")
+        done = shell.crashhunt(*words, "--crash-on", "hang", expect=2)
+        assert "No space left" in done.err or "disk is full" in done.err
+        assert "free some space" in done.err
+        assert len(done.err.strip().splitlines()) == 1
+        finished = ledger(small / "h")
+        subprocess.run(["mount", "-o", "remount,size=200m", str(small)], check=True)
+        words = ("run", str(small / "h"), "2", str(len(finished) + 2), *words[4:])
+        shell.crashhunt(*words, "--crash-on", "hang")
+        after = ledger(small / "h")
+        assert {key: after[key] for key in finished} == finished
+        assert len(after) == len(finished) + 2
+    finally:
+        subprocess.run(["umount", "-l", str(small)], check=False)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "COMMAND"),
+        (("frobnicate",), "frobnicate"),
+        (("run", "h", "2", "ten", "10"), "'ten'"),
+        (("run", "h", "2", "0", "10"), "TRIALS is 0"),
+        (("run", "h", "-1", "3", "10"), "PARALLEL is -1"),
+        (("run", "h", "2", "3", "0"), "MAX_STEPS is 0"),
+        (("run", "no/such/parent", "2", "3", "10"), "no/such/parent"),
+        (("run", "faulty.py", "2", "3", "10"), "is a file"),
+        (("run", ".", "2", "3", "10"), "not empty"),
+        (("run", "h", "2", "3", "10", "--scenario", "lop"), "did you mean 'loop'"),
+        (("run", "h", "2", "3", "10", "--agent", "nowhere:Agent"), "No module named 'nowhere'"),
+        (("run", "h", "2", "3", "10", "--agent", "faulty:Raise"), "did you mean 'Raises'"),
+        (("run", "h", "2", "3", "10", "--agent", "keep-lan"), "did you mean 'keep-lane'"),
+        (("run", "h", "2", "3", "10", "--arg", "sped=3"), "did you mean 'speed'"),
+        (("run", "h", "2", "3", "10", "--arg", "speed=9:3"), "3.0:9.0"),
+        (("run", "h", "2", "3", "10", "--arg", "speed=fast"), "'fast'"),
+        (("run", "h", "2", "3", "10", "--arg", "speed"), "NAME=VALUE"),
+        (("run", "h", "2", "3", "10", "--arg", "speed=1", "--arg", "speed=2"), "given already"),
+        (("run", "h", "2", "3", "10", "--arg", "vehicles=3"), "--set vehicles="),
+        (("run", "h", "2", "3", "10", "--set", "speed=3"), "no argument 'speed'"),
+        (("run", "h", "2", "3", "10", "--crash-on", "boredom"), "'boredom'"),
+        (("run", "h", "2", "3", "10", "--sampler", "magic"), "'magic'"),
+        (("run", "h", "2", "3", "10", "--sampler", "sweep"), "one argument"),
+        (("run", "h", "2", "3", "10", "--timeout", "0"), "--timeout"),
+        (("run", "h", "2", "3", "10", "--agent", "recorded"), "--arg log="),
+        (("replay", "h"), "does not exist"),
+        (("replay", "."), "no crash"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_leaves_nothing_behind(shell, words, says):
+    done = shell.crashhunt(*words, expect=2)
+    assert says in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert done.out == ""
+    assert sorted(path.name for path in shell.folder.iterdir() if path.name != "__pycache__") == ["faulty.py"]
+    as_json = shell.crashhunt(*words, "--json", expect=2).json
+    assert set(as_json) == {"error"}
+    assert set(as_json["error"]) == {"message", "fix", "where"}

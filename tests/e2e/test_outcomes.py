@@ -1,0 +1,119 @@
+"""Every outcome is told apart, saved with its evidence, confirmed and replayed; on real SUMO, real processes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+QUIET = ("--set", "vehicles=10")
+FAULTS = [
+    ("Raises", "agent_error", "ValueError", "no plan"),
+    ("ExitsPython", "agent_error", "SystemExit", "1"),
+    ("Nan", "agent_error", "bad action", "nan"),
+    ("OutOfSpace", "agent_error", "bad action", "(10.0, 2)"),
+    ("ReturnsNone", "agent_error", "bad action", "None"),
+    ("Exits3", "process_died", "exit code", "exited with 3 in ego's act() of step 20"),
+    ("Exits0", "process_died", "exit code", "exited with 0 in ego's act() of step 20"),
+    ("Segfaults", "process_died", "signal", "SIGSEGV in ego's act() of step 20"),
+    ("Hangs", "hang", "timeout", "ego's act() of step 20"),
+    ("HangsHoldingTheInterpreter", "hang", "timeout", "ego's act() of step 20"),
+]
+
+
+def crash_of(folder: Path) -> dict[str, Any]:
+    (path,) = (folder / "crashes").glob("*/crash.json")
+    found: dict[str, Any] = json.loads(path.read_text())
+    return {**found, "path": path.parent}
+
+
+@pytest.mark.parametrize(("agent", "outcome", "kind", "message"), FAULTS, ids=[fault[0] for fault in FAULTS])
+def test_a_software_fault_is_found_saved_and_replayed(shell, agent, outcome, kind, message):
+    words = ("run", "h", "2", "8", "200", "--agent", f"faulty:{agent}", *QUIET, "--timeout", "2", "--json")
+    report = shell.crashhunt(*words).json
+    assert report["stopped_because"] == "crash"
+    (found,) = report["crashes"]
+    assert (found["outcome"], found["step"], found["confirmed"]) == (outcome, 19, True)
+
+    crash = crash_of(shell.folder / "h")
+    assert crash["category"] == "software fault"
+    assert crash["failure"]["kind"] == kind
+    assert message in crash["failure"]["message"]
+    assert crash["failure"]["agent"] == "ego"
+    run_log = (crash["path"] / "run.log").read_text()
+    assert "about to go wrong" in run_log
+    error_log = (crash["path"] / "error.log").read_text()
+    assert message in error_log
+    if outcome == "agent_error" and kind != "bad action":
+        assert "go_wrong" in error_log  # the traceback
+    if outcome == "hang" or agent == "Segfaults":
+        assert "go_wrong" in crash["failure"]["traceback"]  # the stack, by faulthandler
+    if outcome == "process_died":
+        assert "about to go wrong" in crash["failure"]["last_output"]
+
+    verdict = shell.crashhunt("replay", "h", "--json").json
+    assert verdict["verdict"] == "reproduced"
+    assert verdict["steps_recorded"] == verdict["steps_replayed"] == 19
+    assert verdict["digest_recorded"] == verdict["digest_replayed"] == crash["digest"]
+    assert verdict["divergence"] is None
+
+
+def test_the_log_of_a_dead_process_ends_with_the_step_before(shell):
+    from crashhunt.recording import read_log
+
+    shell.crashhunt("run", "h", "1", "1", "200", "--agent", "faulty:Segfaults", *QUIET)
+    recording = read_log(crash_of(shell.folder / "h")["path"] / "log.mcap")
+    assert recording.steps == 19
+    assert recording.actions("ego").shape == (19, 2)
+    assert recording.observations("ego").shape[0] == 20  # what it was shown when it died
+    assert not recording.all_steps[-1].whole
+
+
+@pytest.mark.parametrize("agent", ["FailsToStart", "DiesAtStart"])
+def test_a_start_up_failure_is_no_crash(shell, agent):
+    done = shell.crashhunt("run", "h", "2", "500", "100", "--agent", f"faulty:{agent}", *QUIET, "--json", expect=3)
+    report = done.json
+    assert report["stopped_because"] == "no_valid_trial"
+    assert set(report["outcomes"]) == {"invalid"}
+    assert report["trials_run"] < 50
+    assert report["crashes"] == []
+    assert "no weights" in done.err or "exited with 7" in done.err
+
+
+def test_a_traffic_crash_says_who_hit_whom(shell):
+    words = ("run", "h", "2", "60", "600", "--arg", "speed=22:25", "--seed", "3", "--json")
+    (found,) = shell.crashhunt(*words).json["crashes"]
+    assert found["outcome"] == "collision"
+    crash = crash_of(shell.folder / "h")
+    assert crash["category"] == "traffic crash"
+    hit = crash["collision"]
+    assert hit["role"] in ("collider", "victim")
+    assert "ego" in (hit["collider"], hit["victim"])
+    assert set(hit["seen_by"]) <= {"overlap", "reported"}
+    assert hit["lane"]
+    assert crash["closest_approach"]["gap_m"] == 0.0 or hit["seen_by"] == ["reported"]
+
+
+def test_crash_on_decides_what_counts(shell):
+    words = ("run", "h", "2", "4", "60", "--agent", "faulty:Raises", *QUIET, "--json")
+    report = shell.crashhunt(*words, "--crash-on", "collision,hang").json
+    assert report["stopped_because"] == "all_trials"
+    assert report["outcomes"] == {"agent_error": 4}
+    assert report["crashes"] == []
+    assert sorted(path.name for path in (shell.folder / "h" / "trials").iterdir()) == [f"{n:06d}" for n in range(4)]
+    assert "no plan" in (shell.folder / "h" / "trials" / "000002" / "error.log").read_text()
+
+
+def test_a_crash_that_does_not_come_again_is_called_flaky(shell):
+    report = shell.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:SlowsDown", *QUIET, "--json").json
+    (found,) = report["crashes"]
+    assert found["confirmed"] is False
+    crash = crash_of(shell.folder / "h")
+    assert crash["divergence"]["step"] == 1
+    assert crash["divergence"]["field"] == "action[target_speed]"
+    verdict = shell.crashhunt("replay", "h", "--json", expect=1).json
+    assert verdict["verdict"] == "diverged"
+    # What was recorded can still be driven again, to the bit.
+    assert shell.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
