@@ -48,7 +48,7 @@ def _forbid_unknown(kind: Any, config: Any, seen: set[Any]) -> None:
     seen.add(kind)
     if is_dataclass(kind):
         if "__pydantic_config__" not in vars(kind):
-            kind.__pydantic_config__ = config  # type: ignore[attr-defined]
+            kind.__pydantic_config__ = config  # type: ignore[union-attr]
         for hint in get_type_hints(kind).values():
             _forbid_unknown(hint, config, seen)
     for inner in get_args(kind):

@@ -36,7 +36,6 @@ class Bundle:
         snapshot: the digest of the code that it ran.
         confirmed: whether a fresh process did the same to the bit; None where nobody tried.
         divergence: where it did not.
-
     """
 
     path: Path
@@ -61,7 +60,6 @@ class Bundle:
 
         Raises:
             BundleError: it is missing or damaged.
-
         """
         return read_log(self.path / "log.mcap")
 
@@ -118,7 +116,6 @@ def read_bundle(path: Path) -> Bundle:
 
     Raises:
         BundleError: it is not one, or it is damaged.
-
     """
     file = path / "crash.json"
     try:
@@ -164,7 +161,6 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
 
     Raises:
         BundleError: there is no such crash.
-
     """
     if (directory / "crash.json").is_file() and not crash:
         return read_bundle(directory)
@@ -199,7 +195,6 @@ def write_bundle(
         hunt_seed: of the hunt.
         snapshot: the digest of the code that ran.
         lanes: of the map, for whoever looks at the log.
-
     """
     name = f"{result.spec.number:06d}-{result.outcome}"
     final, building = directory / "crashes" / name, directory / "crashes" / f".{name}.part"

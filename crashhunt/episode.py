@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
+from crashhunt.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
 from crashhunt.oracles import ApproachMeter, Finding, Oracle, merge_findings
 from crashhunt.recording import AgentChannel, BlackBox, Phase, Prologue, Tag, digest_of, encode_actors, encode_events
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
@@ -97,8 +97,10 @@ def run_episode(
         crash_on: what ends the episode; a traffic crash of another kind is recorded, and the episode goes on.
 
     Returns:
-        The result. Whatever agent or simulator raise is in it; errors of the recorder (a full disk) are raised.
+        The result. Whatever agent or simulator raise is in it.
 
+    Raises:
+        RecorderError: the disk is full.
     """
     began = time.monotonic()
     seed_everything(spec.seed)
@@ -170,7 +172,7 @@ class _Run:
             agent = ""
             scene = self.simulator.scene()
             self.scribe.scene(0, scene, (0.0,) * len(self.names))
-        except (OSError, MemoryError):
+        except RecorderError:
             raise
         except BaseException as error:
             return self._result(Outcome.INVALID, failure=_failure(error, agent))
@@ -250,7 +252,11 @@ def _failure(error: BaseException, agent: str) -> Failure:
     text = "".join(traceback.format_exception(error))
     sys.stderr.write(text)
     message = str(error) if isinstance(error, EpisodeError) else " ".join(str(error).split())
-    kinds = {ActionError: "bad action", SimulatorError: "simulator error", InvalidEpisodeError: "invalid"}
+    kinds: dict[type[BaseException], str] = {
+        ActionError: "bad action",
+        InvalidEpisodeError: "invalid",
+        SimulatorError: "simulator error",
+    }
     return Failure(kinds.get(type(error), type(error).__name__), message, text, agent)
 
 

@@ -9,7 +9,7 @@
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
     ├── BundleError                a crash bundle or log that is damaged or incomplete
-    ├── NoValidTrialError          exit code 3: not one trial could be set up
+    ├── RecorderError              a trial could not be recorded: a full disk
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
@@ -26,8 +26,8 @@ __all__ = [
     "EpisodeError",
     "HuntDirectoryError",
     "InvalidEpisodeError",
-    "NoValidTrialError",
     "PluginError",
+    "RecorderError",
     "ScenarioError",
     "SimulatorError",
     "UsageError",
@@ -93,10 +93,8 @@ class BundleError(CrashhuntError):
     """A crash bundle or log that is damaged or incomplete."""
 
 
-class NoValidTrialError(CrashhuntError):
-    """Not one trial could be set up."""
-
-    exit_code = 3
+class RecorderError(CrashhuntError):
+    """A trial could not be recorded."""
 
 
 class EpisodeError(CrashhuntError):

@@ -8,7 +8,6 @@ import shutil
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,6 +26,7 @@ from crashhunt.snapshot import Snapshot, take_snapshot
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from crashhunt.recording import BlackBoxHeader
@@ -57,7 +57,6 @@ class HuntStatus:
         nearest: the trial that came nearest to a crash without one.
         workers: trial number to where it is.
         crashes: saved so far.
-
     """
 
     phase: str
@@ -84,7 +83,6 @@ class HuntReport:
         wall_s: wall time of this run.
         crashes: what was found, the one with the fewest steps first.
         reason: in words, where not one trial was valid.
-
     """
 
     directory: Path
@@ -134,6 +132,8 @@ class _Progress:
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     nearest: TrialResult | None = None
     last_invalid: TrialResult | None = None
+    untold: dict[int, TrialResult] = field(default_factory=dict)  # that the sampler has not been told yet
+    next_told: int = 0
 
 
 class Hunt:
@@ -148,7 +148,6 @@ class Hunt:
         command: the command line, as a comment in ``hunt.toml``.
         overwrite: begin anew, whatever is there.
         seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
-
     """
 
     def __init__(
@@ -178,7 +177,6 @@ class Hunt:
         Raises:
             HuntDirectoryError: the directory is busy, foreign, unwritable or full.
             CrashhuntError: the machinery failed.
-
         """
         with self._locked(), self._signals():
             self._open()
@@ -216,6 +214,8 @@ class Hunt:
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         progress.crashes = list_bundles(self.directory)
+        for result in ledger.results() if sampler.learns else ():
+            self._teach(result, sampler, progress)
         ledger.note(state="running", pid=os.getpid(), heartbeat=time.time(), planned=settings.trials)
         stopped: StoppedBecause | None = None
         if progress.crashes and not settings.run.keep_going:
@@ -260,7 +260,8 @@ class Hunt:
             keep_trials=run.keep_trials,
         )
         waiting = iter(number for number in range(settings.trials) if number not in finished)
-        executor = PoolExecutor(worker_settings, parallel=run.parallel, recycle_after=run.recycle_after)
+        parallel = min(run.parallel, max(1, settings.trials - len(finished)))
+        executor = PoolExecutor(worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         in_flight: set[int] = set()
         heartbeat = 0.0
         try:
@@ -310,7 +311,7 @@ class Hunt:
     ) -> None:
         """Account for a trial that has ended."""
         settings = self.settings
-        sampler.tell(result)
+        self._teach(result, sampler, progress)
         progress.ended_here += 1
         progress.outcomes[str(result.outcome)] += 1
         if result.outcome in settings.crash_on:
@@ -328,6 +329,15 @@ class Hunt:
         if result.kept:
             write_trial(self.directory, result, scratch_of(self._scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
+
+    def _teach(self, result: TrialResult, sampler: Sampler, progress: _Progress) -> None:
+        """Tell a sampler that learns how trials ended, in the order of their numbers."""
+        if not sampler.learns:
+            return
+        progress.untold[result.spec.number] = result
+        while progress.next_told in progress.untold:
+            sampler.tell(progress.untold.pop(progress.next_told))
+            progress.next_told += 1
 
     def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: _Progress) -> None:
         """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""

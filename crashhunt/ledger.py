@@ -44,7 +44,6 @@ class Ledger:
 
     Raises:
         HuntDirectoryError: the file cannot be opened, or is not a ledger.
-
     """
 
     def __init__(self, path: Path, *, writable: bool = False) -> None:
@@ -70,7 +69,6 @@ class Ledger:
 
         Raises:
             HuntDirectoryError: the disk is full.
-
         """
         closest = result.closest.to_json()
         row = (

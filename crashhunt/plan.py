@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from crashhunt.space import Argument, Constant, parse_spec
 from crashhunt.trial import CRASHES, Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.plugins import Signature
@@ -40,7 +40,6 @@ class Request:
         seed: of the hunt; drawn where it is None.
         crash_on: the outcomes that count.
         run: how it is run.
-
     """
 
     trials: int
@@ -62,7 +61,6 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
 
     Raises:
         CrashhuntError: with what is wrong with it.
-
     """
     _check_numbers(request)
     scenario = load_scenario(request.scenario, ego=request.ego)

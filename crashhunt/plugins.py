@@ -73,7 +73,9 @@ def locate(group: Group, name: str) -> Any:
             )
         found = getattr(found, part)
     if not callable(found):
-        raise PluginError(f"{name!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function")
+        raise PluginError(
+            f"{name!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function"
+        )
     return found
 
 
@@ -138,7 +140,7 @@ def _annotation(parameter: inspect.Parameter, names: dict[str, Any]) -> Any:
         return parameter.annotation
     try:
         return eval(parameter.annotation, names)
-    except Exception:  # noqa: BLE001 - an annotation may be any expression
+    except Exception:
         return None
 
 

@@ -14,10 +14,10 @@ from crashhunt.plan import with_settings
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box
 from crashhunt.settings import HuntSettings, read_settings
 from crashhunt.snapshot import Snapshot
-from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
+    from crashhunt.trial import TrialResult
 
 __all__ = ["ReplayReport", "Verdict", "confirm", "replay"]
 
@@ -36,7 +36,6 @@ class ReplayReport:
         replayed: the trial that was run now.
         steps_replayed: how many steps it completed.
         divergence: the first difference.
-
     """
 
     bundle: Bundle
@@ -73,7 +72,6 @@ def replay(bundle: Bundle, *, from_log: bool = False) -> ReplayReport:
     Raises:
         BundleError: the bundle is damaged.
         CrashhuntError: the replay could not be run.
-
     """
     snapshot = Snapshot(bundle.hunt / "snapshots" / bundle.snapshot)
     snapshot.verify()

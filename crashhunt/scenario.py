@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import difflib
 import os
+import string
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.errors import ArgumentError, ScenarioError
-from crashhunt.space import Argument, Constant, Distribution, Kind, Value, kind_of, parse_spec
+from crashhunt.space import Argument, Kind, Value, kind_of, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -289,12 +290,18 @@ def _check(scenario: Scenario, where: str) -> None:
             refuse("sumo", file, "does not exist", f"give a path relative to {scenario.folder}")
         if not path.is_relative_to(scenario.folder):
             refuse("sumo", file, "lies outside the scenario's folder", "move it inside, so that it can be archived")
+    for file in (*scenario.sumo.routes, *scenario.sumo.additional) if scenario.sumo else ():
+        for name in asked_for((scenario.folder / file).read_bytes()):
+            if name not in scenario.arguments:
+                refuse("arguments", sorted(scenario.arguments), f"has no {name!r}, which {file} asks for", "declare it")
     for agent, setup in scenario.agents.items():
         named = [key for key in ("existing", "route", "edges") if getattr(setup, key)]
         if scenario.sumo is not None and len(named) != 1:
             refuse(f"agents.{agent}", named, "must have one of existing, route, edges", "give exactly one of them")
         if not setup.target_speeds or list(setup.target_speeds) != sorted(set(setup.target_speeds)):
-            refuse(f"agents.{agent}.target_speeds", setup.target_speeds, "does not rise", "list speeds from low to high")
+            refuse(
+                f"agents.{agent}.target_speeds", setup.target_speeds, "does not rise", "list speeds from low to high"
+            )
     try:
         scenario.scenario_arguments()
         for agent in scenario.agents:
@@ -303,11 +310,11 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
 
 
-def resolve(argument: Argument) -> Distribution | None:
-    """Return what is tried for an argument when nobody asks for anything, or None where it is left to the agent."""
-    if argument.distribution is not None:
-        return argument.distribution
-    return Constant(argument.default) if argument.default is not None else None
+def asked_for(content: bytes) -> list[str]:
+    """Return the arguments that a file asks for as ``${NAME}``."""
+    if b"${" not in content:
+        return []
+    return string.Template(content.decode("utf-8", "replace")).get_identifiers()
 
 
 def argument_values(scenario: Scenario) -> dict[str, Value]:

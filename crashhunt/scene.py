@@ -26,7 +26,6 @@ class Actor:
         kind: the simulator's word for it, such as SUMO's vehicle class (``passenger``, ``truck``).
         length: in m.
         width: in m.
-
     """
 
     id: str
@@ -46,7 +45,6 @@ class Contact:
         lane: where.
         collider_speed: in m/s.
         victim_speed: in m/s.
-
     """
 
     collider: str
@@ -65,7 +63,6 @@ class Lane:
         id: the simulator's name of it.
         width: in m.
         shape: its centre line, as (x, y) pairs in m.
-
     """
 
     id: str
@@ -78,7 +75,6 @@ class Roster:
 
     Args:
         actors: all actors.
-
     """
 
     def __init__(self, actors: tuple[Actor, ...]) -> None:
@@ -109,7 +105,8 @@ class Roster:
 
 
 Frame = tuple[Roster, "NDArray[np.float64]"]
-"""A scene as bare columns: float64, shape (4 n,): x and y alternating, then all headings, then all speeds."""
+"""Successive scenes of the same actors, as bare columns: float64, shape (scenes, 4 n): x and y alternating, then all
+headings, then all speeds."""
 
 
 class Scene:
@@ -124,7 +121,6 @@ class Scene:
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
         lanes: the lane of each actor, or empty where this step did not look.
-
     """
 
     __slots__ = ("_neighbors", "contacts", "headings", "lanes", "off_road", "points", "roster", "speeds", "time_s")
@@ -154,7 +150,7 @@ class Scene:
     def frame(self) -> Frame:
         """The scene as bare columns."""
         flat = [value for point in self.points for value in point]
-        return self.roster, np.array([*flat, *self.headings, *self.speeds])
+        return self.roster, np.array([[*flat, *self.headings, *self.speeds]])
 
     @property
     def data(self) -> NDArray[np.float64]:
@@ -178,7 +174,7 @@ class Scene:
         found = self._neighbors.get(row)
         if found is None:
             x, y = self.points[row]
-            found = [((px - x) ** 2 + (py - y) ** 2, other) for other, (px, py) in enumerate(self.points)]
+            found = [((px - x) * (px - x) + (py - y) * (py - y), other) for other, (px, py) in enumerate(self.points)]
             del found[row]
             found.sort()
             self._neighbors[row] = found

@@ -26,7 +26,6 @@ class ArgumentSpec:
     Args:
         spec: as in ``--arg NAME=SPEC``.
         kind: the type of its values.
-
     """
 
     spec: str
@@ -57,7 +56,6 @@ class RunSettings:
         keep_trials: keep the logs of every trial.
         timeout_s: wall-clock limit of a trial, in s.
         recycle_after: trials after which a worker is replaced by a fresh one.
-
     """
 
     parallel: int = 1
@@ -86,7 +84,6 @@ class HuntSettings:
         scenario_arguments: what is tried for the scenario's arguments.
         run: how it is run.
         schema: of the file format.
-
     """
 
     scenario: str
@@ -150,7 +147,6 @@ def read_settings(path: Path) -> HuntSettings:
 
     Raises:
         HuntDirectoryError: it is missing or not valid, with the key, its value and the fix.
-
     """
     from crashhunt._validation import validate
 

@@ -33,7 +33,6 @@ class Snapshot:
 
     Args:
         path: of the folder, whose name is its digest.
-
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,7 +61,6 @@ class Snapshot:
 
         Raises:
             BundleError: with the first file that is missing, changed or new.
-
         """
         fix = "get an undamaged copy of the hunt's directory"
         try:
@@ -91,7 +89,6 @@ def take_snapshot(snapshots: Path, scenario: Scenario) -> Snapshot:
 
     Raises:
         HuntDirectoryError: the folder cannot be written.
-
     """
     building = snapshots / f".building-{os.getpid()}"
     try:

@@ -36,11 +36,11 @@ class Constant:
 
     value: Value
 
-    def sample(self, rng: np.random.Generator) -> Value:  # noqa: ARG002 - all distributions sample alike
+    def sample(self, rng: np.random.Generator) -> Value:
         """Return the value."""
         return self.value
 
-    def grid(self, points: int) -> tuple[Value, ...]:  # noqa: ARG002 - all distributions have a grid
+    def grid(self, points: int) -> tuple[Value, ...]:
         """Return the one value."""
         return (self.value,)
 
@@ -62,7 +62,7 @@ class Choice:
         """Draw one of the options."""
         return self.options[int(rng.integers(len(self.options)))]
 
-    def grid(self, points: int) -> tuple[Value, ...]:  # noqa: ARG002 - a choice has as many points as options
+    def grid(self, points: int) -> tuple[Value, ...]:
         """Return the options."""
         return self.options
 

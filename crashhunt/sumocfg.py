@@ -12,7 +12,13 @@ from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario, SumoSetup
 
 __all__ = ["load_sumocfg"]
 
-_SYNONYMS = {"net": "net-file", "n": "net-file", "route": "route-files", "r": "route-files", "additional": "additional-files"}
+_SYNONYMS = {
+    "net": "net-file",
+    "n": "net-file",
+    "route": "route-files",
+    "r": "route-files",
+    "additional": "additional-files",
+}
 _SYNONYMS |= {"a": "additional-files", "b": "begin", "e": "end", "routes": "route-files"}
 # Sections whose options concern files written, windows and remote control, none of which a trial has.
 _DROPPED_SECTIONS = {"output", "gui_only", "traci_server", "report", "random_number"}
@@ -109,7 +115,7 @@ def _seconds(text: str, path: Path) -> float:
         parts = [float(part) for part in text.split(":")]
     except ValueError:
         raise ScenarioError(f"{text!r} is not a time", fix="give seconds", where=str(path)) from None
-    return sum(part * 60**power for power, part in enumerate(reversed(parts)))
+    return sum((part * 60.0**power for power, part in enumerate(reversed(parts))), 0.0)
 
 
 def _choose_ego(ego: str, files: list[Path], path: Path) -> tuple[str, AgentSetup, str]:

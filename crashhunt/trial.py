@@ -1,4 +1,4 @@
-"""What a trial is asked (`TrialSpec`) and what it answers (`TrialResult`): plain, frozen, small, expressible as JSON."""
+"""What a trial is asked, and what it answers: plain, frozen, small, expressible as JSON."""
 
 from __future__ import annotations
 
@@ -60,7 +60,6 @@ class TrialSpec:
         arguments: agent id to argument name to value.
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
-
     """
 
     number: int
@@ -95,7 +94,6 @@ class ClosestApproach:
         time_to_collision_s: the least, at constant velocities; infinite where no course ever crossed.
         gap_m: the least distance between two outlines; 0 where they touched.
         required_deceleration: the greatest needed to avoid a collision, in m/s².
-
     """
 
     time_to_collision_s: float = math.inf
@@ -129,7 +127,6 @@ class Collision:
         lane: where the controlled vehicle was.
         collider_speed: in m/s.
         victim_speed: in m/s.
-
     """
 
     agent: str
@@ -147,8 +144,8 @@ class Collision:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Collision:
         """Rebuild it from plain data, in which null stands for a number that nobody knows."""
-        values = {name: math.nan if value is None else value for name, value in data.items()}
-        return cls(**{**values, "seen_by": tuple(data["seen_by"])})
+        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in data.items()}
+        return cls(**values | {"seen_by": tuple(data["seen_by"])})
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +159,6 @@ class Failure:
         agent: the agent in whose code it happened; empty where it was not an agent's.
         exit_code: of a process that died; negative for a signal, as in `subprocess`.
         last_output: what the process printed last.
-
     """
 
     kind: str
@@ -190,7 +186,6 @@ class TrialResult:
         setup_s: the part of it before the first step.
         worker: the process id.
         kept: whether the worker left its scratch folder for the hunt to collect.
-
     """
 
     spec: TrialSpec

@@ -11,13 +11,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 
@@ -77,7 +80,7 @@ def child_step(scenario: str) -> dict[str, float]:
 
     from crashhunt import episode
     from crashhunt.agents import KeepLaneWithSpeed
-    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+    from crashhunt.oracles import ApproachMeter, OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.simulators.sumo import SumoSimulator
@@ -141,7 +144,7 @@ def child_step(scenario: str) -> dict[str, float]:
             (episode._Run, "_check", "oracles"),
             (episode._Scribe, "scene", "record"),
             (KeepLaneWithSpeed, "act", "agent"),
-            (episode.ApproachMeter, "measure", "closest approach"),
+            (ApproachMeter, "measure", "closest approach"),
         ):
             timed(owner, name, label)
         total = whole() * steps

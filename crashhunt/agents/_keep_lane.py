@@ -22,7 +22,9 @@ class KeepLaneWithSpeed:
 
     def __init__(
         self,
-        speed: Annotated[float, Argument("speed", distribution=Range(5.0, 30.0), unit="m/s", help="held for ever")] = 15.0,
+        speed: Annotated[
+            float, Argument("speed", distribution=Range(5.0, 30.0), unit="m/s", help="held for ever")
+        ] = 15.0,
         action_space: Space[Any] | None = None,
     ) -> None:
         self.speed = speed

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,6 +20,7 @@ from crashhunt.executors._worker import Worker, worker_environment
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["FreshProcessExecutor"]
@@ -46,10 +46,9 @@ class FreshProcessExecutor:
         settings: of the hunt.
         parallel: how many processes at a time.
         recycle_after: not used; a process is never used twice.
-
     """
 
-    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:  # noqa: ARG002
+    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
         self._settings = settings
         self._parallel = parallel
         self._waiting: deque[TrialSpec] = deque()
@@ -137,7 +136,7 @@ class FreshProcessExecutor:
                 ) from None
             return died(spec, scratch, exit_code)
         if "error" in answer:
-            raise CrashhuntError(answer["error"], fix="free some space and run the same command again")
+            raise CrashhuntError(**answer["error"])
         return TrialResult.from_json(answer["result"])
 
 
@@ -153,8 +152,8 @@ def main() -> None:
     settings = WorkerSettings.from_json(job["settings"])
     try:
         answer = {"result": Worker(settings).run(TrialSpec.from_json(job["spec"])).to_json()}
-    except OSError as error:
-        answer = {"error": f"the trial could not be recorded: {error}"}
+    except CrashhuntError as error:
+        answer = error.to_json()
     temporary = f"{job['answer']}.part"
     with open(temporary, "w", encoding="utf-8") as file:
         json.dump(answer, file)

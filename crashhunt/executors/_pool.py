@@ -7,19 +7,20 @@ import os
 import queue
 import signal
 import time
-from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pebble import ProcessExpired, ProcessPool
 
-from crashhunt.errors import CrashhuntError
 from crashhunt.executors._remains import died, hung, where_it_is
 from crashhunt.executors._worker import run_trial, start_worker, worker_environment
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from pebble import ProcessFuture
 
     from crashhunt.executors._protocol import WorkerSettings
@@ -52,7 +53,6 @@ class PoolExecutor:
         settings: of the hunt.
         parallel: how many workers.
         recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
-
     """
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1000) -> None:
@@ -69,14 +69,13 @@ class PoolExecutor:
         pool = self._open()
         future = pool.schedule(run_trial, args=(spec,), timeout=self._settings.timeout_s + _START_UP_S)
         self._running[spec.number] = _Running(spec, future)
-        future.add_done_callback(lambda _, number=spec.number: self._done.put(number))
+        future.add_done_callback(partial(self._finished, spec.number))
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
         """Yield the trials that have ended, waiting so long for a first one.
 
         Raises:
-            CrashhuntError: the machinery itself failed, such as a full disk.
-
+            CrashhuntError: a trial could not even begin, for a reason that has nothing to do with it.
         """
         deadline = time.monotonic() + timeout_s
         found = False
@@ -122,6 +121,9 @@ class PoolExecutor:
             self._pool.join()
             self._pool = None
 
+    def _finished(self, number: int, _future: object) -> None:
+        self._done.put(number)
+
     def _open(self) -> ProcessPool:
         if self._pool is None or not self._pool.active:
             # The fork server has libsumo loaded, so that a new worker is there in milliseconds, not in seconds.
@@ -156,12 +158,6 @@ class PoolExecutor:
             return died(spec, scratch, int(expired.exitcode))
         except CancelledError:
             return None
-        except OSError as error:
-            raise CrashhuntError(
-                f"trial {number} could not be recorded: {error.strerror or error}",
-                fix="free some space and run the same command again",
-                where=str(scratch),
-            ) from error
         except RuntimeError:  # pebble gave up on the whole pool, because a worker died between two trials
             self._resubmit(running)
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult, TrialSpec
 
@@ -28,7 +29,6 @@ class WorkerSettings:
         code: a folder whose modules win over installed ones: the snapshot. Empty for none.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
-
     """
 
     scenario: Scenario

@@ -20,7 +20,6 @@ from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.plugins import locate, signature_of
 from crashhunt.recording import BlackBox
 from crashhunt.scene import Lane
-from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
+    from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["BLACK_BOX", "MAP", "OUTPUT", "STACK", "Worker", "read_map", "worker_environment"]
 
@@ -57,7 +57,6 @@ class Worker:
 
     Args:
         settings: of the hunt.
-
     """
 
     def __init__(self, settings: WorkerSettings) -> None:
@@ -86,7 +85,6 @@ class Worker:
 
         Raises:
             OSError: the disk is full.
-
         """
         box, folder = self._prepare(spec)
         began = time.monotonic()
@@ -116,6 +114,14 @@ class Worker:
             if result.failure is not None and result.failure.traceback:
                 (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return result
+
+    def _make_simulator(self) -> Simulator:
+        stage = self._settings.scratch / f"stage-{os.getpid()}"
+        stage.mkdir(exist_ok=True)
+        factory = locate("simulators", self._settings.scenario.simulator)
+        made: Simulator = factory(self._settings.scenario, stage)
+        self._simulator = made
+        return made
 
     def _draw_map(self, simulator: Simulator) -> None:
         """Write the map down, once for all workers, so that whoever keeps a trial can show it."""

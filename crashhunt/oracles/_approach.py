@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,8 @@ from crashhunt.oracles._geometry import rectangle_gap, time_to_contact
 from crashhunt.trial import ClosestApproach
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from crashhunt.scene import Frame, Scene
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["ApproachMeter", "approaches", "closest_approach"]
 
 _CHUNK = 256
-_SIGHT_M = 120.0
 _HORIZON_S = 10.0  # a collision course further ahead than this says nothing
 
 
@@ -68,30 +68,32 @@ def approaches(
         agent: the controlled vehicle; scenes without it are as safe as can be.
 
     Returns:
-        Time to collision (s), gap (m), required deceleration (m/s²), each of shape (frames,). Gaps of more than 50 m,
-        actors further away than 120 m and times of more than 10 s do not count.
+        Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
+        and times of more than 10 s do not count.
     """
-    count = len(frames)
+    count = sum(len(columns) for _, columns in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-    shown = [number for number, (roster, _) in enumerate(frames) if agent in roster.index]
-    if not shown:
+    xs, ys, headings, speeds, halves, steps, owns = [], [], [], [], [], [], []
+    step = first = 0
+    for roster, columns in frames:
+        scenes, actors = len(columns), len(roster)
+        row = roster.index.get(agent)
+        if row is not None:
+            xs.append(columns[:, 0 : 2 * actors : 2].ravel())
+            ys.append(columns[:, 1 : 2 * actors : 2].ravel())
+            headings.append(columns[:, 2 * actors : 3 * actors].ravel())
+            speeds.append(columns[:, 3 * actors :].ravel())
+            halves.append(np.tile(roster.half_sizes, (scenes, 1)))
+            steps.append(np.repeat(np.arange(step, step + scenes), actors))
+            owns.append(np.repeat(np.arange(first + row, first + scenes * actors, actors), actors))
+            first += scenes * actors
+        step += scenes
+    if not xs:
         return times, gaps, brakes
-    rosters, columns = [frames[number][0] for number in shown], [frames[number][1] for number in shown]
-    sizes = np.array([len(roster) for roster in rosters])
-    rows = np.array([roster.index[agent] for roster in rosters])
-    first = np.cumsum(sizes) - sizes
-    number, own = np.repeat(shown, sizes), np.repeat(first + rows, sizes)
-    position = np.concatenate([flat[: 2 * size] for flat, size in zip(columns, sizes, strict=True)]).reshape(-1, 2)
-    apart = position - position[own]
-    # Everything that costs more than a subtraction is done for those within sight only.
-    seen = np.flatnonzero(np.einsum("ij,ij->i", apart, apart) < _SIGHT_M**2)
-    own = np.searchsorted(seen, own[seen])  # the agent is within sight of itself
-    number, position = number[seen], position[seen]
-    heading = np.concatenate([flat[2 * n : 3 * n] for flat, n in zip(columns, sizes, strict=True)])[seen]
-    speed = np.concatenate([flat[3 * n :] for flat, n in zip(columns, sizes, strict=True)])[seen]
-    half = np.concatenate([roster.half_sizes for roster in rosters])[seen]
+    heading, speed, half = np.concatenate(headings), np.concatenate(speeds), np.concatenate(halves)
+    number, own = np.concatenate(steps), np.concatenate(owns)
     forward = np.stack((np.cos(heading), np.sin(heading)), axis=1)
-    center = position - half[:, :1] * forward
+    center = np.stack((np.concatenate(xs), np.concatenate(ys)), axis=1) - half[:, :1] * forward
     velocity = speed[:, None] * forward
     offset, relative = center - center[own], velocity - velocity[own]
     reach = np.hypot(half[:, 0], half[:, 1])
@@ -119,14 +121,15 @@ def approaches(
     closing = -np.einsum("ij,ij->i", offset, relative)
     squared = np.einsum("ij,ij->i", relative, relative)
     passing = np.abs(offset[:, 0] * relative[:, 1] - offset[:, 1] * relative[:, 0])
-    course = others & (closing > 0) & (passing <= reach * np.sqrt(squared)) & (distance - reach < _HORIZON_S * np.sqrt(squared))
-    course = np.flatnonzero(course)
+    closing_speed = np.sqrt(squared)
+    in_time = distance - reach < _HORIZON_S * closing_speed
+    course = np.flatnonzero(others & (closing > 0) & (passing <= reach * closing_speed) & in_time)
     if len(course):
         place, moving, turn, one, two = pairs(course)
         contact = time_to_contact(place, moving, turn, one, two)
         contact = np.where(contact <= _HORIZON_S, contact, np.inf)
         np.minimum.at(times, number[course], contact)
         with np.errstate(divide="ignore"):
-            needed = np.where(contact > 0, np.sqrt(squared[course]) / (2 * contact), 0.0)
+            needed = np.where(contact > 0, closing_speed[course] / (2 * contact), 0.0)
         np.maximum.at(brakes, number[course], needed)
     return times, gaps, brakes

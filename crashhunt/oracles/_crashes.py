@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import cos, sin
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,8 @@ from crashhunt.oracles._protocol import Finding
 from crashhunt.trial import Collision, Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from crashhunt.scene import Scene
 
 __all__ = ["OffRoad", "Overlap", "ReportedCollision"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from crashhunt.trial import Collision, Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from crashhunt.scene import Scene
 
 __all__ = ["Finding", "Oracle", "merge_findings"]

@@ -13,12 +13,13 @@ import os
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import chain
+from itertools import chain, groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.errors import BundleError
+from crashhunt.errors import BundleError, RecorderError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -99,11 +100,11 @@ class BlackBox:
         path: the file to create.
 
     Raises:
-        OSError: the disk is full, or the folder is not writable. Room is reserved before it is written to, so that
-            a full disk is an error here and not a signal later.
+        RecorderError: the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
         self._reserved = 0
         self._mapped = 0
@@ -116,7 +117,7 @@ class BlackBox:
         self._trail: list[tuple[Roster, int]] = []
         try:
             self._reserve(_FIRST)
-        except OSError:
+        except RecorderError:
             os.close(self._file)
             raise
 
@@ -201,9 +202,11 @@ class BlackBox:
 
     def take_frames(self) -> list[Frame]:
         """Return the scenes recorded since the last call, as bare columns."""
-        frames = [
-            (roster, np.frombuffer(self._map, "<f8", 4 * len(roster), offset).copy()) for roster, offset in self._trail
-        ]
+        frames: list[Frame] = []
+        for roster, run in groupby(self._trail, key=itemgetter(0)):
+            size = 32 * len(roster)
+            data = b"".join([self._map[offset : offset + size] for _, offset in run])
+            frames.append((roster, np.frombuffer(data, "<f8").reshape(-1, 4 * len(roster))))
         self._trail.clear()
         return frames
 
@@ -223,14 +226,21 @@ class BlackBox:
         self._offset = padded
 
     def _reserve(self, end: int) -> None:
-        while self._reserved < end:
-            written = os.pwrite(self._file, bytes(_CHUNK), self._reserved)
-            self._reserved += written
-        if self._reserved > self._mapped:
-            # The old mapping, where there is one, is unmapped when its last view is gone.
-            self._mapped = max(_MAPPED, 2 * self._reserved)
-            os.ftruncate(self._file, self._mapped)
-            self._map = mmap.mmap(self._file, self._mapped)
+        # Written, not only made longer: a full disk must be an error here, not a SIGBUS at the first access.
+        try:
+            while self._reserved < end:
+                self._reserved += os.pwrite(self._file, bytes(_CHUNK), self._reserved)
+            if self._reserved > self._mapped:
+                # The old mapping, where there is one, is unmapped when its last view is gone.
+                self._mapped = max(_MAPPED, 2 * self._reserved)
+                os.ftruncate(self._file, self._mapped)
+                self._map = mmap.mmap(self._file, self._mapped)
+        except OSError as error:
+            raise RecorderError(
+                f"the trial cannot be recorded: {error.strerror}",
+                fix="free some space and run the same command again",
+                where=str(self._path),
+            ) from error
 
 
 def read_header(path: Path) -> BlackBoxHeader | None:

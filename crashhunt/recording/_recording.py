@@ -68,10 +68,13 @@ class Prologue:
     def decode(cls, payload: bytes) -> Prologue:
         """Rebuild what `encode` returned."""
         data = json.loads(payload)
-        agents = tuple(
-            AgentChannel(**{name: tuple(value) if isinstance(value, list) else value for name, value in agent.items()})
-            for agent in data["agents"]
-        )
+
+        def channel(agent: dict[str, Any]) -> AgentChannel:
+            return AgentChannel(
+                **{key: tuple(value) if isinstance(value, list) else value for key, value in agent.items()}
+            )
+
+        agents = tuple(channel(agent) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Group
 from rich.live import Live
@@ -35,7 +35,6 @@ class Watcher:
     Args:
         console: where to; a terminal gets the screen, anything else lines.
         title: on top.
-
     """
 
     def __init__(self, console: Console, title: str) -> None:
@@ -44,7 +43,7 @@ class Watcher:
         self._last_line = -math.inf
         self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
 
-    def __enter__(self) -> Watcher:
+    def __enter__(self) -> Self:
         if self._live is not None:
             self._live.start()
         return self

@@ -22,10 +22,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     """Return what came of a hunt: what crashed, how, where it is, and how to replay it."""
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
-    lines = [
-        f"{ran} of {report.settings.trials} trials, {report.steps_total} steps, "
-        f"{format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"
-    ]
+    count = f"{ran} of {report.settings.trials} trials, {report.steps_total} steps"
+    lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"Not one trial was valid: {report.reason}")
     if report.stopped_because == "interrupted":

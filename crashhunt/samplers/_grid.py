@@ -26,9 +26,9 @@ class GridSampler:
 
     Raises:
         UsageError: ``points`` is below 1.
-
     """
 
+    learns = False
     only_asked = True
 
     def __init__(self, space: Space, *, points: int = 10) -> None:
@@ -41,7 +41,7 @@ class GridSampler:
         """How many combinations there are."""
         return math.prod(len(values) for _, values in self._axes)
 
-    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:  # noqa: ARG002 - the protocol's
+    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
         """Return the combination whose turn it is."""
         chosen: dict[Key, Value] = {}
         for key, values in reversed(self._axes):
@@ -62,7 +62,6 @@ class SweepSampler(GridSampler):
 
     Raises:
         UsageError: none or several arguments vary.
-
     """
 
     def __init__(self, space: Space, *, points: int = 10) -> None:
@@ -70,6 +69,6 @@ class SweepSampler(GridSampler):
         varying = [".".join(filter(None, key)) for key, values in self._axes if len(values) > 1]
         if len(varying) != 1:
             raise UsageError(
-                f"a sweep is over one argument, and {', '.join(varying) or 'none'} {'varies' if len(varying) < 2 else 'vary'}",
+                f"a sweep is over one argument, and what varies is: {', '.join(varying) or 'nothing'}",
                 fix="name one, such as --arg speed=5:30:5",
             )

@@ -32,6 +32,7 @@ class Sampler(Protocol):
     a constant in its space.
     """
 
+    learns: bool
     only_asked: bool
 
     def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
@@ -40,7 +41,6 @@ class Sampler(Protocol):
         Args:
             number: of the trial, from 0.
             rng: the trial's own generator, the same for the same hunt seed and number.
-
         """
 
     def tell(self, result: TrialResult) -> None:

@@ -20,15 +20,15 @@ class RandomSampler:
     Args:
         space: what to draw from.
         points: not used.
-
     """
 
+    learns = False
     only_asked = False
 
-    def __init__(self, space: Space, *, points: int = 10) -> None:  # noqa: ARG002 - all samplers are called alike
+    def __init__(self, space: Space, *, points: int = 10) -> None:
         self._space = sorted(space.items())
 
-    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:  # noqa: ARG002 - the protocol's
+    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
         """Return a draw."""
         return {key: distribution.sample(rng) for key, distribution in self._space}
 

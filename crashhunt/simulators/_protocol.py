@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
     from gymnasium import Space
 
     from crashhunt.scene import Scene
@@ -46,17 +47,21 @@ class Simulator(Protocol):
     A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`.
     """
 
-    agents: Sequence[str]
-    """The agents that act in the next step; those that have terminated are gone."""
+    @property
+    def agents(self) -> Sequence[str]:
+        """The agents that act in the next step; those that have terminated are gone."""
 
-    observation_spaces: Mapping[str, Space[Any]]
-    """For every possible agent."""
+    @property
+    def observation_spaces(self) -> Mapping[str, Space[Any]]:
+        """For every possible agent."""
 
-    actions: Mapping[str, ActionForm]
-    """For every possible agent."""
+    @property
+    def actions(self) -> Mapping[str, ActionForm]:
+        """For every possible agent."""
 
-    step_length_s: float
-    """Simulation time between two steps."""
+    @property
+    def step_length_s(self) -> float:
+        """Simulation time between two steps, in s."""
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode; return the first observation of every agent, and infos.

@@ -7,7 +7,6 @@ import weakref
 from typing import TYPE_CHECKING, Any
 
 import libsumo
-import numpy as np
 
 # The package's own functions each wrap one of these in a Python call, which doubles the cost of a getter; a step reads
 # some two hundred values.
@@ -23,10 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup, Scenario
-    from crashhunt.simulators._protocol import Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
 
 __all__ = ["SumoSimulator"]
 
@@ -59,11 +59,14 @@ class SumoSimulator:
         self._kinematics = Kinematics(scenario.observation)
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
-        self.actions: dict[str, SpeedAndLaneChange | MetaAction] = {
+        self.actions: dict[str, ActionForm] = {
             agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
             for agent, setup in scenario.agents.items()
         }
         self.agents: list[str] = []
+        # Without these options of SUMO a vehicle is always in the middle of a lane.
+        options = scenario.sumo.options if scenario.sumo else {}
+        self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._known: dict[str, Actor] = {}
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
@@ -71,7 +74,7 @@ class SumoSimulator:
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
-        global _current  # noqa: PLW0603 - see there
+        global _current
         arguments = (options or {}).get("arguments", {})
         command = self._files.arguments(seed, arguments)
         try:
@@ -84,7 +87,7 @@ class SumoSimulator:
         except _TRACI_ERRORS as error:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._scenario.agents)
-        self._targets = {agent: -1 for agent in self.agents}
+        self._targets = dict.fromkeys(self.agents, -1)
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._steps = 0
         self._touched: set[tuple[str, str]] = set()
@@ -319,13 +322,17 @@ class SumoSimulator:
         edge = sumo.vehicle_getRoadID(agent)
         lanes, width = self._edge(edge)
         # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
-        from_left = (lanes - 1 - sumo.vehicle_getLaneIndex(agent)) * width - sumo.vehicle_getLateralLanePosition(agent)
+        from_left = (lanes - 1 - sumo.vehicle_getLaneIndex(agent)) * width
+        lateral_speed = 0.0
+        if self._lateral:
+            from_left -= sumo.vehicle_getLateralLanePosition(agent)
+            lateral_speed = -sumo.vehicle_getLateralSpeed(agent)
         return self._kinematics.observe(
             self._scene,
             row,
             distance=sumo.vehicle_getDistance(agent) - self._start[agent],
             from_left=from_left,
-            lateral_speed=-sumo.vehicle_getLateralSpeed(agent),
+            lateral_speed=lateral_speed,
             lanes=lanes,
         )
 

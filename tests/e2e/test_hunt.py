@@ -75,7 +75,19 @@ def test_trials_do_not_depend_on_how_many_run_at_once(shell):
 def test_deterministic_gives_the_same_crash_whatever_the_parallelism(shell):
     found = []
     for parallel in ("1", "3"):
-        words = ("run", parallel, parallel, "40", "700", "--arg", "speed=18:25", "--seed", "2", "--deterministic", "--json")
+        words = (
+            "run",
+            parallel,
+            parallel,
+            "40",
+            "700",
+            "--arg",
+            "speed=18:25",
+            "--seed",
+            "2",
+            "--deterministic",
+            "--json",
+        )
         (crash,) = shell.crashhunt(*words).json["crashes"]
         found.append((crash["trial"], crash["digest"], crash["arguments"]))
     assert found[0] == found[1]
@@ -208,7 +220,9 @@ def test_workers_are_recycled(shell):
 def test_a_full_disk_is_one_clear_line_and_nothing_is_lost(shell):
     small = shell.folder / "small"
     small.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(small)], capture_output=True, check=False)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(small)], capture_output=True, check=False
+    )
     if mounted.returncode != 0:
         pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
     try:

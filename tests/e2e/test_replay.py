@@ -35,7 +35,19 @@ def crash(shell):
     (shell.folder / "my_pkg" / "agents.py").write_text(AGENT)
     (shell.folder / "helper.py").write_text("WORDS = 'out of ideas'\nGAIN = 0.01\n")
     shutil.copytree(Path(__file__).parents[2] / "scenarios" / "loop", shell.folder / "own")
-    words = ("run", "h", "1", "2", "100", "--scenario", "own", "--agent", "my_pkg.agents:Planner", "--set", "vehicles=10")
+    words = (
+        "run",
+        "h",
+        "1",
+        "2",
+        "100",
+        "--scenario",
+        "own",
+        "--agent",
+        "my_pkg.agents:Planner",
+        "--set",
+        "vehicles=10",
+    )
     shell.crashhunt(*words)
     return shell
 
@@ -61,7 +73,9 @@ def test_a_change_is_found_where_it_happens(crash):
     """Change the code in the snapshot as if it had always been so, and see what the replay says."""
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     agents = snapshot / "code" / "my_pkg" / "agents.py"
-    agents.write_text(AGENT.replace("return self.speed + self.step", "return self.speed + (self.step > 17) + self.step"))
+    agents.write_text(
+        AGENT.replace("return self.speed + self.step", "return self.speed + (self.step > 17) + self.step")
+    )
     refused = crash.crashhunt("replay", "h", expect=2)
     assert "agents.py" in refused.err
     assert "changed since" in refused.err
