@@ -1,4 +1,9 @@
-"""Recordings: the black box while it happens, ``log.mcap`` of what is kept, and the comparison of two."""
+"""Recordings: the black box while it happens, ``log.mcap`` of what is kept, and the comparison of two.
+
+Writing and reading logs needs MCAP and protobuf, which a worker never does: they are imported at first use.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.recording._blackbox import BlackBox, BlackBoxHeader, Phase, Record, Tag, read_black_box, read_header
 from crashhunt.recording._compare import Divergence, first_divergence
@@ -12,6 +17,10 @@ from crashhunt.recording._recording import (
     encode_events,
 )
 
+if TYPE_CHECKING:
+    from crashhunt.recording._log import read_log, write_log
+    from crashhunt.recording._views import foxglove_layout
+
 __all__ = [
     "AgentChannel",
     "BlackBox",
@@ -21,12 +30,27 @@ __all__ = [
     "encode_actors",
     "encode_events",
     "first_divergence",
+    "foxglove_layout",
     "Phase",
     "Prologue",
     "read_black_box",
     "read_header",
+    "read_log",
     "Record",
     "Recording",
     "StepRecord",
     "Tag",
+    "write_log",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("read_log", "write_log"):
+        from crashhunt.recording import _log
+
+        return getattr(_log, name)
+    if name == "foxglove_layout":
+        from crashhunt.recording._views import foxglove_layout
+
+        return foxglove_layout
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

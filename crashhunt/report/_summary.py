@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 __all__ = ["describe_hunt", "describe_replay"]
 
 _SHOWN = 10
+_WITNESSES = {
+    ("overlap", "reported"): "the simulator reports it, and the outlines overlap",
+    ("overlap",): "the outlines overlap; the simulator does not report it",
+    ("reported",): "the simulator reports it; the outlines do not overlap",
+}
 
 
 def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
@@ -93,7 +98,9 @@ def _evidence(result: TrialResult) -> list[str]:
         speeds = f"{hit.collider} at {hit.collider_speed:.1f} m/s"
         if hit.victim:
             speeds += f", {hit.victim} at {hit.victim_speed:.1f} m/s"
-        lines.append(f"{where}; {speeds}; seen by {' and '.join(hit.seen_by)}")
+        lines.append(f"{where}; {speeds}")
+        if hit.victim:
+            lines.append(_WITNESSES.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
     if failure is not None:
         frames = failure.traceback.strip().splitlines()
         # Python prints the most recent call last; faulthandler, which speaks for the dead and the stuck, first.

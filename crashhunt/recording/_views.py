@@ -1,0 +1,247 @@
+"""The view channels of a log, in Foxglove's own schemas, so that Foxglove and Lichtblick show something at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from crashhunt.oracles import approaches
+from crashhunt.recording import _schemas as schemas
+
+if TYPE_CHECKING:
+    from crashhunt.recording._log import LogWriter
+    from crashhunt.recording._recording import Recording
+    from crashhunt.scene import Actor, Lane, Scene
+    from crashhunt.trial import TrialResult
+
+__all__ = ["foxglove_layout", "write_views"]
+
+_MAP_REACH_M = 300.0
+_HEIGHT_M = 1.5
+_COLORS = {
+    "ego": (1.0, 0.8, 0.1, 1.0),
+    "agent": (0.2, 0.8, 0.4, 1.0),
+    "party": (0.95, 0.2, 0.2, 1.0),
+    "other": (0.55, 0.6, 0.68, 1.0),
+    "border": (0.45, 0.45, 0.5, 1.0),
+}
+
+
+def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], crash: TrialResult | None) -> None:
+    """Write all view channels.
+
+    Args:
+        log: where to.
+        recording: what happened.
+        lanes: of the map; those far from every controlled vehicle are left out.
+        crash: how it ended.
+    """
+    scenes = recording.scenes()
+    if not scenes or not recording.agents:
+        return
+    _write_map(log, recording, scenes, lanes)
+    _write_scenes(log, recording, scenes, crash)
+    _write_metrics(log, recording.agents[0], scenes)
+    if crash is not None:
+        _write_crash(log, recording, scenes[-1], crash)
+
+
+def foxglove_layout(recording: Recording) -> dict[str, Any]:
+    """Return a layout for Foxglove or Lichtblick: the scene from above, the metrics, the log."""
+    ego = recording.agents[0] if recording.agents else "map"
+    paths = [
+        {"value": f"/metrics.{field}", "enabled": True, "timestampMethod": "receiveTime"}
+        for field in ("speed", "time_to_collision_s", "gap_m")
+    ]
+    return {
+        "configById": {
+            "3D!scene": {
+                "cameraState": {
+                    "perspective": False,
+                    "distance": 120,
+                    "phi": 0,
+                    "thetaOffset": 0,
+                    "targetOffset": [0, 0, 0],
+                    "target": [0, 0, 0],
+                    "targetOrientation": [0, 0, 0, 1],
+                    "fovy": 45,
+                    "near": 0.5,
+                    "far": 5000,
+                },
+                "followMode": "follow-position",
+                "followTf": ego,
+                "topics": {topic: {"visible": True} for topic in ("/map", "/scene/actors", "/scene/crash")},
+            },
+            "Plot!metrics": {"paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"},
+            "RosOut!log": {"topicToRender": "/log", "searchTerms": [], "minLogLevel": 1},
+        },
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {
+            "first": "3D!scene",
+            "second": {"first": "Plot!metrics", "second": "RosOut!log", "direction": "column", "splitPercentage": 70},
+            "direction": "row",
+            "splitPercentage": 65,
+        },
+    }
+
+
+def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], lanes: Sequence[Lane]) -> None:
+    """Both borders of every lane that a controlled vehicle came near, once, at the beginning."""
+    from crashhunt.recording._log import to_ns
+
+    rows = [(scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents]
+    driven = np.array([scene.points[row] for scene, row in rows if row is not None]).reshape(-1, 2)
+    if not len(driven):
+        return
+    low, high = driven.min(axis=0) - _MAP_REACH_M, driven.max(axis=0) + _MAP_REACH_M
+    entity = SceneEntity(id="lanes", frame_id="map")
+    _stamp(entity.timestamp, scenes[0].time_s)
+    for lane in lanes:
+        shape = np.array(lane.shape, dtype=float).reshape(-1, 2)
+        if len(shape) < 2 or not ((shape.max(axis=0) >= low) & (shape.min(axis=0) <= high)).all():
+            continue
+        for side in (-0.5, 0.5):
+            line = entity.lines.add(
+                type=LinePrimitive.LINE_STRIP, thickness=0.12, scale_invariant=False, color=_color("border")
+            )
+            line.pose.orientation.w = 1.0
+            for x, y in _shifted(shape, side * lane.width).tolist():
+                line.points.add(x=x, y=y)
+    log.write("/map", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), to_ns(scenes[0].time_s))
+
+
+def _shifted(shape: Any, distance: float) -> Any:
+    """A polyline moved sideways, to the left for a positive distance."""
+    along = np.gradient(shape, axis=0)
+    norm = np.hypot(along[:, 0], along[:, 1])
+    norm[norm == 0] = 1.0
+    left = np.stack((-along[:, 1], along[:, 0]), axis=1) / norm[:, None]
+    return shape + distance * left
+
+
+def _write_scenes(
+    log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None
+) -> None:
+    from crashhunt.recording._log import to_ns
+
+    # Making a message is dear, changing one is cheap: each actor has one that is changed and serialised in every
+    # step. A SceneUpdate is then put together from these; on the wire it is nothing but its parts in a row.
+    boxes: dict[Actor, Any] = {}
+    transforms = FrameTransforms()
+    children = {agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents}
+    pose = PoseInFrame(frame_id="map")
+    parties = _parties(crash)
+    lifetime_ns = round(recording.prologue.step_length_s * 1.1e9)
+    for scene in scenes:
+        time_ns = to_ns(scene.time_s)
+        seconds, nanos = divmod(time_ns, 1_000_000_000)
+        centers = scene.centers.tolist()
+        parts = []
+        for row, actor in enumerate(scene.roster.actors):
+            box = boxes.get(actor)
+            if box is None:
+                box = boxes[actor] = _box(actor, recording.agents, parties, lifetime_ns)
+            (x, y), half = centers[row], scene.headings[row] / 2
+            place = box.cubes[0].pose
+            place.position.x, place.position.y = x, y
+            z, w = math.sin(half), math.cos(half)
+            place.orientation.z, place.orientation.w = z, w
+            box.timestamp.seconds, box.timestamp.nanos = seconds, nanos
+            data = box.SerializeToString()
+            parts.append(b"\x12" + _varint(len(data)) + data)  # field 2, entities
+            child = children.get(actor.id)
+            if child is not None:
+                child.timestamp.seconds, child.timestamp.nanos = seconds, nanos
+                child.translation.x, child.translation.y = x, y
+                child.rotation.z, child.rotation.w = z, w
+                if actor.id == recording.agents[0]:
+                    pose.timestamp.seconds, pose.timestamp.nanos = seconds, nanos
+                    pose.pose.position.x, pose.pose.position.y = x, y
+                    pose.pose.orientation.z, pose.pose.orientation.w = z, w
+        log.write("/scene/actors", SceneUpdate, b"".join(parts), time_ns)
+        log.write("/tf", FrameTransforms, transforms.SerializeToString(), time_ns)
+        log.write("/ego/pose", PoseInFrame, pose.SerializeToString(), time_ns)
+
+
+def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> Any:
+    role = "ego" if actor.id == agents[0] else "agent" if actor.id in agents else "party" if actor.id in parties else "other"
+    entity = SceneEntity(id=actor.id, frame_id="map")
+    # Just over one step: a viewer that jumps shows the latest message only, and an actor that left disappears.
+    entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
+    entity.metadata.add(key="kind", value=actor.kind)
+    cube = entity.cubes.add(color=_color(role))
+    cube.size.x, cube.size.y, cube.size.z = actor.length, actor.width, _HEIGHT_M
+    cube.pose.position.z = _HEIGHT_M / 2
+    return entity
+
+
+def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
+    from crashhunt.recording._log import to_ns
+
+    times, gaps, brakes = approaches([scene.frame for scene in scenes], agent)
+    for scene, time, gap, brake in zip(scenes, times.tolist(), gaps.tolist(), brakes.tolist(), strict=True):
+        row = scene.roster.index.get(agent)
+        speed = scene.speeds[row] if row is not None else math.nan
+        metrics = schemas.Metrics(
+            speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake
+        )
+        log.write("/metrics", schemas.Metrics, metrics.SerializeToString(), to_ns(scene.time_s))
+
+
+def _write_crash(log: LogWriter, recording: Recording, scene: Scene, crash: TrialResult) -> None:
+    from crashhunt.recording._log import to_ns
+
+    time_ns = to_ns(scene.time_s)
+    line = Log(level=Log.ERROR, message=f"{crash.outcome}: {crash.summary}", name="crashhunt")
+    _stamp(line.timestamp, scene.time_s)
+    log.write("/log", Log, line.SerializeToString(), time_ns)
+    row = scene.roster.index.get(crash.collision.agent if crash.collision else recording.agents[0])
+    if row is None:
+        return
+    x, y = scene.points[row]
+    entity = SceneEntity(id="crash", frame_id="map")
+    _stamp(entity.timestamp, scene.time_s)
+    text = entity.texts.add(text=str(crash.outcome), font_size=2.0, billboard=True, color=_color("party"))
+    text.pose.position.x, text.pose.position.y, text.pose.position.z = x, y, 4.0
+    text.pose.orientation.w = 1.0
+    ring = entity.lines.add(type=LinePrimitive.LINE_LOOP, thickness=0.3, color=_color("party"))
+    ring.pose.orientation.w = 1.0
+    for angle in np.linspace(0, 2 * np.pi, 32, endpoint=False).tolist():
+        ring.points.add(x=x + 5 * math.cos(angle), y=y + 5 * math.sin(angle), z=0.1)
+    log.write("/scene/crash", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), time_ns)
+
+
+def _parties(crash: TrialResult | None) -> tuple[str, ...]:
+    return (crash.collision.collider, crash.collision.victim) if crash and crash.collision else ()
+
+
+def _color(name: str) -> Any:
+    red, green, blue, alpha = _COLORS[name]
+    return Color(r=red, g=green, b=blue, a=alpha)
+
+
+def _stamp(timestamp: Any, time_s: float) -> None:
+    from crashhunt.recording._log import to_ns
+
+    timestamp.seconds, timestamp.nanos = divmod(to_ns(time_s), 1_000_000_000)
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
