@@ -398,12 +398,6 @@ class Hunt:
                     fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
                     where=str(self.directory),
                 )
-        elif self._foreign():
-            raise HuntDirectoryError(
-                f"the folder is not empty and not a hunt: it has {self._foreign()[0]!r}",
-                fix="give an empty or a new folder",
-                where=str(self.directory),
-            )
         shutil.rmtree(self._scratch, ignore_errors=True)
         try:
             self._scratch.mkdir()
@@ -411,8 +405,16 @@ class Hunt:
         except OSError as error:
             raise self._unusable(error) from error
 
-    def _foreign(self) -> list[str]:
-        return sorted(path.name for path in self.directory.iterdir() if path.name not in (".lock", ".scratch"))
+    def _refuse_foreign(self) -> None:
+        if (self.directory / "hunt.toml").exists():
+            return
+        foreign = sorted(path.name for path in self.directory.iterdir() if path.name not in (".lock", ".scratch"))
+        if foreign:
+            raise HuntDirectoryError(
+                f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
+                fix="give an empty or a new folder",
+                where=str(self.directory),
+            )
 
     def _unusable(self, error: OSError) -> HuntDirectoryError:
         if isinstance(error, FileExistsError):
@@ -428,6 +430,7 @@ class Hunt:
         """Keep other hunts out, by a lock that dies with this process."""
         try:
             self.directory.mkdir(exist_ok=True)
+            self._refuse_foreign()
             lock = (self.directory / ".lock").open("a+")
         except OSError as error:
             raise self._unusable(error) from error

@@ -121,9 +121,12 @@ class Scene:
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
         lanes: the lane of each actor, or empty where this step did not look.
+
+    Attributes:
+        agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
     """
 
-    __slots__ = ("_neighbors", "contacts", "headings", "lanes", "off_road", "points", "roster", "speeds", "time_s")
+    __slots__ = ("_neighbors", "agent_lanes", "contacts", "headings", "lanes", "off_road", "points", "roster", "speeds", "time_s")
 
     def __init__(
         self,
@@ -144,6 +147,7 @@ class Scene:
         self.contacts = contacts
         self.off_road = off_road
         self.lanes = lanes
+        self.agent_lanes: dict[str, str] = {}
         self._neighbors: dict[int, list[tuple[float, int]]] = {}
 
     @property

@@ -126,4 +126,4 @@ def _where(scene: Scene, agent: str) -> tuple[float, float, str]:
     if row is None:
         return float("nan"), float("nan"), ""
     x, y = scene.points[row]
-    return x, y, scene.lanes[row] if scene.lanes else ""
+    return x, y, scene.lanes[row] if scene.lanes else scene.agent_lanes.get(agent, "")

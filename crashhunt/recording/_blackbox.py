@@ -205,8 +205,8 @@ class BlackBox:
         frames: list[Frame] = []
         for roster, run in groupby(self._trail, key=itemgetter(0)):
             size = 32 * len(roster)
-            data = b"".join([self._map[offset : offset + size] for _, offset in run])
-            frames.append((roster, np.frombuffer(data, "<f8").reshape(-1, 4 * len(roster))))
+            scenes = [self._map[offset : offset + size] for _, offset in run]
+            frames.append((roster, np.frombuffer(b"".join(scenes), "<f8").reshape(len(scenes), 4 * len(roster))))
         self._trail.clear()
         return frames
 

@@ -322,7 +322,9 @@ class SumoSimulator:
         edge = sumo.vehicle_getRoadID(agent)
         lanes, width = self._edge(edge)
         # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
-        from_left = (lanes - 1 - sumo.vehicle_getLaneIndex(agent)) * width
+        lane = sumo.vehicle_getLaneIndex(agent)
+        self._scene.agent_lanes[agent] = f"{edge}_{lane}"
+        from_left = (lanes - 1 - lane) * width
         lateral_speed = 0.0
         if self._lateral:
             from_left -= sumo.vehicle_getLateralLanePosition(agent)
