@@ -317,6 +317,18 @@ def asked_for(content: bytes) -> list[str]:
     return string.Template(content.decode("utf-8", "replace")).get_identifiers()
 
 
+def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
+    """Return the scenario with another form of action for one agent.
+
+    Raises:
+        ScenarioError: there is no such form.
+    """
+    if action not in ("continuous", "meta"):
+        raise ScenarioError(f"there is no form of action {action!r}", fix="give continuous or meta")
+    setup = replace(scenario.agents[agent], action=action)  # type: ignore[arg-type]
+    return replace(scenario, agents={**scenario.agents, agent: setup})
+
+
 def argument_values(scenario: Scenario) -> dict[str, Value]:
     """Return the default of every scenario argument."""
     return {name: setup.default for name, setup in scenario.arguments.items() if setup.default is not None}

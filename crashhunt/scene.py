@@ -126,7 +126,18 @@ class Scene:
         agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
     """
 
-    __slots__ = ("_neighbors", "agent_lanes", "contacts", "headings", "lanes", "off_road", "points", "roster", "speeds", "time_s")
+    __slots__ = (
+        "_neighbors",
+        "agent_lanes",
+        "contacts",
+        "headings",
+        "lanes",
+        "off_road",
+        "points",
+        "roster",
+        "speeds",
+        "time_s",
+    )
 
     def __init__(
         self,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -26,6 +25,7 @@ from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.recording._recording import Prologue, Recording
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.scene import Lane
@@ -35,7 +35,12 @@ __all__ = ["read_log", "write_log"]
 
 SCHEMA = "1"
 _STEP = struct.Struct("<qd")
-_TEXTS = {Tag.PROLOGUE: "/prologue", Tag.ACTORS: "/scene/actor_definitions", Tag.LANES: "/scene/lanes", Tag.EVENTS: "/events"}
+_TEXTS = {
+    Tag.PROLOGUE: "/prologue",
+    Tag.ACTORS: "/scene/actor_definitions",
+    Tag.LANES: "/scene/lanes",
+    Tag.EVENTS: "/events",
+}
 
 
 class LogWriter:
@@ -141,7 +146,7 @@ def read_log(path: Path) -> Recording:
         raise refuse(error.message, error.fix) from None
     except (McapError, ValueError, KeyError, IndexError, EOFError, struct.error, OverflowError, MemoryError) as error:
         raise refuse(f"not a whole MCAP file: {type(error).__name__}: {error}") from None
-    except Exception as error:  # noqa: BLE001 - the decompressors and protobuf have errors of their own
+    except Exception as error:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
 
 
@@ -212,29 +217,27 @@ def _write_evidence(log: LogWriter, recording: Recording) -> None:
 
 
 def _read_evidence(evidence: Sequence[tuple[int, str, bytes]]) -> Iterator[Record]:
-    readers: dict[str, Callable[[bytes], Record]] = {
-        "/scene": _read_step,
-        "/scene/roster": lambda data: Record(
-            Tag.ROSTER, 0, np.array(schemas.Roster.FromString(data).actors, "<u4").tobytes()
-        ),
-    }
-    for tag, topic in _TEXTS.items():
-        readers[topic] = lambda data, tag=tag: Record(tag, 0, schemas.Text.FromString(data).text.encode())  # type: ignore[misc]
+    texts = {topic: tag for tag, topic in _TEXTS.items()}
+    arrays: dict[str, tuple[int, int, _ArrayCodec]] = {}
     for expected, (sequence, topic, data) in enumerate(evidence, 1):
         if sequence != expected:
             raise BundleError(f"message {expected} of the evidence is missing", fix="get an undamaged copy of it")
-        record = readers[topic](data)
-        if record.tag == Tag.PROLOGUE:
-            for (tag, agent), codec in _codecs(Prologue.decode(record.payload)).items():
-                readers[codec.topic] = lambda data, tag=tag, agent=agent, codec=codec: Record(  # type: ignore[misc]
-                    tag, agent, codec.decode(data)
-                )
-        yield record
+        if topic == "/scene":
+            yield _read_step(data)
+        elif topic == "/scene/roster":
+            yield Record(Tag.ROSTER, 0, np.array(schemas.Roster.FromString(data).actors, "<u4").tobytes())
+        elif topic in texts:
+            payload = schemas.Text.FromString(data).text.encode()
+            if texts[topic] == Tag.PROLOGUE:
+                codecs = _codecs(Prologue.decode(payload))
+                arrays = {codec.topic: (tag, agent, codec) for (tag, agent), codec in codecs.items()}
+            yield Record(texts[topic], 0, payload)
+        else:
+            tag, agent, codec = arrays[topic]
+            yield Record(tag, agent, codec.decode(data))
 
 
 def _read_step(data: bytes) -> Record:
     step = schemas.Step.FromString(data)
     values = np.array([*step.rewards, *step.positions, *step.headings, *step.speeds], "<f8")
     return Record(Tag.STEP, 0, _STEP.pack(step.step, step.time_s) + values.tobytes())
-
-

@@ -68,13 +68,11 @@ class Prologue:
     def decode(cls, payload: bytes) -> Prologue:
         """Rebuild what `encode` returned."""
         data = json.loads(payload)
-
-        def channel(agent: dict[str, Any]) -> AgentChannel:
-            return AgentChannel(
-                **{key: tuple(value) if isinstance(value, list) else value for key, value in agent.items()}
-            )
-
-        agents = tuple(channel(agent) for agent in data["agents"])
+        channels: list[dict[str, Any]] = [
+            {name: tuple(value) if isinstance(value, list) else value for name, value in agent.items()}
+            for agent in data["agents"]
+        ]
+        agents = tuple(AgentChannel(**channel) for channel in channels)
         return cls(agents, data["step_length_s"])
 
 

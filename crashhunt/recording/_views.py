@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +18,8 @@ from crashhunt.oracles import approaches
 from crashhunt.recording import _schemas as schemas
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from crashhunt.recording._log import LogWriter
     from crashhunt.recording._recording import Recording
     from crashhunt.scene import Actor, Lane, Scene
@@ -131,16 +132,16 @@ def _shifted(shape: Any, distance: float) -> Any:
     return shape + distance * left
 
 
-def _write_scenes(
-    log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None
-) -> None:
+def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None) -> None:
     from crashhunt.recording._log import to_ns
 
     # Making a message is dear, changing one is cheap: each actor has one that is changed and serialised in every
     # step. A SceneUpdate is then put together from these; on the wire it is nothing but its parts in a row.
     boxes: dict[Actor, Any] = {}
     transforms = FrameTransforms()
-    children = {agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents}
+    children = {
+        agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents
+    }
     pose = PoseInFrame(frame_id="map")
     parties = _parties(crash)
     lifetime_ns = round(recording.prologue.step_length_s * 1.1e9)
@@ -176,7 +177,15 @@ def _write_scenes(
 
 
 def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> Any:
-    role = "ego" if actor.id == agents[0] else "agent" if actor.id in agents else "party" if actor.id in parties else "other"
+    role = (
+        "ego"
+        if actor.id == agents[0]
+        else "agent"
+        if actor.id in agents
+        else "party"
+        if actor.id in parties
+        else "other"
+    )
     entity = SceneEntity(id=actor.id, frame_id="map")
     # Just over one step: a viewer that jumps shows the latest message only, and an actor that left disappears.
     entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
@@ -194,9 +203,7 @@ def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
     for scene, time, gap, brake in zip(scenes, times.tolist(), gaps.tolist(), brakes.tolist(), strict=True):
         row = scene.roster.index.get(agent)
         speed = scene.speeds[row] if row is not None else math.nan
-        metrics = schemas.Metrics(
-            speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake
-        )
+        metrics = schemas.Metrics(speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake)
         log.write("/metrics", schemas.Metrics, metrics.SerializeToString(), to_ns(scene.time_s))
 
 

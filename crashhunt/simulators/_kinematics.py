@@ -57,10 +57,15 @@ class Kinematics:
 
     @property
     def space(self) -> Space[Any]:
-        """The Gymnasium space, the same as highway-env's."""
+        """The Gymnasium space: highway-env's, with bounds that no simulation reaches instead of infinite ones."""
         from gymnasium import spaces
 
-        return spaces.Box(-np.inf, np.inf, self.shape, np.float32)
+        limits = dict.fromkeys(_ALL, 1.0) | {"heading": float(np.float32(np.pi))}
+        if not self._normalize:
+            limits |= {"x": 1e6, "y": 1e6, "vx": 1e3, "vy": 1e3}
+        high = np.tile([limits[feature] for feature in self.features], (self.shape[0], 1)).astype(np.float32)
+        low = np.where([feature == "presence" for feature in self.features], 0.0, -high).astype(np.float32)
+        return spaces.Box(low, high, self.shape, np.float32)
 
     def blank(self) -> NDArray[np.float32]:
         """What an agent is shown that is no longer there."""
@@ -86,7 +91,8 @@ class Kinematics:
         center_x, center_y = x - half * own_cos, y - half * own_sin
         own_vx, own_vy = speed * own_cos, speed * own_sin
         select = self._select if not self._normalize else self._normalized(lanes)
-        values = [*select((1.0, distance, from_left, speed, lateral_speed, -heading, own_cos, -own_sin))]
+        own = (1.0, distance, from_left, speed, lateral_speed, atan2(-own_sin, own_cos), own_cos, -own_sin)
+        values = [*select(own)]
         usual = self._usual
         nearest = scene.neighbors(row)[: self._others]
         for _, other in nearest:

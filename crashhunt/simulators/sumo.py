@@ -100,6 +100,11 @@ class SumoSimulator:
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
         self._off_road = []
+        if _current is None or _current() is not self:
+            raise SimulatorError(
+                "another simulator of this process has been reset since",
+                fix="run one simulation at a time, or each in a process of its own",
+            )
         try:
             for agent, action in actions.items():
                 self._apply(agent, action)

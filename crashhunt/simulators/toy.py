@@ -1,0 +1,175 @@
+"""A toy: one straight lane, the controlled vehicles one behind the other, and a leader that brakes now and then.
+
+It is pure Python, takes microseconds a step, and can be told to fail in every way in which a simulator can: the double
+for tests, and the shortest example of the protocol.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.simulators._actions import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators._kinematics import Kinematics
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+
+__all__ = ["ToySimulator"]
+
+_LENGTH_M, _WIDTH_M = 5.0, 1.8
+_ACCELERATION, _BRAKING = 3.0, 8.0
+_LEADER = "leader"
+
+
+class ToySimulator:
+    """Drives along the x axis.
+
+    Scenario arguments, all optional: ``leader_speed`` (m/s, 10), ``gap_m`` (bumper to bumper at the start, 30),
+    ``road_m`` (1000), ``step_wall_s`` (wall time that a step takes at least), and to fail on purpose: ``fail_reset``
+    (bool), and the step at which to ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``.
+
+    Args:
+        scenario: its agents and its step length.
+        stage: not used.
+    """
+
+    def __init__(self, scenario: Scenario, stage: Path) -> None:
+        self.step_length_s = scenario.step_length_s
+        self._setups = scenario.agents
+        self._kinematics = Kinematics(scenario.observation)
+        self.observation_names = self._kinematics.features
+        self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
+        self.actions: dict[str, ActionForm] = {
+            agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
+            for agent, setup in scenario.agents.items()
+        }
+        self.agents: list[str] = []
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Put everybody on the road, the leader in front."""
+        self._arguments = dict((options or {}).get("arguments", {}))
+        if self._argument("fail_reset", default=False):
+            raise InvalidEpisodeError("the toy was told to fail")
+        self._rng = np.random.default_rng(seed)
+        self._step = 0
+        self.agents = list(self._setups)
+        spacing = _LENGTH_M + float(self._argument("gap_m", 30.0))
+        names = [*self.agents, _LEADER]
+        self._x = {name: spacing * place for place, name in enumerate(names)}
+        self._v = dict.fromkeys(names, float(self._argument("leader_speed", 10.0)))
+        self._start = dict(self._x)
+        self._touched: set[str] = set()
+        self._enlist()
+        self._look(())
+        return {agent: self._observe(agent) for agent in self.agents}, {}
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Move everybody; the reward is the distance driven, in m."""
+        self._step += 1
+        self._fail_as_told()
+        wanted = {agent: self._target(agent, action) for agent, action in actions.items()}
+        cruising = float(self._argument("leader_speed", 10.0))
+        wanted[_LEADER] = 0.0 if self._rng.random() < 0.05 else cruising
+        for name, target in wanted.items():
+            change = min(
+                max(target - self._v[name], -_BRAKING * self.step_length_s), _ACCELERATION * self.step_length_s
+            )
+            self._v[name] = max(0.0, self._v[name] + change)
+            self._x[name] += self._v[name] * self.step_length_s
+        contacts = self._contacts(list(actions))
+        hit = {contact.collider for contact in contacts}
+        road = float(self._argument("road_m", 1000.0))
+        arrived = {agent for agent in actions if self._x[agent] >= road and agent not in hit}
+        rewards = {agent: self._v[agent] * self.step_length_s for agent in actions}
+        terminations = {agent: agent in hit or agent in arrived for agent in actions}
+        self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
+        if arrived:
+            for agent in arrived:
+                del self._x[agent]
+            self._enlist()
+        self._look(contacts)
+        observations = {
+            agent: self._observe(agent) if agent in self._x else self._kinematics.blank() for agent in actions
+        }
+        return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
+
+    def scene(self) -> Scene:
+        """Return the state of everybody."""
+        return self._scene
+
+    def lanes(self) -> list[Lane]:
+        """Return the one lane."""
+        return [Lane("road_0", 3.5, ((0.0, 0.0), (float(self._argument("road_m", 1000.0)), 0.0)))]
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def _argument(self, name: str, default: Any) -> Any:
+        return self._arguments.get(name, default)
+
+    def _fail_as_told(self) -> None:
+        time.sleep(float(self._argument("step_wall_s", 0.0)))
+        if self._step == self._argument("fail_at_step", 0):
+            raise SimulatorError("the toy was told to fail")
+        if self._step == self._argument("exit_at_step", 0):
+            os._exit(3)
+        if self._step == self._argument("segfault_at_step", 0):
+            ctypes.string_at(0)
+        if self._step == self._argument("hang_at_step", 0):
+            ctypes.PyDLL(None).sleep(3600)  # keeps the interpreter to itself, as a simulator's own code may
+
+    def _target(self, agent: str, action: NDArray[np.generic]) -> float:
+        if self._setups[agent].action != "meta":
+            return float(action[0])
+        shift = {3: 5.0, 4: -5.0}.get(int(action[0]), 0.0)
+        return max(0.0, self._v[agent] + shift)
+
+    def _contacts(self, agents: list[str]) -> tuple[Contact, ...]:
+        """Who drove into whoever is in front of it, in this step for the first time."""
+        found = []
+        for agent in agents:
+            ahead = min(
+                (name for name in self._x if self._x[name] > self._x[agent]), key=self._x.__getitem__, default=None
+            )
+            if ahead is not None and agent not in self._touched and self._x[agent] > self._x[ahead] - _LENGTH_M:
+                self._touched.add(agent)
+                found.append(Contact(agent, ahead, "collision", "road_0", self._v[agent], self._v[ahead]))
+        return tuple(found)
+
+    def _enlist(self) -> None:
+        self._roster = Roster(tuple(Actor(name, "passenger", _LENGTH_M, _WIDTH_M) for name in sorted(self._x)))
+
+    def _look(self, contacts: tuple[Contact, ...]) -> None:
+        names = sorted(self._x)
+        self._scene = Scene(
+            self._step * self.step_length_s,
+            self._roster,
+            [(self._x[name], 0.0) for name in names],
+            [0.0] * len(names),
+            [self._v[name] for name in names],
+            contacts,
+            lanes=("road_0",) * len(names) if self._step % 10 == 0 or contacts else (),
+        )
+
+    def _observe(self, agent: str) -> NDArray[np.float32]:
+        return self._kinematics.observe(
+            self._scene,
+            self._roster.index[agent],
+            distance=self._x[agent] - self._start[agent],
+            from_left=0.0,
+            lateral_speed=0.0,
+            lanes=1,
+        )
