@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.errors import ArgumentError, ScenarioError
+from crashhunt.simulators._sumo_files import RESERVED
 from crashhunt.space import Argument, Kind, Value, kind_of, parse_spec
 
 if TYPE_CHECKING:
@@ -284,6 +285,9 @@ def _check(scenario: Scenario, where: str) -> None:
         refuse("observation.vehicles", scenario.observation.vehicles, "is below 1", "give at least 1")
     if scenario.simulator == "sumo" and scenario.sumo is None:
         refuse("sumo", None, "is missing", "add a table [sumo] with net and routes")
+    for option in scenario.sumo.options if scenario.sumo else ():
+        if option in RESERVED:
+            refuse("sumo.options", option, "is an option that crashhunt sets itself", "remove it")
     for file in scenario.files():
         path = Path(os.path.normpath(scenario.folder / file))
         if not path.is_file():

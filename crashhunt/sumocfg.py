@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario, SumoSetup
+from crashhunt.simulators._sumo_files import RESERVED
 
 __all__ = ["load_sumocfg"]
 
@@ -71,9 +73,9 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     )
     begin = _seconds(options.get("begin", "0"), path)
     step_length = _seconds(options.get("step-length", "1"), path)
-    kept = {key: value for key, value in options.items() if key not in _DROPPED}
+    kept = {key: value for key, value in options.items() if key not in _DROPPED | RESERVED}
     agent, setup, note = _choose_ego(ego, [folder / file for file in (*routes, *additional)], path)
-    scale = float(options.get("scale", "1"))
+    scale = _number(options.get("scale", "1"), "scale", path)
     return Scenario(
         title=f"{path.name}, as it is",
         name=path.name.removesuffix(".sumocfg"),
@@ -108,6 +110,13 @@ def _read_options(path: Path) -> dict[str, str]:
 
 def _split(value: str) -> list[str]:
     return [part for part in value.replace(" ", ",").split(",") if part]
+
+
+def _number(text: str, option: str, path: Path) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ScenarioError(f"{option} = {text!r} is not a number", fix="give a number", where=str(path)) from None
 
 
 def _seconds(text: str, path: Path) -> float:
@@ -165,12 +174,14 @@ def _departures(files: list[Path]) -> list[_Departure]:
 def _elements(files: list[Path], *tags: str) -> list[ET.Element]:
     found = []
     for file in files:
+        opened = gzip.open if file.suffix == ".gz" else open
         try:
-            for _, element in ET.iterparse(file):
-                if element.tag in tags:
-                    found.append(element)
-                elif element.tag not in ("routes", "additional"):
-                    element.clear()
-        except ET.ParseError as error:
+            with opened(file, "rb") as content:
+                for _, element in ET.iterparse(content):
+                    if element.tag in tags:
+                        found.append(element)
+                    elif element.tag not in ("routes", "additional"):
+                        element.clear()
+        except (ET.ParseError, gzip.BadGzipFile, EOFError) as error:
             raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(file)) from None
     return found
