@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from episodes import Episode, episodes, record
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from crashhunt.errors import BundleError
+from crashhunt.recording import foxglove_layout, read_log, write_log
+from crashhunt.scene import Lane
+from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+
+shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30)
+LANES = [Lane("x_0", 3.2, ((0.0, 0.0), (50.0, 0.0), (80.0, 20.0))), Lane("far_0", 3.2, ((9e5, 9e5), (9e5 + 1, 9e5)))]
+CRASH = TrialResult(
+    TrialSpec(7, 1, {}, {}, max_steps=100),
+    Outcome.COLLISION,
+    steps=20,
+    collision=Collision("ego", "collider", "ego", "car 0", ("overlap",), "collision", 1.0, 2.0),
+)
+
+
+@given(episodes)
+@shared_folder
+def test_a_log_gives_back_every_bit(tmp_path, episode):
+    recording = record(episode, tmp_path / "box")
+    write_log(tmp_path / "log.mcap", recording, lanes=LANES, crash=CRASH)
+    found = read_log(tmp_path / "log.mcap")
+    assert found.records == recording.records
+    assert found.digest == recording.digest
+
+
+@given(st.data())
+@shared_folder
+def test_a_damaged_log_never_passes_for_another(tmp_path, data):
+    path = tmp_path / "log.mcap"
+    recording = record(Episode(["ego"], 12, 3), tmp_path / "box")
+    write_log(path, recording, lanes=LANES)
+    whole = path.read_bytes()
+    if data.draw(st.booleans()):
+        damaged = whole[: data.draw(st.integers(0, len(whole) - 1))]
+    else:
+        at = data.draw(st.integers(0, len(whole) - 1))
+        damaged = whole[:at] + bytes([whole[at] ^ (1 << data.draw(st.integers(0, 7)))]) + whole[at + 1 :]
+    path.write_bytes(damaged)
+    try:
+        assert read_log(path).digest == recording.digest  # the damage was in a view channel or in an index
+    except BundleError as error:
+        assert error.where == str(path)
+        assert error.fix
+
+
+def test_what_is_no_log_is_refused(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "log.mcap"
+    with pytest.raises(BundleError, match="cannot be read"):
+        read_log(path)
+    for metadata, says in (({}, "not written by crashhunt"), ({"crashhunt_log_schema": "99"}, "schema is 99")):
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            if metadata:
+                writer.add_metadata("crashhunt", metadata)
+            writer.finish()
+        with pytest.raises(BundleError, match=says):
+            read_log(path)
+
+
+def test_the_views_say_what_the_recording_says(tmp_path):
+    """Every view message is parsed with Foxglove's own classes and compared with the scene it shows."""
+    recording = record(Episode(["ego", "odd name/§ #1"], 20, 4), tmp_path / "box")
+    write_log(tmp_path / "log.mcap", recording, lanes=LANES, crash=CRASH)
+    kinds = {
+        "foxglove.SceneUpdate": SceneUpdate,
+        "foxglove.FrameTransforms": FrameTransforms,
+        "foxglove.PoseInFrame": PoseInFrame,
+        "foxglove.Log": Log,
+    }
+    shown: dict[str, list] = {}
+    with (tmp_path / "log.mcap").open("rb") as file:
+        last = -1
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert message.log_time == message.publish_time
+            assert message.log_time >= last
+            last = message.log_time
+            if schema.name in kinds:
+                assert schema.encoding == channel.message_encoding == "protobuf"
+                shown.setdefault(channel.topic, []).append((message.log_time, kinds[schema.name].FromString(message.data)))
+    assert set(shown) == {"/map", "/scene/actors", "/tf", "/ego/pose", "/log", "/scene/crash"}
+    scenes = recording.scenes()
+    assert len(shown["/scene/actors"]) == len(shown["/tf"]) == len(scenes) == 21
+    for scene, (time_ns, update), (_, transforms) in zip(scenes, shown["/scene/actors"], shown["/tf"], strict=True):
+        assert time_ns == round(scene.time_s * 1e9)
+        assert [entity.id for entity in update.entities] == [actor.id for actor in scene.roster.actors]
+        for entity, center, actor in zip(update.entities, scene.centers, scene.roster.actors, strict=True):
+            (cube,) = entity.cubes
+            assert (cube.pose.position.x, cube.pose.position.y) == tuple(center)
+            assert (cube.size.x, cube.size.y) == (actor.length, actor.width)
+            assert entity.timestamp.ToNanoseconds() == time_ns
+            assert 1e8 < entity.lifetime.ToNanoseconds() < 1.5e8
+        assert [t.child_frame_id for t in transforms.transforms] == list(recording.agents)
+        row = scene.roster.index["ego"]
+        assert transforms.transforms[0].translation.x == scene.centers[row, 0]
+    ((_, lanes),) = shown["/map"]
+    assert len(lanes.entities[0].lines) == 2  # both borders of the near lane, nothing of the far one
+    ((_, line),) = shown["/log"]
+    assert "ego drove into car 0" in line.message
+    layout = foxglove_layout(recording)
+    assert layout["configById"]["3D!scene"]["followTf"] == "ego"
+    assert set(layout["configById"]["3D!scene"]["topics"]) <= set(shown)
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path):
+    program = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from episodes import Episode, record
+from crashhunt.recording import write_log
+folder = Path({str(tmp_path)!r})
+recording = record(Episode(["ego"], 25, 1), folder / "box")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+try:
+    write_log(folder / "log.mcap", recording)
+except OSError as error:
+    print("refused:", error.strerror)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "refused: File too large" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["box"]
+    assert signal.SIGXFSZ and resource.RLIMIT_FSIZE
+
+
+READER = """
+import { McapIndexedReader } from "@mcap/core";
+import { FileHandleReadable } from "@mcap/nodejs";
+import { decompress } from "fzstd";
+import { open } from "node:fs/promises";
+import { createHash } from "node:crypto";
+const readable = new FileHandleReadable(await open(process.argv[2]));
+const decompressHandlers = { zstd: (data, size) => decompress(data, new Uint8Array(Number(size))) };
+const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers });
+const topics = {};
+for await (const message of reader.readMessages()) {
+  const channel = reader.channelsById.get(message.channelId);
+  const entry = (topics[channel.topic] ??= { count: 0, schema: reader.schemasById.get(channel.schemaId).name, hash: createHash("sha256") });
+  entry.count += 1;
+  entry.hash.update(message.data);
+}
+for (const entry of Object.values(topics)) entry.hash = entry.hash.digest("hex");
+console.log(JSON.stringify(topics));
+"""
+
+
+def test_an_independent_reader_agrees(tmp_path):
+    """The npm package @mcap/core, Foxglove's own reader, finds the same messages to the byte."""
+    import hashlib
+
+    node, npm = shutil.which("node"), shutil.which("npm")
+    if node is None or npm is None:
+        pytest.skip("Node.js is not on this machine")
+    recording = record(Episode(["ego", "日本"], 25, 5), tmp_path / "box")
+    write_log(tmp_path / "log.mcap", recording, lanes=LANES, crash=CRASH)
+    packages = ["@mcap/core@2", "@mcap/nodejs@1", "fzstd@0.1"]
+    command = [npm, "install", "--no-audit", "--no-fund", "--prefix", str(tmp_path), *packages]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    (tmp_path / "read.mjs").write_text(READER)
+    done = subprocess.run(
+        [node, "read.mjs", str(tmp_path / "log.mcap")], cwd=tmp_path, check=True, capture_output=True, text=True, timeout=60
+    )
+    theirs = json.loads(done.stdout)
+    ours: dict[str, dict] = {}
+    with (tmp_path / "log.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            entry = ours.setdefault(channel.topic, {"count": 0, "schema": schema.name, "hash": hashlib.sha256()})
+            entry["count"] += 1
+            entry["hash"].update(message.data)
+    for entry in ours.values():
+        entry["hash"] = entry["hash"].hexdigest()
+    assert theirs == ours
+    assert theirs["/scene"]["count"] == 26
+    assert theirs["/agents/ego/action"]["count"] == 25
