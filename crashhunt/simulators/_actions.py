@@ -37,7 +37,7 @@ class SpeedAndLaneChange:
             # NaN fails both comparisons.
             if 0.0 <= speed <= MAX_TARGET_SPEED and lane_change in (-1, 0, 1):
                 return np.array((speed, lane_change), np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             pass
         raise ActionError(
             f"the action {action!r} is not (target_speed, lane_change)",
@@ -52,14 +52,16 @@ class SpaceAction:
 
     def __init__(self, space: Space[Any]) -> None:
         self.space = space
-        self._dtype = space.dtype
+        self._dtype = np.dtype(space.dtype)
 
     def encode(self, action: Any) -> NDArray[np.generic]:
         """Return an array of the space's type and shape."""
         try:
-            array = np.asarray(action, dtype=self._dtype)
-            inside = self.space.contains(array) if self.space.shape else self.space.contains(array[()])
-        except (TypeError, ValueError):
+            given = np.asarray(action)
+            # 1.7 is no discrete action, but 1.0 of a float64 policy is one of a float32 space.
+            array = given.astype(self._dtype) if np.can_cast(given.dtype, self._dtype, "same_kind") else given
+            inside = array.dtype == self._dtype and self.space.contains(array if self.space.shape else array[()])
+        except (TypeError, ValueError, OverflowError):
             inside = False
         if not inside:
             raise ActionError(f"the action {action!r} is not in {self.space}", fix="return one that is")

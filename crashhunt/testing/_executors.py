@@ -1,0 +1,107 @@
+"""What every executor must do. The trials run on the toy simulator, which fails in every way on request."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from crashhunt.executors import Executor, WorkerSettings
+from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
+from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["ExecutorContract"]
+
+Make = Callable[[WorkerSettings, int], Executor]
+
+_SWITCHES = ("fail_at_step", "exit_at_step", "segfault_at_step", "hang_at_step")
+
+
+class ExecutorContract:
+    """Checks `crashhunt.executors.Executor`.
+
+    The fixture ``make`` returns a function that makes an executor of settings and a number of workers.
+    """
+
+    @pytest.fixture
+    def make(self) -> Make:
+        """Return what makes an executor."""
+        raise NotImplementedError("give the suite a fixture named make")
+
+    @pytest.fixture
+    def executor(self, make: Make, tmp_path: Path) -> Iterator[Executor]:
+        """An executor of two workers, with a time limit of two seconds."""
+        scratch = tmp_path / "scratch"
+        scratch.mkdir()
+        scenario = Scenario(
+            simulator="toy",
+            folder=tmp_path,
+            agents={"ego": AgentSetup()},
+            arguments={name: ArgumentSetup(default=0) for name in _SWITCHES},
+        )
+        made = make(WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=2.0), 2)
+        yield made
+        made.close()
+
+    def _spec(self, number: int, **arguments: Any) -> TrialSpec:
+        return TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=30)
+
+    def _collect(self, executor: Executor, count: int) -> dict[int, TrialResult]:
+        found: dict[int, TrialResult] = {}
+        deadline = time.monotonic() + 90
+        while len(found) < count:
+            assert time.monotonic() < deadline, f"only {sorted(found)} came back"
+            for result in executor.completed(0.2):
+                assert result.spec.number not in found, "a trial came back twice"
+                found[result.spec.number] = result
+        return found
+
+    def test_every_trial_comes_back_once(self, executor: Executor) -> None:
+        """And with the specification that was submitted."""
+        specs = [self._spec(number) for number in range(12)]
+        for spec in specs:
+            executor.submit(spec)
+        found = self._collect(executor, 12)
+        assert [found[spec.number].spec for spec in specs] == specs
+        assert {result.outcome for result in found.values()} == {Outcome.SURVIVED}
+        assert list(executor.completed(0.0)) == []
+
+    def test_a_failure_costs_its_own_trial_only(self, executor: Executor) -> None:
+        """Good trials between an exception, an exit, a segmentation fault and a hang are what they would be alone."""
+        failures = {2: "fail_at_step", 4: "exit_at_step", 6: "segfault_at_step", 8: "hang_at_step"}
+        for number in range(10):
+            executor.submit(self._spec(number, **({failures[number]: 10} if number in failures else {})))
+        found = self._collect(executor, 10)
+        outcomes = {number: str(result.outcome) for number, result in found.items() if number in failures}
+        assert outcomes == {2: "simulator_error", 4: "process_died", 6: "process_died", 8: "hang"}
+        assert all(result.steps == 9 for number, result in found.items() if number in failures)
+        good = {number: result for number, result in found.items() if number not in failures}
+        assert {result.outcome for result in good.values()} == {Outcome.SURVIVED}
+        assert all(result.steps == 30 and result.digest for result in good.values())
+
+    def test_cancelled_trials_do_not_come_back(self, executor: Executor) -> None:
+        """Nor do they hold anything up, even where they hang; trials submitted afterwards run."""
+        executor.submit(self._spec(0))
+        self._collect(executor, 1)
+        for number in range(1, 6):
+            executor.submit(self._spec(number, hang_at_step=5))
+        began = time.monotonic()
+        list(executor.completed(0.3))
+        executor.cancel(above=0)
+        assert time.monotonic() - began < 1.5
+        executor.submit(self._spec(9))
+        assert set(self._collect(executor, 1)) == {9}
+
+    def test_closing_twice_is_fine(self, executor: Executor) -> None:
+        """Closing ends every process at once, whatever it does."""
+        executor.submit(self._spec(0, hang_at_step=5))
+        list(executor.completed(0.5))
+        began = time.monotonic()
+        executor.close()
+        executor.close()
+        assert time.monotonic() - began < 5

@@ -1,0 +1,255 @@
+"""The contract suites that ship with crashhunt, against everything that ships with crashhunt."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crashhunt.agents import CarFollowing, KeepLaneWithSpeed, LaneChanger, RandomAgent, Recorded
+from crashhunt.errors import UsageError
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
+from crashhunt.scenario import AgentSetup, Scenario, with_action
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators.toy import ToySimulator
+from crashhunt.space import Choice, Constant, Range
+from crashhunt.testing import AgentContract, ExecutorContract, SamplerContract, SimulatorContract
+
+TOY = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
+
+
+class TestToySimulator(SimulatorContract):
+    @pytest.fixture
+    def make(self, tmp_path):
+        return lambda: ToySimulator(TOY, tmp_path)
+
+
+SUMO = """
+import sys, tempfile, pytest
+from pathlib import Path
+from crashhunt.scenario import load_scenario, with_action
+from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.testing import SimulatorContract
+
+@pytest.mark.parametrize("form", ["continuous", "meta"])
+class TestSumo(SimulatorContract):
+    @pytest.fixture
+    def make(self, tmp_path, form):
+        scenario = load_scenario({name!r})
+        for agent in scenario.agents:
+            scenario = with_action(scenario, agent, form)
+        def made():
+            folder = Path(tempfile.mkdtemp(dir=tmp_path))
+            return SumoSimulator(scenario, folder)
+        original = SumoSimulator.reset
+        def reset(self, *, seed, options=None):
+            from crashhunt.scenario import argument_values
+            return original(self, seed=seed, options=options or {{"arguments": argument_values(scenario)}})
+        SumoSimulator.reset = reset
+        yield made
+        SumoSimulator.reset = original
+"""
+
+
+@pytest.mark.parametrize("name", ["loop", "loop-two-agents", "merge", "intersection"])
+def test_sumo_keeps_the_contract(tmp_path, name):
+    """In a process of its own: libsumo is one simulation per process."""
+    (tmp_path / "test_sumo.py").write_text(SUMO.format(name=name))
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "test_sumo.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=170, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "12 passed" in done.stdout
+
+
+SPACE = {
+    ("ego", "speed"): Range(5.0, 30.0),
+    ("ego", "mode"): Choice(("a", "b")),
+    ("", "vehicles"): Range(10, 30, integer=True),
+    ("", "trucks"): Constant(3),
+}
+
+
+class TestRandomSampler(SamplerContract):
+    @pytest.fixture
+    def make(self):
+        return RandomSampler
+
+    @pytest.fixture
+    def space(self):
+        return SPACE
+
+
+class TestGridSampler(TestRandomSampler):
+    @pytest.fixture
+    def make(self):
+        return lambda space: GridSampler(space, points=4)
+
+    def test_every_combination_comes_once_a_round(self, make, space):
+        sampler = make(space)
+        assert sampler.size == 4 * 2 * 4
+        rng = np.random.default_rng(0)
+        one_round = [tuple(sampler.ask(number, rng).values()) for number in range(sampler.size)]
+        assert len(set(one_round)) == sampler.size
+        assert tuple(sampler.ask(sampler.size, rng).values()) == one_round[0]
+
+
+class TestSweepSampler(SamplerContract):
+    @pytest.fixture
+    def make(self):
+        return SweepSampler
+
+    @pytest.fixture
+    def space(self):
+        return {("ego", "speed"): Range(10, 30, step=5, integer=True), ("", "trucks"): Constant(3)}
+
+    def test_it_steps_from_start_to_end(self, make, space):
+        sampler = make(space)
+        speeds = [sampler.ask(number, np.random.default_rng(0))["ego", "speed"] for number in range(6)]
+        assert speeds == [10, 15, 20, 25, 30, 10]
+
+    def test_it_wants_exactly_one_argument(self):
+        for space in (SPACE, {("ego", "speed"): Constant(3)}):
+            with pytest.raises(UsageError, match="one argument"):
+                SweepSampler(space)
+
+
+class TestPoolExecutor(ExecutorContract):
+    @pytest.fixture
+    def make(self):
+        return lambda settings, parallel: PoolExecutor(settings, parallel=parallel)
+
+
+class TestFreshProcessExecutor(ExecutorContract):
+    @pytest.fixture
+    def make(self):
+        return lambda settings, parallel: FreshProcessExecutor(settings, parallel=parallel)
+
+
+class _Agents(AgentContract):
+    @pytest.fixture
+    def form(self):
+        return SpeedAndLaneChange()
+
+    @pytest.fixture
+    def observations(self, tmp_path):
+        simulator = ToySimulator(TOY, tmp_path)
+        shown, _ = simulator.reset(seed=1)
+        found = [shown["ego"]]
+        actions = {"ego": np.array([14.0, 0.0]), "second": np.array([3])}
+        for _ in range(40):
+            shown, *_ = simulator.step({agent: actions[agent] for agent in simulator.agents})
+            if "ego" not in shown:
+                break
+            found.append(shown["ego"])
+        return found
+
+
+class TestKeepLane(_Agents):
+    @pytest.fixture
+    def make(self):
+        return lambda: KeepLaneWithSpeed(12.0)
+
+
+class TestKeepLaneMeta(TestKeepLane):
+    @pytest.fixture
+    def form(self):
+        return MetaAction()
+
+    @pytest.fixture
+    def make(self):
+        return lambda: KeepLaneWithSpeed(12.0, MetaAction().space)
+
+
+class TestCarFollowing(_Agents):
+    @pytest.fixture
+    def make(self):
+        return lambda: CarFollowing(delay_s=0.4)
+
+
+class TestLaneChanger(_Agents):
+    @pytest.fixture
+    def make(self):
+        return lambda: LaneChanger(patience_s=1.0)
+
+
+class TestRandomAgent(_Agents):
+    @pytest.fixture
+    def make(self, form):
+        return lambda: RandomAgent(form.space, hold_steps=3)
+
+
+class TestRecorded(_Agents):
+    @pytest.fixture
+    def make(self, tmp_path, monkeypatch):
+        monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "recording"))
+        from episodes import Episode, record
+
+        from crashhunt.recording import write_log
+
+        recording = record(Episode(["ego"], 60, 1), tmp_path / "box")
+        monkeypatch.setattr(type(recording), "actions", lambda self, agent: np.tile([3.0, 1.0], (60, 1)))
+        write_log(tmp_path / "log.mcap", recording)
+        return lambda: Recorded(str(tmp_path / "log.mcap"))
+
+    def test_it_never_drives_on_beyond_the_log(self, make, observations):
+        agent = make()
+        agent.reset(1)
+        for _ in range(60):
+            agent.act(observations[0])
+        with pytest.raises(IndexError, match="60 actions"):
+            agent.act(observations[0])
+
+
+ENVIRONMENT = """
+import json, sys, warnings
+warnings.simplefilter("error")
+import gymnasium
+from gymnasium.utils.env_checker import check_env
+environment = gymnasium.make("crashhunt:crashhunt/SUMO-v0", action=sys.argv[1], max_steps=50)
+check_env(environment.unwrapped)
+observation, info = environment.reset(seed=4)
+first = observation.tobytes()
+steps, done = 0, False
+while not done:
+    observation, reward, terminated, truncated, info = environment.step((8.0, 0) if sys.argv[1] == "continuous" else 1)
+    steps += 1
+    done = terminated or truncated
+again, _ = environment.reset(seed=4)
+later, _ = environment.reset()
+other = gymnasium.make("crashhunt:crashhunt/SUMO-v0")
+other.reset(seed=1)
+try:
+    environment.unwrapped.step(environment.action_space.sample())
+    taken_over = ""
+except Exception as error:
+    taken_over = str(error)
+other.close()
+environment.close()
+print(json.dumps({"same": again.tobytes() == first, "next": later.tobytes() != first, "steps": steps,
+                  "truncated": bool(truncated), "taken_over": taken_over}))
+"""
+
+
+@pytest.mark.parametrize("form", ["continuous", "meta"])
+def test_the_gymnasium_environment_passes_gymnasiums_own_checker(form):
+    done = subprocess.run([sys.executable, "-c", ENVIRONMENT, form], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert "another simulator" in found.pop("taken_over")
+    assert found == {"same": True, "next": True, "steps": 50, "truncated": True}
+
+
+def test_meta_actions_are_in_the_order_of_highway_env():
+    from highway_env.envs.common.action import DiscreteMetaAction
+
+    from crashhunt.simulators import META_ACTIONS
+
+    assert dict(enumerate(META_ACTIONS)) == DiscreteMetaAction.ACTIONS_ALL
+    assert replace(TOY, name="x")
+    assert with_action(TOY, "ego", "meta").agents["ego"].action == "meta"
