@@ -1,37 +1,91 @@
-"""A car-following agent with a reaction delay, and the part of it that lane changers share."""
+"""A car-following agent with a reaction delay, and the perception that it shares with lane changers."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from crashhunt.space import Argument, Range
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     import numpy as np
+    from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["CarFollowing", "Leader", "find_leader", "idm_acceleration"]
+__all__ = [
+    "CAR_LENGTH_M",
+    "CarFollowing",
+    "Leader",
+    "PathCurvature",
+    "X",
+    "actors",
+    "check_layout",
+    "find_leader",
+    "idm_acceleration",
+    "off_path",
+]
 
 CAR_LENGTH_M = 5.0
-# Row layout of the observation: presence, x, y, vx, vy, cos_h, sin_h; x ahead and y to the right of the vehicle.
-X, Y, VX = 1, 2, 3
+# The default layout: presence, x, y, vx, vy, cos_h, sin_h; x ahead and y to the right of the vehicle.
+PRESENCE, X, Y, VX, VY, COS_H, SIN_H = range(7)
 
 
+@dataclass(frozen=True, slots=True)
 class Leader:
-    """The nearest vehicle ahead in a lane.
+    """The nearest vehicle ahead on a path.
 
     Args:
-        gap: bumper to bumper, if both are cars, in m.
+        gap: bumper to bumper, in m, if both are cars: an observation has no lengths.
         closing_speed: positive when the gap shrinks, in m/s.
     """
 
-    __slots__ = ("closing_speed", "gap")
+    gap: float
+    closing_speed: float
 
-    def __init__(self, gap: float, closing_speed: float) -> None:
-        self.gap = gap
-        self.closing_speed = closing_speed
+
+def check_layout(space: Space[Any] | None) -> None:
+    """Refuse an observation space that does not have the columns which are read here.
+
+    Raises:
+        ValueError: it has others.
+    """
+    columns = None if space is None else (space.shape or (0,))[-1]
+    if columns not in (None, SIN_H + 1):
+        raise ValueError(
+            f"needs the observation's default features (presence, x, y, vx, vy, cos_h, sin_h), not {columns} columns"
+        )
+
+
+def actors(observation: NDArray[np.float32]) -> Iterator[list[float]]:
+    """Yield the rows of the other actors."""
+    for row in observation[1:].tolist():
+        if row[PRESENCE] < 0.5:
+            return  # present rows come first
+        yield row
+
+
+def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float:
+    """Return how far an actor is from a path, in m; 0 where it may well be on it.
+
+    A bend begins or ends somewhere between here and there, and an observation does not say where. The path of
+    constant curvature is one extreme, the arc that ends in the actor's own heading is the other; an actor in between
+    is taken to be on the path, which errs on the safe side.
+
+    Args:
+        row: of the actor.
+        lateral: how far to the right of the vehicle the path runs, in m.
+        curvature: of the path here, positive to the right, in 1/m.
+    """
+    ahead, right = row[X], row[Y] - lateral
+    low = high = curvature * ahead * ahead / 2
+    if row[COS_H] > 0.5:  # within 60 degrees of the own heading, so that it may have followed the same bend
+        arc = math.atan2(row[SIN_H], row[COS_H]) * ahead / 2
+        low, high = min(low, arc), max(high, arc)
+    return max(low - right, right - high, 0.0)
 
 
 def find_leader(
@@ -39,38 +93,79 @@ def find_leader(
 ) -> Leader | None:
     """Return the nearest vehicle ahead whose centre is within ``half_width`` of a path.
 
+    Oncoming traffic is nobody's leader: it keeps to its own side.
+
     Args:
         observation: in the default layout.
         lateral: how far to the right of the vehicle the path runs, in m.
-        curvature: of the path, positive to the right, in 1/m; a radar's constant-curvature path prediction.
+        curvature: of the path here, positive to the right, in 1/m.
         half_width: in m.
     """
-    best: Leader | None = None
-    for row in observation[1:].tolist():
-        if row[0] < 0.5:
-            break  # present rows come first
-        ahead = row[X]
-        if ahead > 0 and abs(row[Y] - lateral - curvature * ahead * ahead / 2) < half_width:
-            gap = ahead - CAR_LENGTH_M
-            if best is None or gap < best.gap:
-                best = Leader(gap, -row[VX])
-    return best
+    nearest: Leader | None = None
+    for row in actors(observation):
+        if row[X] <= 0 or row[COS_H] < -0.5 or off_path(row, lateral=lateral, curvature=curvature) >= half_width:
+            continue
+        gap = row[X] - CAR_LENGTH_M
+        if nearest is None or gap < nearest.gap:
+            nearest = Leader(gap, -row[VX])
+    return nearest
+
+
+class PathCurvature:
+    """Estimates the curvature of the own path from how the heading changes: a radar's path prediction.
+
+    Args:
+        step_length_s: between two observations, in s.
+    """
+
+    def __init__(self, step_length_s: float) -> None:
+        self._step_length_s = step_length_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._heading: float | None = None
+        self._value = 0.0
+
+    def update(self, observation: NDArray[np.float32]) -> float:
+        """Return the smoothed curvature, positive to the right, in 1/m."""
+        own = observation[0].tolist()
+        heading = math.atan2(own[SIN_H], own[COS_H])
+        if self._heading is not None and own[VX] > 1.0:
+            turned = math.remainder(heading - self._heading, math.tau)
+            self._value += 0.3 * (turned / (own[VX] * self._step_length_s) - self._value)
+        self._heading = heading
+        return self._value
 
 
 def idm_acceleration(
-    speed: float, leader: Leader | None, *, desired_speed: float, headway_s: float, standstill_gap: float = 3.0
+    speed: float,
+    leader: Leader | None,
+    *,
+    desired_speed: float,
+    headway_s: float,
+    standstill_gap: float = 4.0,
+    comfort: float = 2.0,
 ) -> float:
     """Return the acceleration of the Intelligent Driver Model, in m/s².
 
     Source: Treiber, Hennecke, Helbing: Congested traffic states in empirical observations and microscopic
-    simulations, Physical Review E 62 (2000), 1805, with 2 m/s² of acceleration and comfortable deceleration.
+    simulations, Physical Review E 62 (2000), 1805, equations 2 and 3.
+
+    Args:
+        speed: own, in m/s.
+        leader: whom to follow; None on a free road.
+        desired_speed: on a free road, in m/s.
+        headway_s: time gap, in s.
+        standstill_gap: in m; leaves room for the half of a truck that is longer than that of a car.
+        comfort: both the largest acceleration and the comfortable deceleration, in m/s².
     """
     free = 1 - (speed / max(desired_speed, 0.1)) ** 4
     if leader is None:
-        return 2.0 * free
-    dynamic = speed * headway_s + speed * leader.closing_speed / (2 * math.sqrt(2.0 * 2.0))
+        return comfort * free
+    dynamic = speed * headway_s + speed * leader.closing_speed / (2 * comfort)
     wanted = standstill_gap + max(0.0, dynamic)
-    return 2.0 * (free - (wanted / max(leader.gap, 0.1)) ** 2)
+    return comfort * (free - (wanted / max(leader.gap, 0.1)) ** 2)
 
 
 class CarFollowing:
@@ -84,6 +179,10 @@ class CarFollowing:
         max_brake: the hardest that it brakes, in m/s².
         desired_speed: with a free road, in m/s.
         step_length_s: of the simulation, in s; turns the delay into steps.
+        observation_space: of the vehicle.
+
+    Raises:
+        ValueError: an argument makes no sense, or the observation has other columns than the default ones.
     """
 
     def __init__(
@@ -92,48 +191,39 @@ class CarFollowing:
             float, Argument("delay_s", distribution=Range(0.0, 1.2), unit="s", help="acts on observations this old")
         ] = 0.3,
         headway_s: Annotated[
-            float, Argument("headway_s", distribution=Range(0.6, 2.5), unit="s", help="time gap that it keeps")
+            float, Argument("headway_s", distribution=Range(0.5, 2.5), unit="s", help="time gap that it keeps")
         ] = 1.5,
         max_brake: Annotated[
             float, Argument("max_brake", distribution=Range(3.0, 8.0), unit="m/s²", help="hardest braking")
         ] = 6.0,
         desired_speed: Annotated[float, Argument("desired_speed", unit="m/s", help="on a free road")] = 25.0,
         step_length_s: Annotated[float, Argument("step_length_s", unit="s", help="of the simulation")] = 0.1,
+        observation_space: Space[Any] | None = None,
     ) -> None:
-        if step_length_s <= 0:
+        if not delay_s >= 0:
+            raise ValueError(f"delay_s must be at least 0, not {delay_s}")
+        if not step_length_s > 0:
             raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
+        check_layout(observation_space)
         self.headway_s = headway_s
         self.max_brake = max_brake
         self.desired_speed = desired_speed
         self.step_length_s = step_length_s
         self._seen: deque[NDArray[np.float32]] = deque(maxlen=round(delay_s / step_length_s) + 1)
-        self._heading: float | None = None
-        self._curvature = 0.0
+        self._curvature = PathCurvature(step_length_s)
 
     def reset(self, seed: int) -> None:
         """Forget what was seen."""
         self._seen.clear()
-        self._heading = None
-        self._curvature = 0.0
+        self._curvature.reset()
 
     def act(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Return (target speed, 0)."""
         self._seen.append(observation)
         seen = self._seen[0]
-        leader = find_leader(seen, curvature=self.path_curvature(seen))
-        own_speed = float(observation[0, VX])
+        leader = find_leader(seen, curvature=self._curvature.update(seen))
         wanted = idm_acceleration(
             float(seen[0, VX]), leader, desired_speed=self.desired_speed, headway_s=self.headway_s
         )
         acceleration = max(-self.max_brake, min(2.0, wanted))
-        return max(0.0, own_speed + acceleration * self.step_length_s), 0
-
-    def path_curvature(self, observation: NDArray[np.float32]) -> float:
-        """Return the smoothed curvature of the own path, positive to the right, in 1/m."""
-        speed = float(observation[0, VX])
-        heading = math.atan2(float(observation[0, 6]), float(observation[0, 5]))
-        if self._heading is not None and speed > 1.0:
-            turned = math.remainder(heading - self._heading, math.tau)
-            self._curvature += 0.3 * (turned / (speed * self.step_length_s) - self._curvature)
-        self._heading = heading
-        return self._curvature
+        return max(0.0, float(observation[0, VX]) + acceleration * self.step_length_s), 0
