@@ -249,8 +249,8 @@ def _any_action(space: Any) -> Any:
 
 
 def _failure(error: BaseException, agent: str) -> Failure:
-    text = "".join(traceback.format_exception(error))
-    sys.stderr.write(text)
+    # A message of our own says everything; where in our code it was raised is nobody's business.
+    text = "" if isinstance(error, InvalidEpisodeError) else "".join(traceback.format_exception(error))
     message = str(error) if isinstance(error, EpisodeError) else " ".join(str(error).split())
     kinds: dict[type[BaseException], str] = {
         ActionError: "bad action",

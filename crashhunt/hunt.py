@@ -226,7 +226,9 @@ class Hunt:
         self._confirm(progress, snapshot)
         ledger.note(state=stopped, heartbeat=time.time())
         watch(self._status(progress, "done"))
-        reason = progress.last_invalid.summary if stopped == "no_valid_trial" and progress.last_invalid else ""
+        reason = ""
+        if stopped == "no_valid_trial" and progress.last_invalid is not None:
+            reason = _why_invalid(progress.last_invalid)
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
             self.directory,
@@ -468,3 +470,10 @@ class Hunt:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _why_invalid(result: TrialResult) -> str:
+    """Why a trial could not be set up, with what the simulator said about it last."""
+    said = result.failure.last_output.strip().splitlines() if result.failure else []
+    last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
+    return f"{result.summary}\n  last output: {last}" if last else result.summary

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.errors import BundleError
 from crashhunt.executors._protocol import scratch_of
-from crashhunt.executors._worker import BLACK_BOX, OUTPUT, STACK
+from crashhunt.executors._worker import BLACK_BOX, OUTPUT, STACK, read_tail
 from crashhunt.oracles import closest_approach
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
 from crashhunt.trial import ClosestApproach, Failure, Outcome, TrialResult
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 __all__ = ["died", "hung", "where_it_is"]
-
-_LAST_OUTPUT = 4000  # characters
 
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
@@ -59,8 +57,8 @@ def _result(
     exit_code: int | None,
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
-    output = _tail(folder / OUTPUT)
-    stack = _tail(folder / STACK)
+    output = read_tail(folder / OUTPUT)
+    stack = read_tail(folder / STACK)
     agent, steps, sim_time_s, digest, closest = "", 0, 0.0, "", ClosestApproach()
     phase = header.phase if header is not None else Phase.SETUP
     try:
@@ -92,16 +90,6 @@ def _result(
         worker=header.pid if header is not None else 0,
         kept=folder.is_dir(),
     )
-
-
-def _tail(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            file.seek(0, 2)
-            file.seek(max(0, file.tell() - _LAST_OUTPUT))
-            return file.read().decode("utf-8", "replace")
-    except OSError:
-        return ""
 
 
 def _signal_name(exit_code: int) -> str:

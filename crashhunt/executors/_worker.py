@@ -20,6 +20,7 @@ from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.plugins import locate, signature_of
 from crashhunt.recording import BlackBox
 from crashhunt.scene import Lane
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,10 +31,11 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["BLACK_BOX", "MAP", "OUTPUT", "STACK", "Worker", "read_map", "worker_environment"]
+__all__ = ["BLACK_BOX", "MAP", "OUTPUT", "STACK", "Worker", "read_map", "read_tail", "worker_environment"]
 
 BLACK_BOX, OUTPUT, STACK, MAP = "blackbox.bin", "run.log", "stack.txt", "map.json"
 _PR_SET_PDEATHSIG = 1
+_TAIL = 4000  # bytes
 
 
 def worker_environment() -> dict[str, str]:
@@ -105,9 +107,11 @@ class Worker:
             crash_on=self._settings.crash_on,
         )
         faulthandler.cancel_dump_traceback_later()
-        self._draw_map(simulator)
+        if result.outcome is not Outcome.INVALID:
+            self._draw_map(simulator)
         kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
-        result = replace(result, worker=os.getpid(), kept=kept, wall_s=time.monotonic() - began)
+        failure = result.failure and replace(result.failure, last_output=read_tail(folder / OUTPUT))
+        result = replace(result, worker=os.getpid(), kept=kept, wall_s=time.monotonic() - began, failure=failure)
         if kept:
             # The next trial gets a folder of its own; this one now belongs to the hunt.
             self._folder = None
@@ -183,6 +187,17 @@ def read_map(scratch: Path) -> list[Lane]:
     except (OSError, ValueError):
         return []
     return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+
+
+def read_tail(path: Path) -> str:
+    """Return the last few thousand characters of a file; nothing where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _TAIL))
+            return file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
 
 
 def _die_with_parent() -> None:

@@ -129,7 +129,7 @@ def approaches(
         contact = time_to_contact(place, moving, turn, one, two)
         contact = np.where(contact <= _HORIZON_S, contact, np.inf)
         np.minimum.at(times, number[course], contact)
-        with np.errstate(divide="ignore"):
-            needed = np.where(contact > 0, closing_speed[course] / (2 * contact), 0.0)
+        needed = np.zeros_like(contact)
+        np.divide(closing_speed[course], 2 * contact, out=needed, where=contact > 0)
         np.maximum.at(brakes, number[course], needed)
     return times, gaps, brakes

@@ -99,7 +99,7 @@ def time_to_contact(
         (-sine, cosine, half_two[:, 1] + half_one[:, 0] * across + half_one[:, 1] * along),
     )
     enter, leave = np.zeros_like(turn), np.full_like(turn, np.inf)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for axis_x, axis_y, reach in axes:
             distance = offset[:, 0] * axis_x + offset[:, 1] * axis_y
             speed = velocity[:, 0] * axis_x + velocity[:, 1] * axis_y

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from hypothesis import strategies as st
 
-from crashhunt.recording import AgentChannel, BlackBox, Prologue, Recording, Tag, encode_actors, encode_events, read_black_box
+from crashhunt.recording import (
+    AgentChannel,
+    BlackBox,
+    Prologue,
+    Recording,
+    Tag,
+    encode_actors,
+    encode_events,
+    read_black_box,
+)
 from crashhunt.scene import Actor, Contact, Roster, Scene
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 NAMES = ["ego", "left.25", "odd name/§ #1", "日本", "a.b"]
 

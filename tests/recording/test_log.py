@@ -99,7 +99,9 @@ def test_the_views_say_what_the_recording_says(tmp_path):
             last = message.log_time
             if schema.name in kinds:
                 assert schema.encoding == channel.message_encoding == "protobuf"
-                shown.setdefault(channel.topic, []).append((message.log_time, kinds[schema.name].FromString(message.data)))
+                shown.setdefault(channel.topic, []).append(
+                    (message.log_time, kinds[schema.name].FromString(message.data))
+                )
     assert set(shown) == {"/map", "/scene/actors", "/tf", "/ego/pose", "/log", "/scene/crash"}
     scenes = recording.scenes()
     assert len(shown["/scene/actors"]) == len(shown["/tf"]) == len(scenes) == 21
@@ -143,7 +145,8 @@ except OSError as error:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert "refused: File too large" in done.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["box"]
-    assert signal.SIGXFSZ and resource.RLIMIT_FSIZE
+    assert signal.SIGXFSZ
+    assert resource.RLIMIT_FSIZE
 
 
 READER = """
@@ -158,7 +161,8 @@ const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers
 const topics = {};
 for await (const message of reader.readMessages()) {
   const channel = reader.channelsById.get(message.channelId);
-  const entry = (topics[channel.topic] ??= { count: 0, schema: reader.schemasById.get(channel.schemaId).name, hash: createHash("sha256") });
+  const schema = reader.schemasById.get(channel.schemaId).name;
+  const entry = (topics[channel.topic] ??= { count: 0, schema, hash: createHash("sha256") });
   entry.count += 1;
   entry.hash.update(message.data);
 }
@@ -181,7 +185,12 @@ def test_an_independent_reader_agrees(tmp_path):
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     (tmp_path / "read.mjs").write_text(READER)
     done = subprocess.run(
-        [node, "read.mjs", str(tmp_path / "log.mcap")], cwd=tmp_path, check=True, capture_output=True, text=True, timeout=60
+        [node, "read.mjs", str(tmp_path / "log.mcap")],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     theirs = json.loads(done.stdout)
     ours: dict[str, dict] = {}

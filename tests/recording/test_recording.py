@@ -63,7 +63,11 @@ def test_the_first_difference_is_found_where_it_is(tmp_path, episode, data):
         return
     at = data.draw(st.integers(start, len(payload) - 1))
     changed = payload[:at] + bytes([payload[at] ^ (1 << data.draw(st.integers(0, 7)))]) + payload[at + 1 :]
-    records = [*recording.records[:place], recording.records[place]._replace(payload=changed), *recording.records[place + 1 :]]
+    records = [
+        *recording.records[:place],
+        recording.records[place]._replace(payload=changed),
+        *recording.records[place + 1 :],
+    ]
     other = Recording(records)
     divergence = first_divergence(recording, other)
     steps = [r for r in recording.records[:place] if r.tag == Tag.STEP]

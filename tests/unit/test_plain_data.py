@@ -27,8 +27,11 @@ def test_an_error_keeps_its_parts_across_processes(kind):
     assert kind.__name__ in errors.__doc__
 
 
-values = st.one_of(st.booleans(), st.integers(-(2**53), 2**53), st.floats(allow_nan=False, allow_infinity=False), st.text())
 numbers = st.floats(allow_nan=False)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+values = st.one_of(st.booleans(), st.integers(-(2**53), 2**53), finite, st.text())
+names = st.lists(st.text()).map(tuple)
+hits = st.builds(Collision, st.text(), st.text(), st.text(), st.text(), names, x=finite)
 results = st.builds(
     TrialResult,
     spec=st.builds(
@@ -44,8 +47,7 @@ results = st.builds(
     sim_time_s=st.floats(0, 1e9),
     digest=st.text("0123456789abcdef", min_size=32, max_size=32),
     closest=st.builds(ClosestApproach, numbers, numbers.map(abs), st.floats(0, 1e9)),
-    collision=st.none()
-    | st.builds(Collision, st.text(), st.text(), st.text(), st.text(), st.lists(st.text()).map(tuple), x=st.floats(-1e9, 1e9)),
+    collision=st.none() | hits,
     failure=st.none() | st.builds(Failure, st.text(), st.text(), exit_code=st.none() | st.integers(-64, 255)),
     wall_s=st.floats(0, 1e6),
     worker=st.integers(0, 2**22),

@@ -3,7 +3,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import tomllib
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import tomli_w
@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import load_scenario, scenario_from_dict, shipped_folder, shipped_scenarios
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 LOOP = shipped_folder() / "loop"
 

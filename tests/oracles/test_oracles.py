@@ -1,0 +1,200 @@
+"""Geometry against brute force, and the oracles on scenes whose answers are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from crashhunt.oracles import (
+    OffRoad,
+    Overlap,
+    ReportedCollision,
+    approaches,
+    closest_approach,
+    merge_findings,
+    outlines_overlap,
+    rectangle_gap,
+    time_to_contact,
+)
+from crashhunt.scene import Actor, Contact, Roster, Scene, corners
+from crashhunt.trial import Outcome
+
+rectangles = st.tuples(
+    st.floats(-15, 15), st.floats(-15, 15), st.floats(-math.pi, math.pi), st.floats(0.5, 14), st.floats(0.4, 3)
+)
+
+
+def outline(rectangle, points=0):
+    """Points of the border of a rectangle: its corners, or many."""
+    x, y, heading, length, width = rectangle
+    forward = np.array([math.cos(heading), math.sin(heading)])
+    left = np.array([-forward[1], forward[0]])
+    front = np.array([x, y])
+    ring = [front + left * width / 2, front - forward * length + left * width / 2]
+    ring += [front - forward * length - left * width / 2, front - left * width / 2]
+    if not points:
+        return np.array(ring)
+    steps = np.linspace(0, 1, points)[:, None]
+    return np.concatenate([a + steps * (b - a) for a, b in zip(ring, [*ring[1:], ring[0]], strict=True)])
+
+
+def inside(points, rectangle, margin=0.0):
+    x, y, heading, length, width = rectangle
+    c, s = math.cos(heading), math.sin(heading)
+    along = (points[:, 0] - x) * c + (points[:, 1] - y) * s
+    across = (points[:, 1] - y) * c - (points[:, 0] - x) * s
+    return (along < -margin) & (along > -length + margin) & (np.abs(across) < width / 2 - margin)
+
+
+def relative(one, two):
+    """Two rectangles as the vectorised functions want them."""
+
+    def center(rectangle):
+        x, y, heading, length, _ = rectangle
+        return np.array([x - length / 2 * math.cos(heading), y - length / 2 * math.sin(heading)])
+
+    c, s = math.cos(one[2]), math.sin(one[2])
+    dx, dy = center(two) - center(one)
+    offset = np.array([[dx * c + dy * s, dy * c - dx * s]])
+    turn = np.array([two[2] - one[2]])
+    return offset, turn, np.array([[one[3] / 2, one[4] / 2]]), np.array([[two[3] / 2, two[4] / 2]])
+
+
+def border_distance(one, two):
+    a, b = outline(one, 120), outline(two, 120)
+    return float(np.sqrt(((a[:, None] - b[None]) ** 2).sum(axis=2)).min())
+
+
+@given(rectangles, rectangles)
+@settings(deadline=None)
+def test_overlap_and_gap_agree_with_points_of_the_outlines(one, two):
+    overlap = outlines_overlap(one, two)
+    assert overlap == outlines_overlap(two, one)
+    offset, turn, half_one, half_two = relative(one, two)
+    gap = float(rectangle_gap(offset, turn, half_one, half_two)[0])
+    distance = border_distance(one, two)
+    deep = inside(outline(two, 120), one, 0.05).any() or inside(outline(one, 120), two, 0.05).any()
+    if deep:
+        assert overlap
+        assert gap == 0
+    if gap > 0:
+        assert not overlap or gap < 1e-6
+        assert gap <= distance + 1e-9
+        assert distance - gap < 0.2  # between neighbouring points of both outlines
+
+
+@given(rectangles, rectangles, st.floats(-20, 20), st.floats(-20, 20))
+@settings(deadline=None)
+def test_time_to_contact_agrees_with_moving_there(one, two, vx, vy):
+    offset, turn, half_one, half_two = relative(one, two)
+    assume(not outlines_overlap(one, two))
+    c, s = math.cos(one[2]), math.sin(one[2])
+    velocity = np.array([[vx * c + vy * s, vy * c - vx * s]])
+    found = float(time_to_contact(offset, velocity, turn, half_one, half_two)[0])
+
+    def at(time):
+        return (two[0] + vx * time, two[1] + vy * time, *two[2:])
+
+    if math.isfinite(found):
+        assert not outlines_overlap(one, at(max(0.0, found - 1e-3)))
+        touching = rectangle_gap(*relative(one, at(found)))[0]
+        assert touching < 1e-6
+    else:
+        assert not any(outlines_overlap(one, at(time)) for time in np.linspace(0, 5, 60))
+
+
+def test_time_to_contact_of_vehicles_in_line():
+    one, two = (0, 0, 0.0, 5, 2), (25, 0, 0.0, 5, 2)
+    offset, turn, half_one, half_two = relative(one, two)
+    assert time_to_contact(offset, np.array([[-10.0, 0.0]]), turn, half_one, half_two)[0] == pytest.approx(2.0)
+    assert time_to_contact(offset, np.array([[10.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
+    assert time_to_contact(offset, np.array([[0.0, 0.0]]), turn, half_one, half_two)[0] == math.inf
+    assert rectangle_gap(offset, turn, half_one, half_two)[0] == pytest.approx(20.0)
+
+
+def scene(*vehicles, contacts=(), off_road=(), time_s=0.0):
+    """Each vehicle is (id, x, y, heading, speed)."""
+    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name, *_ in vehicles))
+    points = [(float(x), float(y)) for _, x, y, _, _ in vehicles]
+    headings, speeds = [float(v[3]) for v in vehicles], [float(v[4]) for v in vehicles]
+    return Scene(time_s, roster, points, headings, speeds, contacts, off_road)
+
+
+def test_the_closest_approach_of_known_scenes():
+    far = scene(("ego", 0, 0, 0, 20), ("a", 45, 0, 0, 10))  # 40 m apart, closing at 10 m/s
+    near = scene(("ego", 20, 0, 0, 20), ("a", 55, 0, 0, 10))  # 30 m
+    beside = scene(("ego", 40, 0, 0, 20), ("a", 40, 3.5, 0, 10))  # 1.5 m to the side, and it stays so
+    times, gaps, brakes = approaches([view.frame for view in (far, near, beside)], "ego")
+    assert times == pytest.approx([4.0, 3.0, math.inf])
+    assert gaps == pytest.approx([40.0, 30.0, 1.5])
+    assert brakes == pytest.approx([10 / 8, 10 / 6, 0.0])
+    found = closest_approach([far, near, beside], ["ego"])
+    assert (found.time_to_collision_s, found.gap_m) == pytest.approx((3.0, 1.5))
+    assert found.required_deceleration == pytest.approx(10 / 6)
+    alone = closest_approach([scene(("ego", 0, 0, 0, 20))], ["ego"])
+    assert (alone.time_to_collision_s, alone.gap_m, alone.required_deceleration) == (math.inf, math.inf, 0.0)
+    assert closest_approach([scene(("a", 0, 0, 0, 20))], ["ego"]) == alone
+
+
+@given(st.lists(st.tuples(*[st.floats(-60, 60)] * 2, st.floats(-3, 3), st.floats(0, 30)), min_size=2, max_size=8))
+@settings(deadline=None)
+def test_many_scenes_at_once_are_measured_as_one_by_one(vehicles):
+    scenes = []
+    for number in range(4):
+        moved = [
+            (f"v{n}", x + number, y, h, v) for n, (x, y, h, v) in enumerate(vehicles[: len(vehicles) - number % 2])
+        ]
+        scenes.append(scene(*moved))
+    together = approaches([view.frame for view in scenes], "v0")
+    for number, view in enumerate(scenes):
+        alone = approaches([view.frame], "v0")
+        for all_values, one in zip(together, alone, strict=True):
+            assert all_values[number] == one[0]
+
+
+def test_neighbors_are_sorted_and_complete():
+    view = scene(("a", 0, 0, 0, 1), ("b", 3, 4, 0, 1), ("c", 1, 0, 0, 1), ("d", -2, 0, 0, 1))
+    assert view.neighbors(0) == [(1.0, 2), (4.0, 3), (25.0, 1)]
+    assert corners(view, 1) == pytest.approx(np.array([[3, 5], [-2, 5], [-2, 3], [3, 3]]))
+
+
+def test_who_drove_into_whom():
+    behind = scene(("ego", 0, 0, 0, 20), ("a", 4, 0, 0, 10))
+    (finding,) = Overlap().check(behind, ["ego"])
+    hit = finding.collision
+    assert (hit.role, hit.collider, hit.victim, hit.collider_speed, hit.victim_speed) == (
+        "collider",
+        "ego",
+        "a",
+        20,
+        10,
+    )
+    (finding,) = Overlap().check(behind, ["a"])
+    assert (finding.collision.role, finding.collision.collider) == ("victim", "ego")
+    assert Overlap().check(scene(("ego", 0, 0, 0, 1), ("a", 5, 0, 0, 1)), ["ego"]) == []  # bumper to bumper
+    assert Overlap().check(behind, ["gone"]) == []
+
+
+def test_two_witnesses_of_one_crash_are_one_finding():
+    contact = Contact("ego", "a", "junction", "x_0", 20.0, 10.0)
+    view = scene(("ego", 0, 0, 0, 20), ("a", 4, 0, 0, 10), ("b", 4, 1, 0, 10), contacts=(contact,))
+    findings = [*ReportedCollision().check(view, ["ego"]), *Overlap().check(view, ["ego"])]
+    assert len(findings) == 3
+    merged = merge_findings(findings)
+    assert merged.outcome is Outcome.COLLISION
+    assert merged.collision.seen_by == ("overlap", "reported")
+    assert (merged.collision.victim, merged.collision.kind, merged.collision.lane) == ("a", "junction", "x_0")
+    assert merge_findings([]) is None
+    assert ReportedCollision().check(view, ["b"]) == []
+
+
+def test_leaving_the_road():
+    view = scene(("ego", 3, 4, 0, 7), off_road=("ego",))
+    (finding,) = OffRoad().check(view, ["ego"])
+    assert finding.outcome is Outcome.OFF_ROAD
+    assert (finding.collision.role, finding.collision.x, finding.collision.collider_speed) == ("alone", 3, 7)
+    assert OffRoad().check(view, ["other"]) == []

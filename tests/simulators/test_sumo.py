@@ -1,0 +1,172 @@
+"""SUMO for real, through the command line: bring your own, lane changes, broken files; and the observation's layout."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crashhunt.recording import read_log
+from crashhunt.scenario import ObservationSetup, shipped_folder
+from crashhunt.scene import Actor, Roster, Scene
+from crashhunt.simulators._kinematics import Kinematics
+
+AGENTS = """
+class Turns:
+    def __init__(self, at: int = 10, change: int = 1, action_space=None):
+        self.at, self.change, self.meta = at, change, getattr(action_space, "n", None)
+
+    def reset(self, seed):
+        self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        if self.meta:
+            return 0 if self.step >= self.at else 1
+        return 8.0, self.change if self.step >= self.at else 0
+"""
+
+
+@pytest.fixture
+def town(shell):
+    shutil.copy(shipped_folder() / "loop" / "loop.net.xml", shell.folder / "net.net.xml")
+    (shell.folder / "r.rou.xml").write_text(
+        '<routes><route id="way" edges="south east north west"/>'
+        '<flow id="odd.name#1" route="way" begin="3" end="60" number="5" departSpeed="max"/></routes>'
+    )
+    (shell.folder / "det.add.xml").write_text(
+        '<additional><inductionLoop id="d" lane="south_0" pos="50" period="10" file="detector.xml"/></additional>'
+    )
+    (shell.folder / "town.sumocfg").write_text(
+        '<configuration><input><net-file value="net.net.xml"/><route-files value="r.rou.xml"/>'
+        '<additional-files value="det.add.xml"/></input><output><tripinfo-output value="trips.xml"/></output>'
+        '<time><step-length value="0.2"/></time></configuration>'
+    )
+    (shell.folder / "turns.py").write_text(AGENTS)
+    return shell
+
+
+EGOS = {"odd.name#1.0": (), "odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-south,-north")}
+
+
+@pytest.mark.parametrize(("agent", "ego"), EGOS.items(), ids=["first", "named", "added"])
+def test_a_network_that_nobody_wrote_for_us(town, agent, ego):
+    before = sorted(path.name for path in town.folder.iterdir())
+    words = ("run", "h", "2", "3", "100", "--scenario", "town.sumocfg", *ego, "--arg", "speed=5:9", "--keep-going")
+    done = town.crashhunt(*words, "--keep-trials", "--json")
+    assert done.json["trials_run"] == 3
+    assert "invalid" not in done.json["outcomes"]
+    if not ego:
+        assert f"the controlled vehicle is '{agent}'" in done.err
+    params = json.loads((town.folder / "h" / "trials" / "000000" / "params.json").read_text())
+    assert list(params["spec"]["arguments"]) == [agent]
+    # What SUMO writes beside its input files must not end up beside the user's.
+    assert sorted(path.name for path in town.folder.iterdir() if path.name != "__pycache__") == sorted([*before, "h"])
+
+
+def test_a_vehicle_that_never_enters_is_invalid(town):
+    words = ("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--ego", "nobody", "--json")
+    done = town.crashhunt(*words, expect=3)
+    assert done.json["stopped_because"] == "no_valid_trial"
+    assert "'nobody' was not on the road" in done.err
+
+
+@pytest.mark.parametrize("damage", ["</net", "<net><edge"])
+def test_a_malformed_network_is_no_crash(town, damage):
+    (town.folder / "net.net.xml").write_text(damage)
+    done = town.crashhunt("run", "h", "2", "40", "100", "--scenario", "town.sumocfg", "--json", expect=3)
+    assert set(done.json["outcomes"]) == {"invalid"}
+    assert done.json["crashes"] == []
+
+
+def test_leaving_the_road_and_changing_lanes(town):
+    """To the left twice from any of two lanes is off the road; in the discrete form it is ignored."""
+    words = ("--agent", "turns:Turns", "--set", "vehicles=10", "--seed", "4", "--json")
+    (crash,) = town.crashhunt("run", "h", "1", "1", "100", *words).json["crashes"]
+    assert crash["outcome"] == "off_road"
+    assert crash["step"] in (10, 11, 12)
+    assert crash["confirmed"] is True
+    path = Path(town.folder / crash["path"])
+    assert json.loads((path / "crash.json").read_text())["collision"]["role"] == "alone"
+    observations = read_log(path / "log.mcap").observations("ego")
+    assert observations[-1][0, 2] == 0.0  # y: in the leftmost lane
+    own = town.folder / "meta"
+    shutil.copytree(shipped_folder() / "loop", own)
+    text = (own / "scenario.toml").read_text()
+    (own / "scenario.toml").write_text(text.replace('type = "ego"', 'type = "ego"\naction = "meta"'))
+    report = town.crashhunt("run", "m", "1", "1", "100", "--scenario", "meta", *words).json
+    assert report["outcomes"] in ({"survived": 1}, {"collision": 1})
+
+
+def test_two_agents_have_channels_and_arguments_of_their_own(shell):
+    words = ("run", "h", "2", "40", "400", "--scenario", "loop-two-agents", "--seed", "1", "--json")
+    (crash,) = shell.crashhunt(*words, "--arg", "overtaker.blind_spot_m=8:10").json["crashes"]
+    assert set(crash["arguments"]) == {"keeper", "overtaker"}
+    assert 8 <= crash["arguments"]["overtaker"]["blind_spot_m"] <= 10
+    recording = read_log(shell.folder / crash["path"] / "log.mcap")
+    assert recording.agents == ("keeper", "overtaker")
+    assert recording.actions("keeper").shape == recording.actions("overtaker").shape == (crash["step"], 2)
+    assert shell.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+    assert shell.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
+    done = shell.crashhunt(
+        "run", "x", "1", "1", "10", "--scenario", "loop-two-agents", "--agent", "keep-lane", expect=2
+    )
+    assert "keeper=keep-lane" in done.err
+
+
+def test_seen_and_done_by_the_ego_is_what_the_log_says(shell):
+    shell.crashhunt("run", "h", "1", "30", "1500", "--arg", "speed=20:25", "--seed", "1")
+    (path,) = (shell.folder / "h" / "crashes").glob("*/log.mcap")
+    recording = read_log(path)
+    speeds = [scene.speeds[scene.roster.index["ego"]] for scene in recording.scenes()]
+    seen = recording.observations("ego")[:, 0, 3]
+    assert np.allclose(speeds[: len(seen)], seen)
+    assert np.all(np.abs(np.diff(speeds)) <= 0.1 * 9.0 + 1e-6)  # physical limits hold: speed mode 6
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_observation_has_the_layout_of_highway_env(normalize):
+    """The same vehicles on highway-env's own straight road, seen by highway-env's own observation."""
+    import gymnasium
+    import highway_env  # noqa: F401 - registers
+
+    features = ["presence", "x", "y", "vx", "vy", "cos_h", "sin_h"]
+    config = {
+        "observation": {
+            "type": "Kinematics",
+            "vehicles_count": 6,
+            "features": features,
+            "see_behind": True,
+            "normalize": normalize,
+        },
+        "vehicles_count": 20,
+    }
+    environment = gymnasium.make("highway-fast-v0", config=config)
+    theirs, _ = environment.reset(seed=3)
+    road = environment.unwrapped.road
+    ego = environment.unwrapped.vehicle
+    actors, points, headings, speeds = [], [], [], []
+    for number, vehicle in enumerate(road.vehicles):
+        actors.append(Actor("ego" if vehicle is ego else f"v{number}", "car", vehicle.LENGTH, vehicle.WIDTH))
+        x, y = vehicle.position
+        heading = -vehicle.heading  # their y points down
+        headings.append(heading)
+        speeds.append(float(vehicle.speed))
+        half = vehicle.LENGTH / 2
+        points.append((float(x + half * np.cos(heading)), float(-y + half * np.sin(heading))))
+    scene = Scene(0.0, Roster(tuple(actors)), points, headings, speeds)
+    row = scene.roster.index["ego"]
+    x, y = ego.position
+    setup = ObservationSetup(vehicles=6, features=tuple(features), normalize=normalize)
+    lanes = len(road.network.all_side_lanes(ego.lane_index))
+    ours = Kinematics(setup).observe(scene, row, distance=x, from_left=y, lateral_speed=0.0, lanes=lanes)
+    environment.close()
+    assert ours.shape == theirs.shape
+    assert ours.dtype == theirs.dtype
+    assert np.allclose(ours[0], theirs[0], atol=1e-5)
+    # They choose neighbours by distance along the lane, we by distance; the nearest is compared, and how it is shown.
+    shown = {tuple(np.round(other, 3)) for other in theirs[1:]}
+    assert sum(tuple(np.round(other, 3)) in shown for other in ours[1:]) >= 4
