@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from crashhunt.scene import Lane
 
-__all__ = ["Bundle", "find_bundle", "list_bundles", "write_bundle", "write_trial"]
+__all__ = ["Bundle", "find_bundle", "list_bundles", "read_bundle", "write_bundle", "write_trial"]
 
 SCHEMA = 1
 

@@ -20,7 +20,20 @@ from crashhunt.space import Argument, Kind, Value, kind_of, parse_spec
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["AgentSetup", "ArgumentSetup", "ObservationSetup", "Scenario", "SumoSetup", "load_scenario"]
+__all__ = [
+    "AgentSetup",
+    "ArgumentSetup",
+    "ObservationSetup",
+    "Scenario",
+    "SumoSetup",
+    "argument_values",
+    "asked_for",
+    "load_scenario",
+    "scenario_from_dict",
+    "shipped_folder",
+    "shipped_scenarios",
+    "with_action",
+]
 
 DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
 

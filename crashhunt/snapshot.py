@@ -22,7 +22,7 @@ from crashhunt.scenario import Scenario, load_scenario
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-__all__ = ["Snapshot", "scenario_digest", "take_snapshot"]
+__all__ = ["Snapshot", "scenario_digest", "take_snapshot", "versions"]
 
 _SKIPPED = {"__pycache__", ".git", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
 _VERSIONED = ("crashhunt", "libsumo", "gymnasium", "numpy", "highway-env")

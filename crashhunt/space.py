@@ -24,7 +24,18 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-__all__ = ["Argument", "Choice", "Constant", "Distribution", "Kind", "Range", "Value", "kind_of", "parse_spec"]
+__all__ = [
+    "Argument",
+    "Choice",
+    "Constant",
+    "Distribution",
+    "Kind",
+    "Range",
+    "Value",
+    "describe",
+    "kind_of",
+    "parse_spec",
+]
 
 Value = bool | int | float | str
 Kind = Literal["float", "int", "bool", "str"]

@@ -7,13 +7,13 @@ from crashhunt.executors._worker import BLACK_BOX, OUTPUT, STACK, read_map, work
 
 __all__ = [
     "BLACK_BOX",
+    "OUTPUT",
+    "STACK",
     "Executor",
     "FreshProcessExecutor",
-    "OUTPUT",
     "PoolExecutor",
+    "WorkerSettings",
     "read_map",
     "scratch_of",
-    "STACK",
     "worker_environment",
-    "WorkerSettings",
 ]

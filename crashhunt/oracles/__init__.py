@@ -7,15 +7,15 @@ from crashhunt.oracles._protocol import Finding, Oracle, merge_findings
 
 __all__ = [
     "ApproachMeter",
-    "approaches",
-    "closest_approach",
     "Finding",
-    "merge_findings",
     "OffRoad",
     "Oracle",
-    "outlines_overlap",
     "Overlap",
-    "rectangle_gap",
     "ReportedCollision",
+    "approaches",
+    "closest_approach",
+    "merge_findings",
+    "outlines_overlap",
+    "rectangle_gap",
     "time_to_contact",
 ]

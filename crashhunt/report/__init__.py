@@ -3,4 +3,4 @@
 from crashhunt.report._screen import Watcher, format_arguments, format_seconds
 from crashhunt.report._summary import describe_hunt, describe_replay
 
-__all__ = ["describe_hunt", "describe_replay", "format_arguments", "format_seconds", "Watcher"]
+__all__ = ["Watcher", "describe_hunt", "describe_replay", "format_arguments", "format_seconds"]

@@ -4,8 +4,8 @@ from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpaceAction,
 from crashhunt.simulators._protocol import ActionForm, Observations, Simulator, StepResult
 
 __all__ = [
-    "ActionForm",
     "META_ACTIONS",
+    "ActionForm",
     "MetaAction",
     "Observations",
     "Simulator",

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.timeout(300)
+def test_a_wheel_brings_its_scenarios_along(tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".venv", ".git", ".*_cache", ".hypothesis"))
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source], check=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    site = tmp_path / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)  # as pip does it; what it depends on is in this environment already
+    shutil.rmtree(source)
+    # Before the editable installation of this environment.
+    program = f"import sys; sys.path.insert(0, {str(site)!r}); from crashhunt.cli import main; sys.exit(main())"
+    environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+
+    def crashhunt(*words: str) -> dict:
+        done = subprocess.run(
+            [sys.executable, "-c", program, *words, "--json"], cwd=tmp_path, env=environment, capture_output=True,
+            text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    shipped = {path.parent.name for path in (ROOT / "scenarios").glob("*/scenario.toml")}
+    assert {entry["name"] for entry in crashhunt("scenarios")["scenarios"]} == shipped
+    found = crashhunt("run", "out", "2", "50", "600", "--arg", "speed=20:25", "--seed", "1")
+    assert found["stopped_because"] == "crash"
+    shutil.rmtree(site / "crashhunt" / "scenarios")  # the bundle has its own
+    assert crashhunt("replay", "out")["verdict"] == "reproduced"

@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_agents_are_listed_with_arguments_ranges_and_units(shell):
+    agents = {entry["name"]: entry for entry in shell.crashhunt("agents", "--json").json["agents"]}
+    assert {"car-following", "keep-lane", "lane-changer", "random", "recorded"} <= set(agents)
+    (speed,) = agents["keep-lane"]["arguments"]
+    assert speed == {
+        "name": "speed",
+        "kind": "float",
+        "default": 15.0,
+        "range": "5.0:30.0",
+        "unit": "m/s",
+        "help": "held for ever",
+    }
+    text = shell.crashhunt("agents").out
+    assert all(entry["locator"] in text and entry["title"] in text for entry in agents.values())
+
+
+def test_every_listed_scenario_and_agent_can_be_hunted_by_name(shell):
+    scenarios = shell.crashhunt("scenarios", "--json").json["scenarios"]
+    assert {"loop", "merge", "intersection", "loop-two-agents"} <= {entry["name"] for entry in scenarios}
+    for entry in scenarios:
+        assert entry["title"]
+        assert entry["arguments"]
+        found = shell.crashhunt("run", f"out-{entry['name']}", "1", "1", "3", "--scenario", entry["name"], "--json")
+        assert found.json["trials_run"] == 1
+        assert "invalid" not in found.json["outcomes"]
+    for agent in ("car-following", "lane-changer", "random"):
+        found = shell.crashhunt("run", f"out-{agent}", "1", "1", "3", "--agent", agent, "--json")
+        assert found.json["trials_run"] == 1
+        assert set(found.json["outcomes"]) <= {"survived", "off_road"}
+
+
+def test_networks_are_what_their_sources_say():
+    done = subprocess.run([ROOT / "scripts" / "networks", "--check"], capture_output=True, text=True, check=False)
+    if "netconvert is missing" in done.stderr:
+        pytest.skip("netconvert is not installed")
+    assert (done.returncode, done.stderr) == (0, "")
