@@ -395,8 +395,9 @@ class Hunt:
                 self.settings = replace(self.settings, seed=before.seed)
             differences = before.differences(self.settings)
             if differences:
+                more = f"; and {len(differences) - 4} more" if len(differences) > 4 else ""
                 raise HuntDirectoryError(
-                    f"another hunt is there: {'; '.join(differences)}",
+                    f"another hunt is there: {'; '.join(differences[:4])}{more}",
                     fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
                     where=str(self.directory),
                 )

@@ -113,8 +113,12 @@ class HuntSettings:
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))
         return [
             f"{key} was {mine.get(key, '(not there)')} and is now {theirs.get(key, '(not there)')}"
-            for key in sorted(mine.keys() | theirs.keys())
-            if mine.get(key) != theirs.get(key) and not key.startswith("run.") and key != "trials"
+            for key in sorted(mine.keys() | theirs.keys(), key=lambda key: (key.count("."), key))
+            if mine.get(key) != theirs.get(key)
+            and not key.startswith("run.")
+            and key != "trials"
+            # The kind of an argument that only one of them has says nothing more.
+            and not (key.endswith(".kind") and key.removesuffix(".kind") in mine.keys() ^ theirs.keys())
         ]
 
 

@@ -28,6 +28,8 @@ _DROPPED_SECTIONS = {"output", "gui_only", "traci_server", "report", "random_num
 _DROPPED = {"seed", "random", "threads", "remote-port", "num-clients", "begin", "end", "step-length", "scale"}
 _DROPPED |= {"gui-settings-file", "registry-viewport", "save-configuration", "load-state", "quit-on-end", "start"}
 _FILE_OPTIONS = {"net-file", "route-files", "additional-files"}
+# A flow is not punctual, and a full road lets nobody in.
+_PATIENCE_S = 300.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         folder=folder,
         step_length_s=step_length,
         warmup_s=0.0,
+        insertion_timeout_s=_PATIENCE_S,
         agents={agent: setup},
         arguments={"scale": ArgumentSetup(default=scale, help="scales the traffic demand", option="scale")},
         sumo=SumoSetup(net=net[0], routes=routes, additional=additional, options={"begin": begin, **kept}),
@@ -138,8 +141,7 @@ def _choose_ego(ego: str, files: list[Path], path: Path) -> tuple[str, AgentSetu
         edges = tuple(edge for edge in value.split(",") if edge)
         return "ego", AgentSetup(edges=edges), f"the controlled vehicle is added on the edges {', '.join(edges)}"
     if kind == "vehicle":
-        known = {departure.vehicle: departure for departure in _departures(files)}
-        depart = known[value].depart_s if value in known else 0.0
+        depart = _departure_of(value, files)
         return value, AgentSetup(existing=True, depart_s=depart), f"the controlled vehicle is the vehicle {value!r}"
     if kind:
         raise ScenarioError(
@@ -169,6 +171,37 @@ def _departures(files: list[Path]) -> list[_Departure]:
             continue
         found.append(_Departure(f"{name}.0" if element.tag == "flow" else name, depart))
     return found
+
+
+def _departure_of(vehicle: str, files: list[Path]) -> float:
+    """When a vehicle departs, as far as its files tell; SUMO calls the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
+    flow, _, number = vehicle.rpartition(".")
+    for element in _elements(files, "flow"):
+        if element.get("id") == flow and number.isdecimal():
+            try:
+                begin = _seconds(element.get("begin", "0"), Path())
+                return begin + int(number) * _interval(element, begin)
+            except (ScenarioError, ZeroDivisionError):
+                return 0.0
+    return next((found.depart_s for found in _departures(files) if found.vehicle == vehicle), 0.0)
+
+
+def _interval(flow: ET.Element, begin: float) -> float:
+    """The mean time from one vehicle of a flow to the next, in s."""
+
+    def value(attribute: str) -> float:
+        return _number(flow.get(attribute, "").removeprefix("exp(").removesuffix(")"), attribute, Path())
+
+    for attribute in ("vehsPerHour", "perHour"):
+        if attribute in flow.keys():  # noqa: SIM118 - an element is no mapping
+            return 3600.0 / value(attribute)
+    if "probability" in flow.keys():  # noqa: SIM118
+        return 1.0 / value("probability")
+    if "number" in flow.keys() and "end" in flow.keys():  # noqa: SIM118
+        return (_seconds(flow.get("end", ""), Path()) - begin) / value("number")
+    if flow.get("period", "").startswith("exp("):
+        return 1.0 / value("period")  # exp(rate), in 1/s
+    return value("period")
 
 
 def _elements(files: list[Path], *tags: str) -> list[ET.Element]:

@@ -169,6 +169,25 @@ def test_the_controlled_vehicle_can_be_named(town, ego, agent, attribute, value)
     assert getattr(scenario.agents[agent], attribute) == value
 
 
+@pytest.mark.parametrize(
+    ("rate", "depart_s"),
+    [
+        ('period="4"', 46.0),
+        ('vehsPerHour="1800"', 28.0),
+        ('perHour="1800"', 28.0),
+        ('probability="0.5"', 28.0),
+        ('period="exp(0.25)"', 46.0),
+        ('end="1:50" number="10"', 100.0),
+        ('period="whenever"', 0.0),
+        ("", 0.0),
+    ],
+)
+def test_a_vehicle_of_a_flow_is_waited_for(town, rate, depart_s):
+    (town / "r.rou.xml").write_text(f'<routes><flow id="a.b" from="south" to="east" begin="10" {rate}/></routes>')
+    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
+    assert load_scenario(path, ego="a.b.9").agents["a.b.9"].depart_s == depart_s
+
+
 def test_files_beside_and_above_and_compressed(town):
     (town / "cfg").mkdir()
     with gzip.open(town / "r.rou.xml.gz", "wb") as file:
