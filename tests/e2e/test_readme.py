@@ -1,0 +1,69 @@
+"""What the README shows is run: its files are written as they stand there, its commands are called."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(\w*)\n(.*?)```", TEXT, re.DOTALL)
+
+
+def commands() -> list[str]:
+    """The commands behind a prompt, continuation lines joined."""
+    found = []
+    for kind, block in BLOCKS:
+        if kind == "console":
+            found += re.findall(r"^\$ (.*)$", block.replace("\\\n", " "), re.MULTILINE)
+    return found
+
+
+@pytest.fixture
+def shown(shell):
+    """A folder with the files of the README."""
+    for _, block in BLOCKS:
+        name = re.match(r"(?:# |<!-- )(\w+\.\S+\w)", block)
+        if name:
+            (shell.folder / name[1]).write_text(block, encoding="utf-8")
+    shutil.copy(ROOT / "scenarios/intersection/intersection.net.xml", shell.folder / "town.net.xml")
+    return shell
+
+
+def test_every_command_does_what_it_says(shown):
+    ran = []
+    for command in commands():
+        program, *words = shlex.split(command)
+        ran.append(program)
+        if program == "scripts/crashhunt":
+            out = shown.crashhunt(*words).out
+            assert "reproduced" in out if words[0] == "replay" else "confirmed: a fresh process" in out
+        else:
+            assert program == ".venv/bin/python"
+            done = subprocess.run(
+                [sys.executable, *words], cwd=shown.folder, capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, done.stderr
+            assert re.search(r"'outcome': '\w+'|^[\d.]+ s: \[", done.stdout), done.stdout
+    assert len(ran) == 5
+
+
+def test_the_shown_scenario_is_valid(shown):
+    (toml,) = (block for kind, block in BLOCKS if kind == "toml")
+    folder = shown.folder / "mine"
+    shutil.copytree(ROOT / "scenarios/loop", folder)
+    (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    found = shown.crashhunt("run", "out", "1", "1", "5", "--scenario", "mine", "--json").json
+    assert found["outcomes"] == {"survived": 1}
+
+
+def test_every_option_that_is_mentioned_exists(shell):
+    helps = "".join(shell.crashhunt(command, "--help").out for command in ("run", "replay"))
+    known = {*re.findall(r"--[a-z-]+", helps), "--check", "--json"}
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", TEXT)) <= known
