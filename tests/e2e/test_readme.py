@@ -59,6 +59,8 @@ def test_the_shown_scenario_is_valid(shown):
     folder = shown.folder / "mine"
     shutil.copytree(ROOT / "scenarios/loop", folder)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")
+    traffic = folder / "traffic.rou.xml"  # it shows one argument of several
+    traffic.write_text(re.sub(r"\$\{(?!vehicles\b)\w+\}", "0.1", traffic.read_text()))
     found = shown.crashhunt("run", "out", "1", "1", "5", "--scenario", "mine", "--json").json
     assert found["outcomes"] == {"survived": 1}
 
