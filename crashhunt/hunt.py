@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import signal
 import time
 from collections import Counter
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from crashhunt.bundle import Bundle, list_bundles, write_bundle, write_trial
+from crashhunt.directory import HuntDirectory
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_of
 from crashhunt.ledger import Ledger
-from crashhunt.plan import with_settings
+from crashhunt.plan import spec_of, with_settings
 from crashhunt.plugins import locate
 from crashhunt.replay import confirm
-from crashhunt.settings import HuntSettings, read_settings, write_settings
 from crashhunt.snapshot import Snapshot, take_snapshot
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -32,8 +29,9 @@ if TYPE_CHECKING:
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.samplers import Sampler
     from crashhunt.scenario import Scenario
+    from crashhunt.settings import HuntSettings
 
-__all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause", "spec_of"]
+__all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
 StoppedBecause = Literal["crash", "all_trials", "interrupted", "no_valid_trial"]
 
@@ -109,17 +107,6 @@ class HuntReport:
         }
 
 
-def spec_of(number: int, settings: HuntSettings, sampler: Sampler) -> TrialSpec:
-    """Return a trial of a hunt; it depends on the hunt's seed and on the number only."""
-    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
-    seed = int(rng.integers(2**31))
-    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
-    scenario_arguments: dict[str, Any] = {}
-    for (agent, name), value in sorted(sampler.ask(number, rng).items()):
-        (arguments[agent] if agent else scenario_arguments)[name] = value
-    return TrialSpec(number, seed, arguments, scenario_arguments, max_steps=settings.max_steps)
-
-
 @dataclass(slots=True)
 class _Progress:
     """What this run of the hunt has seen."""
@@ -162,6 +149,7 @@ class Hunt:
     ) -> None:
         self.directory = directory
         self.scenario = scenario
+        self._place = HuntDirectory(directory)
         self.settings = settings
         self._command = command or ["crashhunt", "run", str(directory)]
         self._overwrite = overwrite
@@ -178,8 +166,10 @@ class Hunt:
             HuntDirectoryError: the directory is busy, foreign, unwritable or full.
             CrashhuntError: the machinery failed.
         """
-        with self._locked(), self._signals():
-            self._open()
+        with self._place.locked(), self._signals():
+            self.settings = self._place.claim(
+                self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given
+            )
             ledger = Ledger(self.directory / "ledger.sqlite", writable=True)
             try:
                 return self._run(ledger, watch or (lambda _: None))
@@ -199,11 +189,7 @@ class Hunt:
                 with suppress(CrashhuntError):
                     ledger.note(pid=None, heartbeat=time.time())
                 ledger.close()
-                shutil.rmtree(self._scratch, ignore_errors=True)
-
-    @property
-    def _scratch(self) -> Path:
-        return self.directory / ".scratch"
+                shutil.rmtree(self._place.scratch, ignore_errors=True)
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
@@ -256,7 +242,7 @@ class Hunt:
             scenario=with_settings(snapshot.scenario(), settings),
             oracles=settings.oracles,
             crash_on=settings.crash_on,
-            scratch=self._scratch,
+            scratch=self._place.scratch,
             code=str(snapshot.code.resolve()),
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
@@ -329,7 +315,7 @@ class Hunt:
             if nearest is None or result.closest.time_to_collision_s < nearest.closest.time_to_collision_s:
                 progress.nearest = result
         if result.kept:
-            write_trial(self.directory, result, scratch_of(self._scratch, result.spec.number))
+            write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
 
     def _teach(self, result: TrialResult, sampler: Sampler, progress: _Progress) -> None:
@@ -346,10 +332,10 @@ class Hunt:
         bundle = write_bundle(
             self.directory,
             result,
-            scratch_of(self._scratch, result.spec.number),
+            scratch_of(self._place.scratch, result.spec.number),
             hunt_seed=self.settings.seed,
             snapshot=snapshot.digest,
-            lanes=read_map(self._scratch),
+            lanes=read_map(self._place.scratch),
         )
         progress.crashes.append(bundle)
         ledger.record(result, snapshot=snapshot.digest)
@@ -380,77 +366,6 @@ class Hunt:
             workers or {},
             len(progress.crashes) + (1 if progress.found else 0),
         )
-
-    def _open(self) -> None:
-        """Make the directory this hunt's, or see that it is already."""
-        path = self.directory / "hunt.toml"
-        if self._overwrite:
-            for name in ("hunt.toml", "ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm"):
-                (self.directory / name).unlink(missing_ok=True)
-            for name in ("snapshots", "crashes", "trials"):
-                shutil.rmtree(self.directory / name, ignore_errors=True)
-        if path.exists():
-            before = read_settings(path)
-            if not self._seed_given:
-                self.settings = replace(self.settings, seed=before.seed)
-            differences = before.differences(self.settings)
-            if differences:
-                more = f"; and {len(differences) - 4} more" if len(differences) > 4 else ""
-                raise HuntDirectoryError(
-                    f"another hunt is there: {'; '.join(differences[:4])}{more}",
-                    fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
-                    where=str(self.directory),
-                )
-        shutil.rmtree(self._scratch, ignore_errors=True)
-        try:
-            self._scratch.mkdir()
-            write_settings(path, self.settings, self._command)
-        except OSError as error:
-            raise self._unusable(error) from error
-
-    def _refuse_foreign(self) -> None:
-        if (self.directory / "hunt.toml").exists():
-            return
-        foreign = sorted(path.name for path in self.directory.iterdir() if path.name not in (".lock", ".scratch"))
-        if foreign:
-            raise HuntDirectoryError(
-                f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
-                fix="give an empty or a new folder",
-                where=str(self.directory),
-            )
-
-    def _unusable(self, error: OSError) -> HuntDirectoryError:
-        if isinstance(error, FileExistsError):
-            return HuntDirectoryError(f"{str(self.directory)!r} is a file", fix="give a new or an empty folder")
-        return HuntDirectoryError(
-            f"the directory cannot be used: {error.strerror}",
-            fix="choose one below a folder that exists and is writable",
-            where=str(error.filename or self.directory),
-        )
-
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Keep other hunts out, by a lock that dies with this process."""
-        try:
-            self.directory.mkdir(exist_ok=True)
-            self._refuse_foreign()
-            lock = (self.directory / ".lock").open("a+")
-        except OSError as error:
-            raise self._unusable(error) from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                lock.seek(0)
-                raise HuntDirectoryError(
-                    f"another hunt is running there (process {lock.read().strip() or '?'})",
-                    fix="wait for it, stop it, or choose another directory",
-                    where=str(self.directory),
-                ) from None
-            lock.truncate(0)
-            lock.write(str(os.getpid()))
-            lock.flush()
-            yield
 
     @contextmanager
     def _signals(self) -> Iterator[None]:

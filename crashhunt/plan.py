@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import secrets
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.plugins import locate, signature_of
@@ -12,15 +14,16 @@ from crashhunt.scenario import Scenario, load_scenario
 from crashhunt.settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.snapshot import scenario_digest
 from crashhunt.space import Argument, Constant, parse_spec
-from crashhunt.trial import CRASHES, Outcome
+from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.plugins import Signature
+    from crashhunt.samplers import Sampler
 
-__all__ = ["Request", "plan", "with_settings"]
+__all__ = ["Request", "plan", "spec_of", "with_settings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,3 +238,14 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
             )
         specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
     return specs
+
+
+def spec_of(number: int, settings: HuntSettings, sampler: Sampler) -> TrialSpec:
+    """Return a trial of a hunt; it depends on the hunt's seed and on the number only."""
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
+    seed = int(rng.integers(2**31))
+    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
+    scenario_arguments: dict[str, Any] = {}
+    for (agent, name), value in sorted(sampler.ask(number, rng).items()):
+        (arguments[agent] if agent else scenario_arguments)[name] = value
+    return TrialSpec(number, seed, arguments, scenario_arguments, max_steps=settings.max_steps)
