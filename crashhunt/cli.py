@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -155,6 +156,9 @@ def _add_replay(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace, words: list[str]) -> int:
+    # From here to where the hunt takes over there is nothing to keep, and an exception would be lost where somebody
+    # else's import swallows it.
+    signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from rich.console import Console
 
     from crashhunt.hunt import Hunt
@@ -208,6 +212,14 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     if report.stopped_because == "interrupted":
         return 130
     return 1 if report.crashes and options.fail_on_crash else 0
+
+
+def _leave_at_once(*, as_json: bool) -> NoReturn:
+    error = CrashhuntError("interrupted before the hunt began")
+    if as_json:
+        os.write(1, json.dumps(error.to_json()).encode() + b"\n")
+    os.write(2, f"crashhunt: {error}\n".encode())
+    os._exit(130)
 
 
 def _replay(options: argparse.Namespace, _words: list[str]) -> int:

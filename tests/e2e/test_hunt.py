@@ -125,6 +125,16 @@ def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(shell
     assert {key: after[key] for key in before} == before  # nothing that had finished ran again
 
 
+@pytest.mark.parametrize("after_s", [0.15, 0.2, 0.25, 0.3, 0.4])
+def test_an_interrupt_while_it_starts_is_not_lost(shell, after_s):
+    process = shell.start("run", "h", "2", "100000", "300", *FINE, start_new_session=True)
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=15)
+    assert process.returncode in (130, -signal.SIGINT)  # the latter where Python itself had not started yet
+    wait_for(lambda: session_is_gone(process.pid), 5)
+
+
 def test_a_killed_hunt_leaves_no_process_and_goes_on(shell):
     words = ("run", "h", "2", "60", "300", *FINE, "--json")
     process = shell.start(*words, start_new_session=True)
