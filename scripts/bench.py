@@ -305,7 +305,7 @@ def bench_memory() -> Iterator[Figure]:
 
 
 def bench_bundle() -> Iterator[Figure]:
-    """The size of a log, and how long it takes from the crash to everything stopped and saved."""
+    """The size of a log."""
     with folder() as place:
         options = ("--agent", "keep-lane", "--arg", "speed=14:18", "--seed", "3", "--crash-on", "collision")
         found = hunt(place / "h", 2, 500, 1500, *options)
@@ -313,6 +313,46 @@ def bench_bundle() -> Iterator[Figure]:
         size = sum(path.stat().st_size for path in (place / "h" / "crashes").glob("*/log.mcap"))
         note = f"log.mcap with view channels, {crash['step']} steps, trial {crash['trial']} of {found['trials_run']}"
         yield Figure("log_bytes_per_step", size / max(1, crash["step"]), "B", "lower", None, note)
+
+
+_CRASHES_AMONG_HANGING = """
+import re, time
+
+
+class Agent:
+    def __init__(self, number: int = 0):
+        self.number = number
+
+    def reset(self, seed): pass
+
+    def act(self, observation):
+        if self.number:
+            re.match(r"(a+)+$", "a" * 60 + "b")  # in C, holding the interpreter, for ever
+        time.sleep(0.02)  # until the others hang
+        if observation[0, 1] > 10:
+            print("raised at", time.time(), flush=True)
+            raise RuntimeError("on purpose")
+        return 5.0, 0
+"""
+
+
+def bench_stop() -> Iterator[Figure]:
+    """From a crash to every worker stopped and the bundle on disk, while all other workers hang."""
+    seconds = []
+    for _ in range(3):
+        with folder() as place:
+            (place / "bench_agent.py").write_text(_CRASHES_AMONG_HANGING)
+            words = ["run", "h", "3", "101", "2000", "--agent", "bench_agent:Agent", "--arg", "number=0:100"]
+            options = ["--sampler", "grid", "--points", "101", "--set", "vehicles=10", "--json"]
+            command = [str(CRASHHUNT), *words, *options]
+            subprocess.run(
+                command, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True, timeout=120
+            )
+            crashes = place / "h" / "crashes"
+            raised = float(next(crashes.glob("*/run.log")).read_text().split("raised at")[1].split()[0])
+            seconds.append(crashes.stat().st_mtime - raised)  # the bundle's folder is renamed into place last
+    note = "from the crash to all workers killed and the bundle saved, with two of three workers hung in C"
+    yield Figure("crash_to_saved_s", statistics.median(seconds), "s", "lower", 1.0, note)
 
 
 def _toy(place: Path) -> Path:
@@ -333,6 +373,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "help": bench_help,
     "memory": bench_memory,
     "bundle": bench_bundle,
+    "stop": bench_stop,
 }
 
 
