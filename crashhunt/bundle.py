@@ -8,10 +8,10 @@ import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.environment import versions
 from crashhunt.errors import BundleError
 from crashhunt.executors import BLACK_BOX, OUTPUT
 from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
-from crashhunt.snapshot import versions
 from crashhunt.trial import ClosestApproach, Collision, Failure, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
     ├── BundleError                a crash bundle or log that is damaged or incomplete
+    ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
     ├── RecorderError              a trial could not be recorded: a full disk
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
@@ -30,6 +31,7 @@ __all__ = [
     "RecorderError",
     "ScenarioError",
     "SimulatorError",
+    "SnapshotError",
     "UsageError",
 ]
 
@@ -91,6 +93,10 @@ class HuntDirectoryError(CrashhuntError):
 
 class BundleError(CrashhuntError):
     """A crash bundle or log that is damaged or incomplete."""
+
+
+class SnapshotError(CrashhuntError):
+    """The code of a hunt cannot be captured."""
 
 
 class RecorderError(CrashhuntError):

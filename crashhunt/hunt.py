@@ -19,7 +19,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plan import spec_of, with_settings
 from crashhunt.plugins import locate
 from crashhunt.replay import confirm
-from crashhunt.snapshot import Snapshot, take_snapshot
+from crashhunt.snapshot import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -135,6 +135,7 @@ class Hunt:
         command: the command line, as a comment in ``hunt.toml``.
         overwrite: begin anew, whatever is there.
         seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
+        snapshot: what the snapshot of the code takes in.
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class Hunt:
         command: list[str] | None = None,
         overwrite: bool = False,
         seed_given: bool = True,
+        snapshot: SnapshotOptions | None = None,
     ) -> None:
         self.directory = directory
         self.scenario = scenario
@@ -154,6 +156,7 @@ class Hunt:
         self._command = command or ["crashhunt", "run", str(directory)]
         self._overwrite = overwrite
         self._seed_given = seed_given
+        self._snapshot_options = snapshot
         self._interrupted = False
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
@@ -193,7 +196,7 @@ class Hunt:
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
-        snapshot = take_snapshot(self.directory / "snapshots", self.scenario)
+        snapshot = take_snapshot(self.directory / "snapshots", self.scenario, settings, self._snapshot_options)
         sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
         progress = _Progress()
         finished = ledger.finished()
@@ -209,7 +212,7 @@ class Hunt:
         if stopped is None:
             stopped = self._hunt(ledger, sampler, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
-        self._confirm(progress, snapshot)
+        self._confirm(progress)
         ledger.note(state=stopped, heartbeat=time.time())
         watch(self._status(progress, "done"))
         reason = ""
@@ -243,7 +246,8 @@ class Hunt:
             oracles=settings.oracles,
             crash_on=settings.crash_on,
             scratch=self._place.scratch,
-            code=str(snapshot.code.resolve()),
+            code=snapshot.code,
+            argument_files=snapshot.argument_files,
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
         )
@@ -340,11 +344,11 @@ class Hunt:
         progress.crashes.append(bundle)
         ledger.record(result, snapshot=snapshot.digest)
 
-    def _confirm(self, progress: _Progress, snapshot: Snapshot) -> None:
+    def _confirm(self, progress: _Progress) -> None:
         """Run every crash that nobody has confirmed yet once more, in a fresh process."""
         for place, bundle in enumerate(progress.crashes):
             if bundle.confirmed is None and not self._interrupted:
-                confirmed = confirm(bundle, Snapshot(snapshot.path.parent / bundle.snapshot), self.settings)
+                confirmed = confirm(bundle)
                 confirmed.write()
                 progress.crashes[place] = confirmed
 

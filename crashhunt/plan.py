@@ -212,8 +212,10 @@ def _spec(
         if argument is not None and argument.distribution is not None:
             # The same text may mean whole numbers or not, depending on the agent's own type.
             return ArgumentSpec(spec=str(parse_spec(str(argument.distribution), kind, where=name)), kind=kind)
-    if known is not None and known.default is not None:
-        return ArgumentSpec(spec=str(parse_spec(str(Constant(known.default)), kind, where=name)), kind=kind)
+    for argument in (known, declared):
+        # The constructor's own default too: it may be another one by the time of a replay.
+        if argument is not None and argument.default is not None:
+            return ArgumentSpec(spec=str(parse_spec(str(Constant(argument.default)), kind, where=name)), kind=kind)
     return None
 
 

@@ -2,26 +2,76 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.errors import BundleError, CrashhuntError
+from crashhunt.edits import edited_spec
+from crashhunt.environment import environment_changes
+from crashhunt.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, FreshProcessExecutor, WorkerSettings, scratch_of
 from crashhunt.plan import with_settings
-from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box
-from crashhunt.settings import HuntSettings, read_settings
+from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box, values_around
+from crashhunt.settings import read_settings
 from crashhunt.snapshot import Snapshot
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from crashhunt.bundle import Bundle
-    from crashhunt.trial import TrialResult
+    from collections.abc import Mapping
 
-__all__ = ["ReplayReport", "Verdict", "confirm", "replay"]
+    from crashhunt.bundle import Bundle
+    from crashhunt.trial import TrialResult, TrialSpec
+
+__all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
+Code = Literal["snapshot", "current", "log"]
+
+_SIMULATORS = {"sumo": ("libsumo",)}  # on whose version everything depends that a simulator computes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayOptions:
+    """How to replay.
+
+    Args:
+        code: who drives: the code of the snapshot, today's, or the recorded actions.
+        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
+        force: replay even from a snapshot that is damaged.
+        times: how often.
+    """
+
+    code: Code = "snapshot"
+    changes: Mapping[str, str] = field(default_factory=dict)
+    force: bool = False
+    times: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Rerun:
+    """A crash, ready to be run again.
+
+    Args:
+        bundle: the crash.
+        recorded: the recording.
+        spec: the trial, with all edits.
+        worker: where and how it runs; its scratch folder is not set yet.
+        code: who drives.
+        snapshot: of the bundle.
+        edits: what is not as it was recorded, in words.
+        warnings: what may make a difference, in words.
+    """
+
+    bundle: Bundle
+    recorded: Recording
+    spec: TrialSpec
+    worker: WorkerSettings
+    code: Code
+    snapshot: Snapshot
+    edits: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,59 +79,75 @@ class ReplayReport:
     """What came of a replay.
 
     Args:
-        bundle: the crash.
-        verdict: whether it is the same.
-        code: whose code drove: the snapshot's, or the log's recorded actions.
-        recorded: the recording.
+        rerun: what was run.
+        verdict: whether it is the same; of several times, the first that was not.
         replayed: the trial that was run now.
         steps_replayed: how many steps it completed.
         divergence: the first difference.
+        around: step, recorded and replayed value of the field that differs, in the steps around.
+        reason: why the two cannot be compared.
+        verdicts: of all runs, and how many had each.
     """
 
-    bundle: Bundle
+    rerun: Rerun
     verdict: Verdict
-    code: Literal["snapshot", "current", "log"]
-    recorded: Recording
     replayed: TrialResult
     steps_replayed: int
-    divergence: Divergence | None
+    divergence: Divergence | None = None
+    around: tuple[tuple[int, Any, Any], ...] = ()
+    reason: str = ""
+    verdicts: Mapping[Verdict, int] = field(default_factory=dict)
+
+    @property
+    def bundle(self) -> Bundle:
+        """The crash."""
+        return self.rerun.bundle
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``replay --json`` prints."""
         return {
             "crash": self.bundle.id,
             "verdict": self.verdict,
-            "code": self.code,
-            "steps_recorded": self.recorded.steps,
+            "code": self.rerun.code,
+            "steps_recorded": self.rerun.recorded.steps,
             "steps_replayed": self.steps_replayed,
             "digest_recorded": self.bundle.result.digest,
             "digest_replayed": self.replayed.digest,
             "divergence": self.divergence.to_json() if self.divergence else None,
+            "outcome_recorded": str(self.bundle.result.outcome),
+            "outcome_replayed": str(self.replayed.outcome),
+            "reason": self.reason,
+            "edits": list(self.rerun.edits),
+            "warnings": list(self.rerun.warnings),
+            "times": sum(self.verdicts.values()),
+            "agreed": self.verdicts.get("reproduced", 0),
+            "verdicts": dict(self.verdicts),
         }
 
 
-def replay(bundle: Bundle, *, from_log: bool = False) -> ReplayReport:
-    """Run a crash again from its bundle alone.
+def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:
+    """Run a crash again from its bundle alone, and compare every step with the log.
 
-    The scenario and the agent's code come from the snapshot, whatever has become of the originals.
-
-    Args:
-        bundle: the crash.
-        from_log: drive with the recorded actions instead of the agent's code.
+    The scenario comes from the snapshot, whatever has become of the original; so does the agent's code, unless the
+    options say otherwise. With recorded actions at the wheel, nothing of the bundle's code is run.
 
     Raises:
         BundleError: the bundle is damaged.
         CrashhuntError: the replay could not be run.
     """
-    snapshot = Snapshot(bundle.hunt / "snapshots" / bundle.snapshot)
-    snapshot.verify()
-    return _replay(bundle, snapshot, read_settings(bundle.hunt / "hunt.toml"), from_log=from_log)
+    options = options or ReplayOptions()
+    if options.times < 1:
+        raise UsageError(f"--times is {options.times}", fix="give at least 1")
+    rerun = prepare(bundle, options)
+    reports = [_run(rerun) for _ in range(options.times)]
+    shown = next((report for report in reports if report.verdict != "reproduced"), reports[0])
+    return replace(shown, verdicts=Counter(report.verdict for report in reports))
 
 
-def confirm(bundle: Bundle, snapshot: Snapshot, settings: HuntSettings) -> Bundle:
+def confirm(bundle: Bundle) -> Bundle:
     """Return the bundle with the verdict of a first replay."""
     try:
-        report = _replay(bundle, snapshot, settings, from_log=False)
+        report = _run(prepare(bundle, ReplayOptions(force=True)))
     except CrashhuntError as error:
         failure = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure)
@@ -89,7 +155,13 @@ def confirm(bundle: Bundle, snapshot: Snapshot, settings: HuntSettings) -> Bundl
     return replace(bundle, confirmed=report.verdict == "reproduced", divergence=divergence)
 
 
-def _replay(bundle: Bundle, snapshot: Snapshot, settings: HuntSettings, *, from_log: bool) -> ReplayReport:
+def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
+    """Check a bundle, and gather what its crash needs to be run again.
+
+    Raises:
+        BundleError: the bundle is damaged.
+        UsageError: an edit cannot be meant.
+    """
     recorded = bundle.recording()
     if recorded.digest != bundle.result.digest:
         raise BundleError(
@@ -97,58 +169,107 @@ def _replay(bundle: Bundle, snapshot: Snapshot, settings: HuntSettings, *, from_
             fix="get an undamaged copy of the bundle",
             where=str(bundle.path / "log.mcap"),
         )
+    snapshot = Snapshot(bundle.hunt / "snapshots" / bundle.snapshot)
+    warnings = []
+    code: Code = options.code
+    if code == "snapshot" and not snapshot.has_code:
+        code = "current"
+        warnings.append("the hunt kept no snapshot of the code (--no-snapshot), so that today's code drives")
+    if options.force:
+        warnings += [f"the snapshot is damaged: {fault}" for fault in snapshot.faults()]
+    else:
+        snapshot.verify()
+    changed = environment_changes(snapshot.environment())
+    warnings += [f"{name} was {then} and is {now}" for name, (then, now) in changed.items()]
+    settings = read_settings(bundle.hunt / "hunt.toml")
+    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
     scenario = with_settings(snapshot.scenario(), settings)
-    spec = bundle.result.spec
-    if from_log:
+    if code == "log":
+        if edits:
+            raise UsageError(
+                f"recorded actions belong to the recorded trial, and {edits[0]}", fix="replay with --code snapshot"
+            )
         log = str((bundle.path / "log.mcap").resolve())
         scenario = scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded"))
-        spec = replace(spec, arguments={agent: {"log": log, "agent": agent} for agent in scenario.agents})
         # An agent that failed did not act in its last step, and neither can its record.
         acted = max((len(recorded.actions(agent)) for agent in recorded.agents), default=0)
-        spec = replace(spec, max_steps=max(1, min(spec.max_steps, acted)))
+        arguments = {agent: {"log": log, "agent": agent} for agent in scenario.agents}
+        spec = replace(spec, arguments=arguments, max_steps=max(1, min(spec.max_steps, acted)))
+    worker = WorkerSettings(
+        scenario=scenario,
+        oracles=settings.oracles,
+        crash_on=settings.crash_on,
+        scratch=Path(),
+        code=snapshot.code if code == "snapshot" else (),
+        argument_files=snapshot.argument_files if code == "snapshot" else {},
+        timeout_s=settings.run.timeout_s,
+        keep_trials=True,
+    )
+    return Rerun(bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings))
+
+
+def _run(rerun: Rerun) -> ReplayReport:
     with tempfile.TemporaryDirectory(prefix="crashhunt-replay-") as folder:
         scratch = Path(folder)
-        worker = WorkerSettings(
-            scenario=scenario,
-            oracles=settings.oracles,
-            crash_on=settings.crash_on,
-            scratch=scratch,
-            code=str(snapshot.code.resolve()),
-            timeout_s=settings.run.timeout_s,
-            keep_trials=True,
-        )
-        executor = FreshProcessExecutor(worker)
+        executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
         try:
-            executor.submit(spec)
+            executor.submit(rerun.spec)
             result = next(result for _ in iter(int, 1) for result in executor.completed(1.0))
         finally:
             executor.close()
-        box = scratch_of(scratch, spec.number) / BLACK_BOX
+        message = result.failure.message if result.failure else "it left no recording"
+        if result.outcome is Outcome.INVALID:
+            raise _not_set_up(rerun, message)
         try:
-            replayed = Recording(read_black_box(box))
+            replayed = Recording(read_black_box(scratch_of(scratch, rerun.spec.number) / BLACK_BOX))
         except BundleError as error:
-            message = result.failure.message if result.failure else str(error)
-            raise CrashhuntError(
-                f"the replay did not get as far as the first step: {message}",
-                fix="see that what the agent needs is installed",
-                where=bundle.id,
-            ) from error
-        shutil.rmtree(scratch, ignore_errors=True)
-    if from_log:
-        recorded_part, replayed_part = _driven_part(recorded), _driven_part(replayed)
-    else:
-        recorded_part, replayed_part = recorded, replayed
-    divergence = first_divergence(recorded_part, replayed_part)
-    if divergence is None and not from_log:
-        divergence = _outcome_divergence(bundle.result, result)
-    return ReplayReport(
-        bundle,
-        "reproduced" if divergence is None else "diverged",
-        "log" if from_log else "snapshot",
-        recorded,
-        result,
-        replayed.steps,
-        divergence,
+            raise _not_set_up(rerun, message) from error
+    recorded = rerun.recorded
+    if rerun.code == "log":
+        recorded, replayed = _driven_part(recorded), _driven_part(replayed)
+    divergence = first_divergence(recorded, replayed)
+    if divergence is None and rerun.code != "log":
+        divergence = _outcome_divergence(rerun.bundle.result, result)
+    verdict, reason = _judge(rerun, replayed, result, divergence)
+    around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
+    return ReplayReport(rerun, verdict, result, replayed.steps, divergence, around, reason)
+
+
+def _judge(
+    rerun: Rerun, replayed: Recording, result: TrialResult, divergence: Divergence | None
+) -> tuple[Verdict, str]:
+    if divergence is None:
+        return "reproduced", ""
+    was, now = rerun.recorded.prologue, replayed.prologue
+    if was != now:
+        return "not_comparable", f"what is recorded is another: {_prologue_change(was, now)}"
+    changed = environment_changes(rerun.snapshot.environment())
+    for name in _SIMULATORS.get(rerun.worker.scenario.simulator, ()):
+        if name in changed:
+            return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
+    if rerun.code != "current" and not rerun.edits:
+        return "diverged", ""
+    return ("changed" if result.outcome in rerun.worker.crash_on else "fixed"), ""
+
+
+def _prologue_change(was: Any, now: Any) -> str:
+    if was.step_length_s != now.step_length_s:
+        return f"the step length was {was.step_length_s:g} s and is {now.step_length_s:g} s"
+    for left, right in zip(was.agents, now.agents, strict=False):
+        if left != right:
+            return f"{left.id}'s channel was {_channel(left)} and is {_channel(right)}"
+    return f"the agents were {', '.join(a.id for a in was.agents)} and are {', '.join(a.id for a in now.agents)}"
+
+
+def _channel(agent: Any) -> str:
+    return f"{agent.observation_shape} {agent.observation_dtype} → {agent.action_shape} {agent.action_dtype}"
+
+
+def _not_set_up(rerun: Rerun, message: str) -> CrashhuntError:
+    return CrashhuntError(
+        f"the replay did not get as far as the first step: {message}",
+        fix="see that what the agent needs is installed",
+        where=rerun.bundle.id,
     )
 
 

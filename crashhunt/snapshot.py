@@ -5,31 +5,48 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 import shutil
-import subprocess
-import sys
-import sysconfig
-from dataclasses import asdict, replace
-from importlib import metadata
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import BundleError, HuntDirectoryError
-from crashhunt.plugins import locate
+from crashhunt.environment import environment
+from crashhunt.errors import BundleError, SnapshotError
 from crashhunt.scenario import Scenario, load_scenario
+from crashhunt.settings import HuntSettings, read_settings, write_settings
+from crashhunt.sources import Sources, find_sources, git
+from crashhunt.space import Choice, Constant
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Sequence
 
-__all__ = ["Snapshot", "scenario_digest", "take_snapshot", "versions"]
+__all__ = ["Snapshot", "SnapshotOptions", "scenario_digest", "take_snapshot"]
 
-_SKIPPED = {"__pycache__", ".git", ".venv", ".mypy_cache", ".ruff_cache", ".pytest_cache"}
-_VERSIONED = ("crashhunt", "libsumo", "gymnasium", "numpy", "highway-env")
+SCHEMA = 1
+_MEGABYTE = 10**6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotOptions:
+    """What a snapshot takes in.
+
+    Args:
+        code: whether it has code at all; without, a replay runs what is current.
+        roots: files and folders besides what is found.
+        limit_mb: how large it may be, in MB.
+    """
+
+    code: bool = True
+    roots: tuple[Path, ...] = ()
+    limit_mb: float = 500.0
 
 
 class Snapshot:
-    """A snapshot on disk: ``code/``, ``scenario/``, ``manifest.json``, ``environment.json``, ``git.diff``.
+    """A snapshot on disk.
+
+    ``code/`` and ``scenario/``, ``files/`` that arguments name, the ``manifest.json`` with the size and hash of each,
+    the resolved ``hunt.toml``, ``environment.json`` and ``git.diff``.
 
     Args:
         path: of the folder, whose name is its digest.
@@ -39,82 +56,152 @@ class Snapshot:
         self.path = path
         self.digest = path.name
 
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """Return the manifest.
+
+        Raises:
+            BundleError: it is missing, damaged or of another version.
+        """
+        file = self.path / "manifest.json"
+        try:
+            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            if found["schema"] != SCHEMA:
+                raise BundleError(
+                    f"schema {found['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(file)
+                )
+            if not all(isinstance(found[key], kind) for key, kind in (("files", dict), ("paths", list))):
+                raise ValueError("it is incomplete")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BundleError(f"the snapshot has no manifest: {error}", fix=_UNDAMAGED, where=str(self.path)) from None
+        return found
+
     @property
-    def code(self) -> Path:
-        """The folder whose modules win over installed ones."""
-        return self.path / "code"
+    def has_code(self) -> bool:
+        """Whether it holds the code."""
+        return bool(self.manifest["paths"])
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The folders whose modules win over installed ones, the first one first."""
+        return tuple(str((self.path / place).resolve()) for place in self.manifest["paths"])
+
+    @property
+    def argument_files(self) -> dict[str, str]:
+        """The files that arguments name: the value of the argument to the file in the snapshot."""
+        found = self.manifest.get("argument_files", {})
+        return {value: str((self.path / place).resolve()) for value, place in found.items()}
 
     def scenario(self) -> Scenario:
         """Return the scenario as it was."""
         return load_scenario(self.path / "scenario" / "scenario.toml")
 
+    def settings(self) -> HuntSettings:
+        """Return the settings of the hunt as they were."""
+        return read_settings(self.path / "hunt.toml")
+
     def environment(self) -> dict[str, Any]:
-        """Return what was installed."""
+        """Return what was installed.
+
+        Raises:
+            BundleError: the file is missing or damaged.
+        """
+        file = self.path / "environment.json"
         try:
-            found: dict[str, Any] = json.loads((self.path / "environment.json").read_text(encoding="utf-8"))
+            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise BundleError(f"cannot be read: {error}", where=str(self.path / "environment.json")) from None
+            raise BundleError(f"cannot be read: {error}", fix=_UNDAMAGED, where=str(file)) from None
+        return found
+
+    def faults(self) -> list[str]:
+        """Return what is not as it was: files that are missing or changed, and code that was not there."""
+        found = []
+        for name, entry in self.manifest["files"].items():
+            path = self.path / name
+            if not path.is_file() or path.is_symlink():
+                found.append(f"{name} is missing")
+            elif path.stat().st_size != entry["size"] or _hash(path) != entry["blake2b"]:
+                found.append(f"{name} has changed")
+        for path in sorted((self.path / "code").rglob("*")):
+            name = path.relative_to(self.path).as_posix()
+            # Data that the agent wrote beside its code does no harm; a module that was not there might.
+            if path.suffix in (".py", ".so", ".pth") and name not in self.manifest["files"]:
+                found.append(f"{name} was not there")
         return found
 
     def verify(self) -> None:
-        """Check that every file is as it was.
+        """Check that everything is as it was.
 
         Raises:
-            BundleError: with the first file that is missing, changed or new.
+            BundleError: with what is not.
         """
-        fix = "get an undamaged copy of the hunt's directory"
-        try:
-            manifest = json.loads((self.path / "manifest.json").read_text(encoding="utf-8"))["files"]
-        except (OSError, ValueError, KeyError) as error:
-            raise BundleError(f"the snapshot has no manifest: {error}", fix=fix, where=str(self.path)) from None
-        present = {path.relative_to(self.path).as_posix(): path for path in _files(self.path, ("code", "scenario"))}
-        for name, entry in manifest.items():
-            if name not in present:
-                raise BundleError("missing from the snapshot", fix=fix, where=str(self.path / name))
-            if _hash(present[name]) != entry["blake2b"]:
-                raise BundleError("changed since the snapshot was taken", fix=fix, where=str(self.path / name))
-        for name in present.keys() - manifest.keys():
-            raise BundleError("not part of the snapshot", fix="remove it", where=str(self.path / name))
+        faults = self.faults()
+        if faults:
+            more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+            raise BundleError(
+                f"the snapshot is damaged: {faults[0]}{more}",
+                fix="get an undamaged copy of the hunt's directory, or give --force",
+                where=str(self.path),
+            )
 
 
-def take_snapshot(snapshots: Path, scenario: Scenario) -> Snapshot:
-    """Store the scenario, the agents' own code and crashhunt itself, unless the very same is there already.
+_UNDAMAGED = "get an undamaged copy of the hunt's directory"
 
-    The agents' own code is the top-level package or module of each, and whatever else they imported from the folder
-    in which that lies.
+
+def take_snapshot(
+    snapshots: Path, scenario: Scenario, settings: HuntSettings, options: SnapshotOptions | None = None
+) -> Snapshot:
+    """Store the scenario, the agents' own projects, what their arguments name, and crashhunt itself.
+
+    The very same content is stored once.
 
     Args:
-        snapshots: the folder of all snapshots.
+        snapshots: the folder of all snapshots of a hunt.
         scenario: with its agents.
+        settings: of the hunt.
+        options: what to take in.
 
     Raises:
-        HuntDirectoryError: the folder cannot be written.
+        SnapshotError: it is too large, or cannot be read or written.
     """
+    options = options or SnapshotOptions()
     building = snapshots / f".building-{os.getpid()}"
+    found = Sources(paths=[])
+    if options.code:
+        locators = [setup.agent for setup in scenario.agents.values()]
+        found = find_sources(locators, roots=options.roots, without=snapshots.parent)
+    argument_files = _argument_files(settings) if options.code else {}
+    files = found.files | {argument_files[value]: Path(value) for value in argument_files}
+    _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
         shutil.rmtree(building, ignore_errors=True)
-        roots = _copy_code((setup.agent for setup in scenario.agents.values()), building / "code")
-        _copy_scenario(scenario, building / "scenario")
-        files = {
-            path.relative_to(building).as_posix(): {"size": path.stat().st_size, "blake2b": _hash(path)}
-            for path in _files(building, ("code", "scenario"))
+        building.mkdir()
+        entries = {name: _store(path, building / name) for name, path in files.items()}
+        entries |= _store_scenario(scenario, building)
+        stored = {name: entry for name, entry in entries.items() if entry is not None}
+        manifest = {
+            "schema": SCHEMA,
+            "paths": found.paths,
+            "argument_files": argument_files,
+            "left_out": found.left_out,
+            "files": stored,
         }
-        digest = _digest(files)
-        (building / "manifest.json").write_text(json.dumps({"schema": 1, "files": files}, indent=1), encoding="utf-8")
-        revision = {str(root): _git(root, building / "git.diff") for root in roots}
-        environment = {**_environment(), "git": {root: found for root, found in revision.items() if found}}
-        (building / "environment.json").write_text(json.dumps(environment, indent=1), encoding="utf-8")
+        digest = _digest(stored, says=[found.paths, argument_files])
         final = snapshots / digest
         if final.exists():
             shutil.rmtree(building)
-        else:
-            building.rename(final)
+            return Snapshot(final)
+        (building / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        write_settings(building / "hunt.toml", settings, ["crashhunt", "run", "as resolved"])
+        facts = {**environment(), "git": _describe_trees(found.trees, building / "git.diff")}
+        (building / "environment.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        building.rename(final)
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
-        raise HuntDirectoryError(
-            f"the snapshot cannot be written: {error.strerror or error}",
-            fix="free some space or choose another directory",
+        raise SnapshotError(
+            f"the snapshot cannot be made: {error.strerror or error}",
+            fix="free some space, make the file readable, or give --no-snapshot",
             where=str(error.filename or snapshots),
         ) from error
     return Snapshot(final)
@@ -128,8 +215,9 @@ def scenario_digest(scenario: Scenario) -> str:
     return _digest({**files, "": {"blake2b": json.dumps(says, sort_keys=True)}})
 
 
-def _digest(files: dict[str, Any]) -> str:
-    text = json.dumps({name: entry["blake2b"] for name, entry in files.items()}, sort_keys=True)
+def _digest(files: dict[str, Any], *, says: object = None) -> str:
+    content: Any = {name: entry["blake2b"] for name, entry in files.items()}
+    text = json.dumps(content if says is None else [content, says], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
@@ -138,23 +226,64 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
-def _files(folder: Path, parts: Iterable[str]) -> Iterator[Path]:
-    for part in parts:
-        for path in sorted((folder / part).rglob("*")):
-            if path.is_file() and not _SKIPPED.intersection(path.relative_to(folder).parts):
-                yield path
+def _argument_files(settings: HuntSettings) -> dict[str, str]:
+    """The files that arguments of agents name, such as the weights of a policy, and their place in the snapshot."""
+    found: dict[str, str] = {}
+    for agent in settings.agents.values():
+        for spec in agent.arguments.values():
+            distribution = spec.distribution
+            values: Sequence[object] = ()
+            if isinstance(distribution, Constant):
+                values = (distribution.value,)
+            elif isinstance(distribution, Choice):
+                values = distribution.options
+            for value in values:
+                if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
+                    found[value] = f"files/{len(found)}-{Path(value).name}"
+    return found
 
 
-def _copy_scenario(scenario: Scenario, target: Path) -> None:
+def _check_size(files: dict[str, Path], limit_mb: float) -> None:
+    sizes = {path: _size(path) for path in files.values()}
+    total = sum(sizes.values())
+    if total > limit_mb * _MEGABYTE:
+        largest = sorted(sizes, key=lambda path: -sizes[path])[:3]
+        names = ", ".join(f"{path} ({sizes[path] / _MEGABYTE:.3g} MB)" for path in largest)
+        raise SnapshotError(
+            f"the snapshot would have {total / _MEGABYTE:.3g} MB, above the limit of {limit_mb:g} MB; largest: {names}",
+            fix="have git ignore what the agent does not need, raise --snapshot-limit, or give --no-snapshot",
+        )
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _store(path: Path, copy: Path) -> dict[str, Any] | None:
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        shutil.copy(path, copy)
+    except FileNotFoundError:
+        return None  # deleted since it was listed
+    return {"size": copy.stat().st_size, "blake2b": _hash(copy)}
+
+
+def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
     import tomli_w
 
+    entries: dict[str, Any] = {}
     for name in scenario.files():
-        copy = target / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(scenario.folder / name, copy)
-    target.mkdir(parents=True, exist_ok=True)
+        place = f"scenario/{name}"
+        entries[place] = _store(scenario.folder / name, building / place)
+    (building / "scenario").mkdir(exist_ok=True)
+    resolved = building / "scenario" / "scenario.toml"
     text = "# The scenario as it was resolved for this hunt.\n" + tomli_w.dumps(_as_dict(scenario))
-    (target / "scenario.toml").write_text(text, encoding="utf-8")
+    resolved.write_text(text, encoding="utf-8")
+    entries["scenario/scenario.toml"] = {"size": resolved.stat().st_size, "blake2b": _hash(resolved)}
+    return entries
 
 
 def _as_dict(scenario: Scenario) -> dict[str, Any]:
@@ -167,90 +296,13 @@ def _as_dict(scenario: Scenario) -> dict[str, Any]:
     return {key: value for key, value in data.items() if key not in ("folder", "notes")}
 
 
-def _copy_code(locators: Iterable[str], target: Path) -> list[Path]:
-    """Copy the code; return the folders that it came from."""
-    target.mkdir(parents=True)
-    roots: list[Path] = []
-    names = {"crashhunt"}
-    for locator in locators:
-        names.add(locate("agents", locator).__module__.partition(".")[0])
-    installed = {Path(path).resolve() for path in sysconfig.get_paths().values()}
-    for name in sorted(names):
-        root = _place_of(name)
-        if root is None:
-            continue
-        if root not in roots:
-            roots.append(root)
-        if root not in installed and name != "crashhunt":
-            # What the agent imported from beside itself; site-packages is everybody's, and recorded by version.
-            names = names | {other for other in _top_level_modules() if _place_of(other) == root}
-    for name in sorted(names):
-        _copy_module(name, target)
-    return roots
-
-
-def _top_level_modules() -> set[str]:
-    return {name.partition(".")[0] for name in list(sys.modules)}
-
-
-def _place_of(name: str) -> Path | None:
-    """The folder in which a top-level module or package lies."""
-    module = sys.modules.get(name)
-    file = getattr(module, "__file__", None)
-    if name == "__main__" or file is None:
-        paths = list(getattr(module, "__path__", ()))  # a package without __init__.py
-        return Path(paths[0]).resolve().parent if len(paths) == 1 else None
-    path = Path(file).resolve()
-    return path.parent.parent if path.stem == "__init__" else path.parent
-
-
-def _copy_module(name: str, target: Path) -> None:
-    module = sys.modules.get(name)
-    file = getattr(module, "__file__", None)
-    paths = list(getattr(module, "__path__", ()))
-    if paths:
-        shutil.copytree(paths[0], target / name, ignore=shutil.ignore_patterns(*_SKIPPED, "*.pyc"), dirs_exist_ok=True)
-    elif file is not None:
-        shutil.copyfile(file, target / Path(file).name)
-
-
-def _environment() -> dict[str, Any]:
-    distributions = {dist.metadata["Name"]: dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
-    relevant = ("PYTHONHASHSEED", "PYTHONPATH", "SUMO_HOME", "OMP_NUM_THREADS", "VIRTUAL_ENV")
-    return {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "versions": versions(),
-        "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
-        "variables": {name: os.environ[name] for name in relevant if name in os.environ},
-    }
-
-
-def versions() -> dict[str, str]:
-    """Return the versions on which a result depends."""
-    found = {"python": platform.python_version()}
-    for name in _VERSIONED:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def _git(root: Path, diff: Path) -> str:
-    """Append the work tree's changes to ``diff`` and return its revision; nothing where it is not one."""
-
-    def git(*arguments: str) -> bytes:
-        command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
-        done = subprocess.run(command, capture_output=True, check=False, timeout=30)
-        return done.stdout if done.returncode == 0 else b""
-
-    try:
-        revision = git("rev-parse", "HEAD").decode().strip()
-        if revision:
+def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:
+    """Write the uncommitted changes of work trees down; return their revisions."""
+    revisions = {}
+    for tree in trees:
+        revision = git(tree, "rev-parse", "HEAD")
+        if revision is not None:
+            revisions[str(tree)] = revision.decode().strip()
             with diff.open("ab") as file:
-                file.write(git("diff", "HEAD", "--no-ext-diff", "--binary", "--", "."))
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return revision
+                file.write(git(tree, "diff", "HEAD", "--no-ext-diff", "--no-textconv", "--binary") or b"")
+    return revisions

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from crashhunt.errors import CrashhuntError
 from crashhunt.executors._protocol import WorkerSettings
 from crashhunt.executors._remains import died, hung, where_it_is
-from crashhunt.executors._worker import Worker, worker_environment
+from crashhunt.executors._worker import Worker, require_origin, worker_environment
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -90,10 +90,10 @@ class FreshProcessExecutor:
             if self._settings.code:
                 # Before anything is imported, so that crashhunt itself comes from there too, where it is there.
                 before = environment.get("PYTHONPATH")
-                environment["PYTHONPATH"] = os.pathsep.join(filter(None, (self._settings.code, before)))
+                environment["PYTHONPATH"] = os.pathsep.join(filter(None, (*self._settings.code, before)))
             with (self._settings.scratch / f"start-{spec.number:06d}.log").open("wb") as log:
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "crashhunt.executors._fresh"],
+                    [sys.executable, "-P", "-m", "crashhunt.executors._fresh"],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -151,6 +151,7 @@ def main() -> None:
     job = json.load(sys.stdin)
     settings = WorkerSettings.from_json(job["settings"])
     try:
+        require_origin("crashhunt", settings.code)
         answer = {"result": Worker(settings).run(TrialSpec.from_json(job["spec"])).to_json()}
     except CrashhuntError as error:
         answer = error.to_json()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,7 +26,8 @@ class WorkerSettings:
         oracles: names of registered oracles, or ``module:attribute``.
         crash_on: the outcomes that end a trial as a crash.
         scratch: the folder in which workers keep black boxes and output while trials run.
-        code: a folder whose modules win over installed ones: the snapshot. Empty for none.
+        code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
+        argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
     """
@@ -35,7 +36,8 @@ class WorkerSettings:
     oracles: tuple[str, ...]
     crash_on: tuple[Outcome, ...]
     scratch: Path
-    code: str = ""
+    code: tuple[str, ...] = ()
+    argument_files: dict[str, str] = field(default_factory=dict)
     timeout_s: float = 60.0
     keep_trials: bool = False
 
@@ -58,7 +60,8 @@ class WorkerSettings:
             oracles=tuple(data["oracles"]),
             crash_on=tuple(Outcome(name) for name in data["crash_on"]),
             scratch=Path(data["scratch"]),
-            code=data["code"],
+            code=tuple(data["code"]),
+            argument_files=data["argument_files"],
             timeout_s=data["timeout_s"],
             keep_trials=data["keep_trials"],
         )

@@ -9,13 +9,16 @@ import io
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.episode import run_episode
+from crashhunt.errors import CrashhuntError
 from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.plugins import locate, signature_of
 from crashhunt.recording import BlackBox
@@ -24,14 +27,23 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from crashhunt.agents import Agent
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["BLACK_BOX", "MAP", "OUTPUT", "STACK", "Worker", "read_map", "read_tail", "worker_environment"]
+__all__ = [
+    "BLACK_BOX",
+    "MAP",
+    "OUTPUT",
+    "STACK",
+    "Worker",
+    "read_map",
+    "read_tail",
+    "require_origin",
+    "worker_environment",
+]
 
 BLACK_BOX, OUTPUT, STACK, MAP = "blackbox.bin", "run.log", "stack.txt", "map.json"
 _PR_SET_PDEATHSIG = 1
@@ -74,7 +86,8 @@ class Worker:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         if settings.code:
-            sys.path.insert(0, settings.code)
+            # What the snapshot does not have may come from where the hunt was started, as it did then.
+            sys.path[:0] = [*settings.code, str(Path.cwd())]
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -92,10 +105,7 @@ class Worker:
         began = time.monotonic()
         simulator = self._simulator
         if simulator is None:
-            stage = self._settings.scratch / f"stage-{os.getpid()}"
-            stage.mkdir(exist_ok=True)
-            factory = locate("simulators", self._settings.scenario.simulator)
-            simulator = self._simulator = factory(self._settings.scenario, stage)
+            simulator = self._simulator = self._make_simulator()
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
         faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         result = run_episode(
@@ -124,7 +134,6 @@ class Worker:
         stage.mkdir(exist_ok=True)
         factory = locate("simulators", self._settings.scenario.simulator)
         made: Simulator = factory(self._settings.scenario, stage)
-        self._simulator = made
         return made
 
     def _draw_map(self, simulator: Simulator) -> None:
@@ -141,7 +150,7 @@ class Worker:
         """Give the trial its scratch folder: that of the last one, whose pages are warm, or a new one."""
         folder = scratch_of(self._settings.scratch, spec.number)
         if folder.exists():
-            _clear(folder)  # of an earlier attempt at the same trial
+            shutil.rmtree(folder)  # of an earlier attempt at the same trial
         if self._folder is None:
             self._fresh += 1
             made = self._settings.scratch / f"new-{os.getpid()}-{self._fresh}"
@@ -168,7 +177,10 @@ class Worker:
     def _make_agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
         found = self._factories.get(agent)
         if found is None:
-            factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            locator = self._settings.scenario.agents[agent].agent
+            factory = locate("agents", locator)
+            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
+                require_origin(factory.__module__, self._settings.code)
             found = self._factories[agent] = factory, signature_of(factory).spaces
         factory, wanted = found
         spaces: dict[str, Any] = {}
@@ -176,7 +188,11 @@ class Worker:
             spaces["observation_space"] = simulator.observation_spaces[agent]
         if "action_space" in wanted:
             spaces["action_space"] = simulator.actions[agent].space
-        made: Agent = factory(**arguments, **spaces)
+        files = self._settings.argument_files
+        values = {
+            name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
+        }
+        made: Agent = factory(**values, **spaces)
         return made
 
 
@@ -200,16 +216,25 @@ def read_tail(path: Path) -> str:
         return ""
 
 
+def require_origin(module: str, code: tuple[str, ...]) -> None:
+    """See that a module comes from the snapshot, if it is there at all, and not from where it is developed."""
+    top = module.partition(".")[0]
+    file = getattr(sys.modules[module], "__file__", None)
+    for folder in code:
+        if (Path(folder) / top).is_dir() or (Path(folder) / f"{top}.py").is_file():
+            if file is not None and not Path(file).resolve().is_relative_to(folder):
+                raise CrashhuntError(
+                    f"the module {module!r} was imported from {file}, not from the snapshot",
+                    fix="remove it from PYTHONPATH and from start-up files such as sitecustomize",
+                    where=folder,
+                )
+            return
+
+
 def _die_with_parent() -> None:
     """Have the kernel end this process when its parent is gone, whatever it is doing; where that can be had."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def _clear(folder: Path) -> None:
-    import shutil
-
-    shutil.rmtree(folder)
 
 
 # A pool's task is a function, and what the process keeps warm has to live somewhere between two of them.

@@ -6,7 +6,7 @@ Writing and reading logs needs MCAP and protobuf, which a worker never does: the
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.recording._blackbox import BlackBox, BlackBoxHeader, Phase, Record, Tag, read_black_box, read_header
-from crashhunt.recording._compare import Divergence, first_divergence
+from crashhunt.recording._compare import Divergence, first_divergence, values_around
 from crashhunt.recording._recording import (
     AgentChannel,
     Prologue,
@@ -40,6 +40,7 @@ __all__ = [
     "read_black_box",
     "read_header",
     "read_log",
+    "values_around",
     "write_log",
 ]
 

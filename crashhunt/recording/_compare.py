@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from crashhunt.recording._recording import AgentChannel, Recording, StepRecord
     from crashhunt.scene import Scene
 
-__all__ = ["Divergence", "first_divergence"]
+__all__ = ["Divergence", "first_divergence", "values_around"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,7 @@ class Divergence:
         field: such as ``observation[1, x]``, ``action[target_speed]``, ``scene.x`` or ``length``.
         recorded: the value in the recording; None where there is none.
         replayed: likewise in the replay.
+        place: of the value within the step: ``observation``, ``action`` or a column of the scene, and the index.
     """
 
     step: int
@@ -34,10 +35,13 @@ class Divergence:
     field: str
     recorded: Any
     replayed: Any
+    place: tuple[str, tuple[int, ...]] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``replay --json`` prints."""
-        data: dict[str, Any] = json.loads(json.dumps(asdict(self), default=float))
+        facts = asdict(self)
+        del facts["place"]
+        data: dict[str, Any] = json.loads(json.dumps(facts, default=float))
         return data
 
     def __str__(self) -> str:
@@ -65,6 +69,35 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
     return None
 
 
+def values_around(
+    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int = 2
+) -> list[tuple[int, Any, Any]]:
+    """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
+
+    Nothing where the divergence is not about one value; None where a recording does not have the step.
+    """
+    if divergence.place is None:
+        return []
+    first = max(0, divergence.step - reach)
+    return [
+        (step, _value(recorded, step, divergence), _value(replayed, step, divergence))
+        for step in range(first, divergence.step + reach + 1)
+    ]
+
+
+def _value(recording: Recording, number: int, divergence: Divergence) -> Any:
+    if divergence.place is None or number >= len(recording.all_steps):
+        return None
+    step = recording.all_steps[number]
+    kind, index = divergence.place
+    if kind == "scene":
+        if step.scene is None or divergence.agent not in step.scene.roster.index:
+            return None
+        return float(step.scene.data[step.scene.roster.index[divergence.agent], index[0]])
+    array = (step.observations if kind == "observation" else step.actions).get(divergence.agent)
+    return None if array is None else array[index].item()
+
+
 def _in_step(left: StepRecord, right: StepRecord, agents: tuple[AgentChannel, ...]) -> Divergence | None:
     step = left.step
     for agent in agents:
@@ -78,7 +111,8 @@ def _in_step(left: StepRecord, right: StepRecord, agents: tuple[AgentChannel, ..
             if was.tobytes() != now.tobytes():
                 where = _first_difference(was, now)
                 name = ", ".join((*map(str, where[:-1]), rows[where[-1]] if rows else str(where[-1]))) if where else ""
-                return Divergence(step, agent.id, f"{kind}[{name}]" if name else kind, was[where], now[where])
+                field = f"{kind}[{name}]" if name else kind
+                return Divergence(step, agent.id, field, was[where].item(), now[where].item(), (kind, where))
     if left.scene is None or right.scene is None:
         if left.scene is right.scene:
             return None
@@ -110,7 +144,8 @@ def _in_scene(step: int, left: Scene, right: Scene) -> Divergence | None:
         row, column = _first_difference(was_data, now_data)
         name = ("x", "y", "heading", "speed")[column]
         was_value, now_value = float(was_data[row, column]), float(now_data[row, column])
-        return Divergence(step, left.roster.actors[row].id, f"scene.{name}", was_value, now_value)
+        who = left.roster.actors[row].id
+        return Divergence(step, who, f"scene.{name}", was_value, now_value, ("scene", (column,)))
     for field in ("contacts", "off_road", "lanes"):
         was_events, now_events = getattr(left, field), getattr(right, field)
         if was_events != now_events:

@@ -50,23 +50,63 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
 
 def describe_replay(report: ReplayReport) -> str:
     """Return what came of a replay."""
-    bundle = report.bundle
-    driver = (
-        "the recorded actions" if report.code == "log" else f"the code in {bundle.hunt / 'snapshots' / bundle.snapshot}"
-    )
+    bundle, rerun = report.bundle, report.rerun
+    drivers = {
+        "log": "the recorded actions",
+        "current": "today's code",
+        "snapshot": f"the code in {rerun.snapshot.path}",
+    }
+    was = bundle.result
     lines = [
-        f"{bundle.id}: {bundle.result.summary}",
-        f"  seed {bundle.result.spec.seed}, {format_arguments(bundle.result)}",
-        f"  driven by {driver}",
-        f"{report.verdict}: {report.steps_replayed} of {report.recorded.steps} steps, digest {report.replayed.digest}",
+        f"{bundle.id}: {was.summary}",
+        f"  seed {was.spec.seed}, {format_arguments(was)}",
+        f"  driven by {drivers[rerun.code]}",
     ]
-    if report.divergence is not None:
+    lines += [f"  warning: {warning}" for warning in rerun.warnings]
+    lines += [f"  no longer the recorded trial: {edit}" for edit in rerun.edits]
+    lines += _verdict(report)
+    if report.divergence is not None and report.verdict != "not_comparable":
         lines.append(f"  first difference at {report.divergence}")
-    elif report.code == "log":
-        lines.append("  every observation and scene that the recorded actions lead to is the same to the bit")
-    else:
-        lines.append("  every observation, action and scene is the same to the bit")
+        lines += [f"    {line}" for line in _table_around(report)]
+    times = sum(report.verdicts.values())
+    if times > 1:
+        counts = ", ".join(f"{count} {verdict.replace('_', ' ')}" for verdict, count in report.verdicts.items())
+        lines.append(f"of {times} runs: {counts}")
     return "\n".join(lines)
+
+
+def _verdict(report: ReplayReport) -> list[str]:
+    was, now, steps = report.bundle.result, report.replayed, report.rerun.recorded.steps
+    count = f"{report.steps_replayed} of {steps} steps, digest {now.digest}"
+    if report.verdict == "reproduced":
+        what = "every observation, action and scene is the same to the bit"
+        if report.rerun.code == "log":
+            what = "every observation and scene that the recorded actions lead to is the same to the bit"
+        return [f"reproduced: {count}", f"  {what}"]
+    if report.verdict == "fixed":
+        return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
+    if report.verdict == "changed":
+        return ["changed: another crash", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
+    if report.verdict == "not_comparable":
+        return [f"not comparable: {report.reason}"]
+    lines = [f"diverged: {count}"]
+    if was.outcome is not now.outcome or was.steps != now.steps:
+        lines.append(f"  now: {now.summary}")
+    return lines
+
+
+def _table_around(report: ReplayReport) -> list[str]:
+    if not report.around or report.divergence is None:
+        return []
+    cells = [("step", "recorded", "replayed", "")]
+    for step, was, now in report.around:
+        mark = "<- first difference" if step == report.divergence.step else ""
+        cells.append((str(step), "-" if was is None else f"{was!r}", "-" if now is None else f"{now!r}", mark))
+    widths = [max(len(row[column]) for row in cells) for column in range(3)]
+    return [
+        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[3]]).rstrip()
+        for row in cells
+    ]
 
 
 def _describe_crash(bundle: Bundle) -> list[str]:

@@ -69,44 +69,44 @@ def test_the_actions_of_the_log_lead_to_the_same_scenes(crash):
     assert (verdict["verdict"], verdict["code"], verdict["divergence"]) == ("reproduced", "log", None)
 
 
-def test_a_change_is_found_where_it_happens(crash):
-    """Change the code in the snapshot as if it had always been so, and see what the replay says."""
+def change_snapshot(crash, before: str, after: str) -> None:
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     agents = snapshot / "code" / "my_pkg" / "agents.py"
-    agents.write_text(
-        AGENT.replace("return self.speed + self.step", "return self.speed + (self.step > 17) + self.step")
-    )
-    refused = crash.crashhunt("replay", "h", expect=2)
-    assert "agents.py" in refused.err
-    assert "changed since" in refused.err
-    manifest = snapshot / "manifest.json"
-    data = json.loads(manifest.read_text())
-    from crashhunt.snapshot import _hash
+    assert before in agents.read_text()
+    agents.write_text(agents.read_text().replace(before, after))
 
-    data["files"]["code/my_pkg/agents.py"]["blake2b"] = _hash(agents)
-    manifest.write_text(json.dumps(data))
-    done = crash.crashhunt("replay", "h", "--json", expect=1)
+
+def test_a_change_is_found_where_it_happens(crash):
+    change_snapshot(crash, "return self.speed + self.step", "return self.speed + (self.step > 17) + self.step")
+    refused = crash.crashhunt("replay", "h", expect=2)
+    assert "code/my_pkg/agents.py has changed" in refused.err
+    assert "--force" in refused.err
+    done = crash.crashhunt("replay", "h", "--force", "--json", expect=1)
     assert done.json["verdict"] == "diverged"
+    assert any("agents.py has changed" in warning for warning in done.json["warnings"])
     assert done.json["divergence"]["step"] == 18
     assert done.json["divergence"]["agent"] == "ego"
     assert done.json["divergence"]["field"] == "action[target_speed]"
     assert done.json["divergence"]["replayed"] == pytest.approx(done.json["divergence"]["recorded"] + 1)
+    # For people, with the steps around it.
+    shown = done.err.splitlines()
+    (marked,) = (line for line in shown if "<- first difference" in line)
+    assert marked.split()[:3] == [
+        "18",
+        str(done.json["divergence"]["recorded"]),
+        str(done.json["divergence"]["replayed"]),
+    ]
+    assert [line.split()[0] for line in shown[shown.index(marked) - 2 : shown.index(marked) + 3]] == [
+        "16", "17", "18", "19", "20",
+    ]  # fmt: skip
     # The recorded actions do not need the code, changed or not.
-    assert crash.crashhunt("replay", "h", "--from-log", "--json").json["verdict"] == "reproduced"
+    assert crash.crashhunt("replay", "h", "--from-log", "--force", "--json").json["verdict"] == "reproduced"
 
 
 @pytest.mark.parametrize(("step", "field"), [(25, "length"), (35, "action")])
 def test_a_run_that_is_shorter_or_longer_diverges(crash, step, field):
-    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
-    agents = snapshot / "code" / "my_pkg" / "agents.py"
-    agents.write_text(AGENT.replace("== 30", f"== {step}"))
-    manifest = snapshot / "manifest.json"
-    data = json.loads(manifest.read_text())
-    from crashhunt.snapshot import _hash
-
-    data["files"]["code/my_pkg/agents.py"]["blake2b"] = _hash(agents)
-    manifest.write_text(json.dumps(data))
-    divergence = crash.crashhunt("replay", "h", "--json", expect=1).json["divergence"]
+    change_snapshot(crash, "== 30", f"== {step}")
+    divergence = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json["divergence"]
     assert divergence["step"] == min(step, 30)
     assert divergence["field"] in (field, "action")
 
@@ -138,3 +138,125 @@ def test_replay_takes_the_crash_with_the_fewest_steps(shell):
     assert shell.crashhunt("replay", "h", "--json").json["crash"] == report["crashes"][0]["id"]
     done = shell.crashhunt("replay", "h", "--crash", "77", expect=2)
     assert report["crashes"][0]["id"] in done.err
+
+
+def edit(path: Path, before: str, after: str) -> None:
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+
+
+def test_todays_code_is_judged_against_the_recorded_crash(crash):
+    agents = crash.folder / "my_pkg" / "agents.py"
+    same = crash.crashhunt("replay", "h", "--code", "current", "--json").json
+    assert (same["verdict"], same["code"]) == ("reproduced", "current")
+
+    edit(agents, "if self.step == 30:", "if self.step == 40:")
+    other = crash.crashhunt("replay", "h", "--code", "current", "--json", expect=1)
+    assert other.json["verdict"] == "changed"
+    assert (other.json["steps_recorded"], other.json["steps_replayed"]) == (29, 39)
+    assert "it was: ego: ValueError: out of ideas" in other.err
+
+    edit(agents, "if self.step == 40:", "if self.step == 4000:")
+    assert crash.crashhunt("replay", "h", "--code", "current", expect=1).out.count("fixed: no crash") == 1
+    fixed = crash.crashhunt("replay", "h", "--code", "current", "--expect", "fixed", "--json").json
+    assert (fixed["verdict"], fixed["outcome_replayed"], fixed["steps_replayed"]) == ("fixed", "survived", 100)
+    crash.crashhunt("replay", "h", "--expect", "fixed", expect=1)  # the snapshot still crashes
+
+    edit(agents, "import helper", "import helper_that_is_gone")
+    broken = crash.crashhunt("replay", "h", "--code", "current", expect=2)
+    assert "helper_that_is_gone" in broken.err
+
+
+def test_another_value_is_no_longer_the_recorded_trial(crash):
+    done = crash.crashhunt("replay", "h", "--set", "speed=9", "--json", expect=1)
+    assert done.json["verdict"] == "changed"  # it raises all the same
+    assert done.json["edits"] == ["ego.speed was 8.0 and is 9.0"]
+    assert "no longer the recorded trial" in done.err
+    assert (
+        crash.crashhunt("replay", "h", "--set", "ego.speed=9", "--json", expect=1).json["edits"] == done.json["edits"]
+    )
+    for words, says in (
+        (("--set", "sped=9"), "did you mean 'ego.speed'"),
+        (("--set", "speed=9:10"), "not one value"),
+        (("--set", "speed=fast"), "fast"),
+        (("--set", "speed=9", "--from-log"), "--code snapshot"),
+        (("--times", "0"), "--times"),
+    ):
+        refused = crash.crashhunt("replay", "h", *words, expect=2)
+        assert says in refused.err
+        assert len(refused.err.strip().splitlines()) == 1
+
+
+def test_hunt_toml_is_what_a_replay_uses(crash):
+    settings = crash.folder / "h" / "hunt.toml"
+    edit(settings, "max_steps = 100", "max_steps = 12")
+    done = crash.crashhunt("replay", "h", "--json", expect=1).json
+    assert (done["verdict"], done["steps_replayed"], done["edits"]) == ("fixed", 12, ["max_steps was 100 and is 12"])
+    edit(settings, "max_steps = 12", "max_steps = 100")
+    edit(settings, 'spec = "8.0"', 'spec = "5.5"')
+    assert crash.crashhunt("replay", "h", "--json", expect=1).json["edits"] == ["ego.speed was 8.0 and is 5.5"]
+
+
+def test_an_agent_that_is_not_deterministic_is_found_out(shell):
+    (shell.folder / "coin.py").write_text(
+        "import os\n\nclass Agent:\n    def reset(self, seed): self.step = 0\n\n"
+        "    def act(self, observation):\n        self.step += 1\n        assert self.step < 20\n"
+        "        return 5 + os.urandom(1)[0] / 1000 * (self.step > 9), 0\n"
+    )
+    shell.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--set", "vehicles=10", "--json")
+    done = shell.crashhunt("replay", "h", "--times", "3", "--json", expect=1).json
+    assert (done["verdict"], done["times"]) == ("diverged", 3)
+    assert done["divergence"]["step"] == 10
+    assert done["divergence"]["field"] == "action[target_speed]"
+    assert done["agreed"] < 3
+
+
+def test_what_cannot_be_compared_says_which(crash):
+    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
+    scenario = snapshot / "scenario" / "scenario.toml"
+    edit(scenario, "vehicles = 8", "vehicles = 4")
+    done = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json
+    assert done["verdict"] == "not_comparable"
+    assert "(8, 7)" in done["reason"]
+    assert "(4, 7)" in done["reason"]
+    # Another version of the simulator: a warning as long as it makes no difference.
+    edit(scenario, "vehicles = 4", "vehicles = 8")
+    facts = snapshot / "environment.json"
+    data = json.loads(facts.read_text())
+    now = data["distributions"]["libsumo"]
+    data["distributions"]["libsumo"] = "1.2.3"
+    facts.write_text(json.dumps(data))
+    same = crash.crashhunt("replay", "h", "--json").json
+    assert same["warnings"] == [f"libsumo was 1.2.3 and is {now}"]
+    change_snapshot(crash, "self.step * helper.GAIN", "self.step * helper.GAIN * 2")
+    other = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json
+    assert (other["verdict"], other["reason"]) == (
+        "not_comparable", f"the simulator differs: libsumo was 1.2.3 and is {now}"
+    )  # fmt: skip
+
+
+def test_the_recorded_actions_run_no_code_of_the_bundle(crash):
+    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
+    for module in (
+        "my_pkg/agents.py",
+        "my_pkg/__init__.py",
+        "helper.py",
+        "crashhunt/__init__.py",
+        "crashhunt/episode.py",
+    ):
+        (snapshot / "code" / module).write_text(f"open('evil', 'a').write({module!r})\n")
+    crash.crashhunt("replay", "h", "--from-log", "--force")
+    assert not (crash.folder / "evil").exists()
+
+
+def test_code_comes_from_the_snapshot_or_the_replay_is_refused(crash):
+    # Somebody's start-up file imports a module before anything else can.
+    site = crash.folder / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(
+        f"import sys; sys.path.insert(0, {str(crash.folder)!r}); import my_pkg.agents\n"
+    )
+    crash.environment["PYTHONPATH"] = str(site)
+    done = crash.crashhunt("replay", "h", expect=2)
+    assert "not from the snapshot" in done.err

@@ -1,0 +1,65 @@
+"""The command line: parses, calls, prints."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from typing import TYPE_CHECKING, NoReturn
+
+from crashhunt import __version__
+from crashhunt.cli._common import Parser
+from crashhunt.cli._list import add_lists
+from crashhunt.cli._replay import add_replay
+from crashhunt.cli._run import add_run
+from crashhunt.errors import CrashhuntError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["main"]
+
+_DESCRIPTION = "Hunts for the crashes of a driving agent, and hands them over so that they can be fixed."
+_EPILOG = """\
+examples:
+  crashhunt run crash 2 300 1500
+      hunt the shipped scenario `loop`: 2 trials at a time, 300 at most, 1500 steps each
+  crashhunt run out 4 1000 1500 --scenario my/town.sumocfg --agent my_pkg.agents:Planner --arg headway_s=0.3:2
+      hunt your own agent on your own network
+  crashhunt replay crash
+      run the crash again in a fresh process and prove that it is the same
+
+exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid trial, 130 interrupted
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and exit."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    as_json = "--json" in words
+    try:
+        options = _parser().parse_args(words)
+        code = options.command(options, words)
+    except CrashhuntError as error:
+        if as_json:
+            print(json.dumps(error.to_json()))
+        print(f"crashhunt: {error}", file=sys.stderr)
+        code = error.exit_code
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        code = 0
+    except KeyboardInterrupt:
+        code = 130
+    sys.exit(code)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        "crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (add_run, add_replay, add_lists):
+        add(commands)
+    return parser

@@ -1,0 +1,68 @@
+"""What several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import NoReturn
+
+from crashhunt.errors import UsageError
+
+__all__ = ["Parser", "add_crash", "add_json", "integer", "pairs", "say"]
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports mistakes as every other error is reported."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse a command line.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(message, fix=f"see {self.prog} --help")
+
+
+def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add ``--json``, the same for every command."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object; what is for people goes to stderr")
+
+
+def add_crash(parser: argparse.ArgumentParser) -> None:
+    """Add what chooses a crash."""
+    from pathlib import Path
+
+    parser.add_argument("directory", metavar="DIR", type=Path, help="of the hunt, or of one crash")
+    parser.add_argument("--crash", metavar="ID", default="", help="which one; default: the one with the fewest steps")
+
+
+def say(text: str, *, as_json: bool) -> None:
+    """Print what is for people."""
+    print(text, file=sys.stderr if as_json else sys.stdout)
+
+
+def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str]:
+    """Split repeated ``NAME=VALUE`` options.
+
+    Raises:
+        UsageError: one has no name, or a name comes twice.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals and not named:
+            name, value = "", word
+        elif not equals or not name:
+            raise UsageError(f"{option} {word!r} has no name", fix=f"write {option} NAME=VALUE")
+        if name in found:
+            raise UsageError(f"{option} {word!r}: {name or 'it'!r} was given already", fix="give it once")
+        found[name] = value
+    return found
+
+
+def integer(text: str) -> int:
+    """Read a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None

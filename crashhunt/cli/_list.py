@@ -1,0 +1,47 @@
+"""``crashhunt agents`` and ``crashhunt scenarios``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["add_lists"]
+
+
+def add_lists(commands: Any) -> None:
+    """Add the commands."""
+    for name, command, text in (
+        ("agents", _agents, "list the agents that come with crashhunt or are installed, with their arguments"),
+        ("scenarios", _scenarios, "list the scenarios that come with crashhunt, with their arguments"),
+    ):
+        listing = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        add_json(listing)
+        listing.set_defaults(command=command)
+
+
+def _agents(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.listing import list_agents
+
+    return _print_listing("agents", list_agents(), as_json=options.json)
+
+
+def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.listing import list_scenarios
+
+    return _print_listing("scenarios", list_scenarios(), as_json=options.json)
+
+
+def _print_listing(name: str, entries: list[dict[str, Any]], *, as_json: bool) -> int:
+    from crashhunt.listing import describe
+
+    for entry in entries:
+        if "warning" in entry:
+            print(f"crashhunt: warning: {entry['warning']}", file=sys.stderr)
+    print(json.dumps({name: entries}) if as_json else describe(entries))
+    return 0

@@ -1,0 +1,105 @@
+"""A recorded trial with something changed on purpose: by hand in ``hunt.toml``, or on the command line."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import ArgumentError, UsageError
+from crashhunt.space import Constant, parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.settings import ArgumentSpec, HuntSettings
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["edited_spec"]
+
+Values = dict[tuple[str, str], Any]  # (agent, or empty for the scenario; name) to value
+
+
+def edited_spec(
+    recorded: TrialSpec, settings: HuntSettings, original: HuntSettings, changes: Mapping[str, str]
+) -> tuple[TrialSpec, list[str]]:
+    """Return the trial as it is to be replayed, and in words what is not as it was recorded.
+
+    Args:
+        recorded: the trial.
+        settings: ``hunt.toml`` as it is now.
+        original: ``hunt.toml`` as it was when the trial ran.
+        changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
+
+    Raises:
+        ArgumentError: an argument does not exist, or a range is given where it takes one value.
+    """
+    edits: list[str] = []
+    values: Values = {}
+    before, after = _specs(original), _specs(settings)
+    for key in sorted(before.keys() | after.keys()):
+        spec = after.get(key)
+        if spec is not None and spec != before.get(key):
+            values[key] = _constant(spec.spec, spec, f"hunt.toml, {_name(key)}")
+    for agent, chosen in settings.agents.items():
+        if agent in original.agents and chosen.agent != original.agents[agent].agent:
+            edits.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
+    for name in ("max_steps", "crash_on", "oracles"):
+        was, now = getattr(original, name), getattr(settings, name)
+        if was != now:
+            edits.append(f"{name} was {_plain(was)} and is {_plain(now)}")
+    for name, text in changes.items():
+        key = _find(name, recorded, settings)
+        values[key] = _constant(text, after.get(key), f"--set {name}")
+    arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
+    scenario_arguments = dict(recorded.scenario_arguments)
+    for (agent, name), value in values.items():
+        target = arguments.setdefault(agent, {}) if agent else scenario_arguments
+        if name not in target or target[name] != value:
+            edits.append(f"{_name((agent, name))} was {target.get(name, '(not there)')} and is {value}")
+            target[name] = value
+    max_steps = settings.max_steps if settings.max_steps != original.max_steps else recorded.max_steps
+    trial = replace(recorded, arguments=arguments, scenario_arguments=scenario_arguments, max_steps=max_steps)
+    return trial, edits
+
+
+def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:
+    found = {("", name): spec for name, spec in settings.scenario_arguments.items()}
+    for agent, chosen in settings.agents.items():
+        found |= {(agent, name): spec for name, spec in chosen.arguments.items()}
+    return found
+
+
+def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Any:
+    distribution = parse_spec(text, spec.kind if spec else None, where=where)
+    if not isinstance(distribution, Constant):
+        raise ArgumentError(f"{where}: {text!r} is not one value, and a replay needs one", fix="give a value")
+    return distribution.value
+
+
+def _find(name: str, recorded: TrialSpec, settings: HuntSettings) -> tuple[str, str]:
+    for agent in sorted(recorded.arguments, key=len, reverse=True):
+        if name.startswith(f"{agent}."):
+            return agent, name.removeprefix(f"{agent}.")
+    takers = [agent for agent, values in recorded.arguments.items() if name in values]
+    if len(takers) > 1:
+        raise UsageError(
+            f"--set {name}: several agents take it", fix="write " + " or ".join(f"{agent}.{name}=…" for agent in takers)
+        )
+    if takers:
+        return takers[0], name
+    if name in recorded.scenario_arguments:
+        return "", name
+    known = [_name(key) for key in _specs(settings)]
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=f"{hint}it has {', '.join(known) or 'none'}")
+
+
+def _name(key: tuple[str, str]) -> str:
+    agent, name = key
+    return f"{agent}.{name}" if agent else name
+
+
+def _plain(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

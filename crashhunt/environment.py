@@ -1,0 +1,81 @@
+"""What a result depends on besides code: Python, the machine, what is installed."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+__all__ = ["environment", "environment_changes", "versions"]
+
+_VERSIONED = ("crashhunt", "libsumo", "gymnasium", "numpy", "highway-env")
+_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "SUMO_HOME", "OMP_NUM_THREADS", "VIRTUAL_ENV")
+
+
+def environment() -> dict[str, Any]:
+    """Return the content of ``environment.json``.
+
+    ``loaded`` are the distributions of which something has been imported by now: with the simulator's, those on which
+    a result may depend.
+    """
+    distributions = {dist.metadata["Name"]: dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
+    modules = {name.partition(".")[0] for name in list(sys.modules)}
+    owners = metadata.packages_distributions()
+    loaded = {owner for name in modules for owner in owners.get(name, ())} | (distributions.keys() & _VERSIONED)
+    return {
+        "schema": 1,
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "cpu": _cpu(),
+        "versions": versions(),
+        "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
+        "loaded": sorted(loaded, key=str.lower),
+        "variables": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that every crash names."""
+    found = {"python": platform.python_version()}
+    for name in _VERSIONED:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def environment_changes(recorded: dict[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return what is another version here than in an ``environment.json``: name to (then, now)."""
+    changes = {}
+    for name, now in (
+        ("python", platform.python_version()),
+        ("implementation", platform.python_implementation()),
+        ("machine", platform.machine()),
+    ):
+        then = recorded.get(name, now)
+        if then != now:
+            changes[name] = (str(then), now)
+    distributions = recorded.get("distributions", {})
+    for name in recorded.get("loaded", ()):
+        try:
+            now = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            now = "not installed"
+        then = distributions.get(name, now)
+        if then != now and name != "crashhunt":  # which comes from the snapshot
+            changes[name] = (str(then), now)
+    return changes
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
