@@ -215,7 +215,9 @@ def _spec(
     for argument in (known, declared):
         # The constructor's own default too: it may be another one by the time of a replay.
         if argument is not None and argument.default is not None:
-            return ArgumentSpec(spec=str(parse_spec(str(Constant(argument.default)), kind, where=name)), kind=kind)
+            constant = parse_spec(str(Constant(argument.default)), kind, where=name)
+            # A text such as "a|b" would be read as a choice; it is left to whoever has it as a default.
+            return ArgumentSpec(spec=str(constant), kind=kind) if isinstance(constant, Constant) else None
     return None
 
 
