@@ -1,6 +1,7 @@
 """Reports: what people are told."""
 
 from crashhunt.report._screen import Watcher, format_arguments, format_seconds
+from crashhunt.report._show import Story
 from crashhunt.report._summary import describe_hunt, describe_replay
 
-__all__ = ["Watcher", "describe_hunt", "describe_replay", "format_arguments", "format_seconds"]
+__all__ = ["Story", "Watcher", "describe_hunt", "describe_replay", "format_arguments", "format_seconds"]

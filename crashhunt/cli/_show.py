@@ -1,0 +1,43 @@
+"""``crashhunt show``."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_crash, add_json
+from crashhunt.errors import UsageError
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["add_show"]
+
+
+def add_show(commands: Any) -> None:
+    """Add the command."""
+    show = commands.add_parser(
+        "show",
+        help="tell the last seconds of a crash",
+        description="Tell the last seconds of a crash in words and a table: who was where, how fast, closing how "
+        "quickly, what the agent decided, and until when full braking would have avoided it. Runs no code of the "
+        "bundle.",
+    )
+    add_crash(show)
+    show.add_argument("--last-seconds", metavar="S", type=float, default=5.0, help="how much of it; default: 5")
+    show.add_argument("--braking", metavar="A", type=float, default=8.0, help="full braking, in m/s²; default: 8")
+    add_json(show)
+    show.set_defaults(command=_show)
+
+
+def _show(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.bundle import find_bundle
+    from crashhunt.report import Story
+
+    for name, value in (("--last-seconds", options.last_seconds), ("--braking", options.braking)):
+        if not 0 < value < float("inf"):
+            raise UsageError(f"{name} is {value:g}", fix="give a number above 0")
+    bundle = find_bundle(options.directory, options.crash)
+    story = Story(bundle, last_s=options.last_seconds, braking=options.braking)
+    print(json.dumps(story.to_json()) if options.json else story.describe())
+    return 0

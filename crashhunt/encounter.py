@@ -1,0 +1,197 @@
+"""Two actors of a recording: how they stood to each other, and how long the crash could still have been avoided."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from crashhunt.oracles import outlines_overlap, rectangle_gap, time_to_contact
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.recording import Recording
+    from crashhunt.scene import Scene
+
+__all__ = ["Encounter", "Manner", "Moment", "last_escape"]
+
+Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "crossing from the right", "left", "right"]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """How the other one stands to the agent after one step.
+
+    Args:
+        step: of the episode.
+        time_s: simulation time.
+        speed: of the agent, in m/s.
+        other_speed: in m/s.
+        gap_m: between the outlines.
+        closing_speed: at which their centres come nearer, in m/s; negative when they part.
+        time_to_collision_s: at constant velocities; infinite where they would miss each other.
+        required_deceleration: that the agent would need, v² / (2 gap) with v the closing speed, in m/s².
+    """
+
+    step: int
+    time_s: float
+    speed: float
+    other_speed: float
+    gap_m: float
+    closing_speed: float
+    time_to_collision_s: float
+    required_deceleration: float
+
+
+class Encounter:
+    """The steps of a recording in which two actors were both there.
+
+    Args:
+        recording: of the episode.
+        agent: one of them.
+        other: the other.
+    """
+
+    def __init__(self, recording: Recording, agent: str, other: str) -> None:
+        self.agent = agent
+        self.other = other
+        self._scenes = [
+            (step.step, step.scene)
+            for step in recording.all_steps
+            if step.scene is not None and agent in step.scene.roster.index and other in step.scene.roster.index
+        ]
+        self.moments = self._measure()
+
+    def manner(self, step: int) -> Manner | None:
+        """Where the other one was after a step, as seen from the agent; None where one of them was not there."""
+        scene = next((scene for number, scene in self._scenes if number == step), None)
+        if scene is None:
+            return None
+        own, other = scene.roster.index[self.agent], scene.roster.index[self.other]
+        offset = scene.centers[other] - scene.centers[own]
+        c, s = math.cos(scene.headings[own]), math.sin(scene.headings[own])
+        ahead, left = offset[0] * c + offset[1] * s, offset[1] * c - offset[0] * s
+        turn = math.remainder(scene.headings[other] - scene.headings[own], math.tau)
+        if abs(turn) > math.radians(135):
+            return "oncoming"
+        if abs(turn) > math.radians(45):
+            return "crossing from the right" if turn > 0 else "crossing from the left"
+        room = (scene.roster.actors[own].length + scene.roster.actors[other].length) / 2
+        if abs(ahead) < room and abs(left) > (scene.roster.actors[own].width + scene.roster.actors[other].width) / 3:
+            return "left" if left > 0 else "right"
+        return "ahead" if ahead > 0 else "behind"
+
+    def _measure(self) -> list[Moment]:
+        if not self._scenes:
+            return []
+        rows = [(scene.roster.index[self.agent], scene.roster.index[self.other]) for _, scene in self._scenes]
+        states = np.array(
+            [
+                (*scene.centers[own], *scene.centers[other], scene.headings[own], scene.headings[other],
+                 scene.speeds[own], scene.speeds[other])
+                for (_, scene), (own, other) in zip(self._scenes, rows, strict=True)
+            ]
+        )  # fmt: skip
+        half_own, half_other = (
+            np.array(
+                [scene.roster.half_sizes[pair[which]] for (_, scene), pair in zip(self._scenes, rows, strict=True)]
+            )
+            for which in (0, 1)
+        )
+        heading, other_heading, speed, other_speed = states[:, 4:].T
+        offset = states[:, 2:4] - states[:, 0:2]
+        own_velocity = speed[:, None] * np.stack((np.cos(heading), np.sin(heading)), axis=1)
+        velocity = (
+            other_speed[:, None] * np.stack((np.cos(other_heading), np.sin(other_heading)), axis=1) - own_velocity
+        )
+        distance = np.maximum(np.hypot(*offset.T), 1e-9)
+        closing = -np.einsum("ij,ij->i", offset, velocity) / distance
+        turn = other_heading - heading
+        gap = rectangle_gap(_turned(offset, heading), turn, half_own, half_other)
+        contact = time_to_contact(_turned(offset, heading), _turned(velocity, heading), turn, half_own, half_other)
+        needed = np.where((gap > 0) & (closing > 0), closing**2 / (2 * np.maximum(gap, 1e-9)), 0.0)
+        return [
+            Moment(number, scene.time_s, *map(float, values))
+            for (number, scene), *values in zip(
+                self._scenes, speed, other_speed, gap, closing, contact, needed, strict=True
+            )
+        ]
+
+
+def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
+    """Return the last step after which full braking would have avoided the crash; None where there was none.
+
+    The agent goes on along the path that it drove, braking from that step on; the other one does what it did, and
+    beyond the end of the recording goes on at its last velocity.
+
+    Args:
+        recording: of the crash.
+        agent: who brakes.
+        other: whom it crashed into, or who crashed into it.
+        braking: deceleration, in m/s².
+    """
+    encounter = Encounter(recording, agent, other)
+    scenes = [scene for _, scene in encounter._scenes]
+    if len(scenes) < 2:
+        return None
+    step_length = recording.prologue.step_length_s
+    own = [scene.roster.index[agent] for scene in scenes]
+    them = [scene.roster.index[other] for scene in scenes]
+    path = _Path([(*scene.points[row], scene.headings[row]) for scene, row in zip(scenes, own, strict=True)])
+    actor, second = scenes[-1].roster.actors[own[-1]], scenes[-1].roster.actors[them[-1]]
+    for start in range(len(scenes) - 1, -1, -1):
+        speed, driven = scenes[start].speeds[own[start]], path.distances[start]
+        index, hit = start, False
+        while speed > 0 and not hit:
+            slower = max(0.0, speed - braking * step_length)
+            driven += (speed + slower) / 2 * step_length
+            speed = slower
+            index += 1
+            hit = outlines_overlap(
+                (*path.at(driven), actor.length, actor.width),
+                (*_where_other(scenes, them, index, step_length), second.length, second.width),
+            )
+        # The other one may still drive into somebody who stands; that is not for the agent's brakes to avoid.
+        if not hit:
+            return encounter._scenes[start][0]
+    return None
+
+
+class _Path:
+    """A driven path, and its straight continuation."""
+
+    def __init__(self, poses: list[tuple[float, float, float]]) -> None:
+        self._poses = np.array(poses)
+        lengths = np.hypot(*np.diff(self._poses[:, :2], axis=0).T)
+        self.distances = [0.0, *np.cumsum(lengths).tolist()]
+
+    def at(self, distance: float) -> tuple[float, float, float]:
+        index = int(np.searchsorted(self.distances, distance))
+        if index >= len(self.distances):
+            x, y, heading = self._poses[-1]
+            beyond = distance - self.distances[-1]
+            return float(x + beyond * math.cos(heading)), float(y + beyond * math.sin(heading)), float(heading)
+        if index == 0:
+            x, y, heading = self._poses[0]
+            return float(x), float(y), float(heading)
+        before, after = self._poses[index - 1], self._poses[index]
+        share = (distance - self.distances[index - 1]) / max(self.distances[index] - self.distances[index - 1], 1e-9)
+        x, y = before[:2] + share * (after[:2] - before[:2])
+        heading = before[2] + share * math.remainder(after[2] - before[2], math.tau)
+        return float(x), float(y), float(heading)
+
+
+def _where_other(scenes: list[Scene], rows: list[int], index: int, step_length: float) -> tuple[float, float, float]:
+    last = min(index, len(scenes) - 1)
+    (x, y), heading = scenes[last].points[rows[last]], scenes[last].headings[rows[last]]
+    beyond = (index - last) * step_length * scenes[last].speeds[rows[last]]
+    return x + beyond * math.cos(heading), y + beyond * math.sin(heading), heading
+
+
+def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors of the map in frames with these headings."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack((vectors[:, 0] * c + vectors[:, 1] * s, vectors[:, 1] * c - vectors[:, 0] * s), axis=1)

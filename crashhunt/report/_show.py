@@ -1,0 +1,240 @@
+"""The last seconds of a crash, in plain words and a table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.encounter import Encounter, last_escape
+from crashhunt.report._screen import format_arguments
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.bundle import Bundle
+    from crashhunt.encounter import Manner
+
+__all__ = ["Story"]
+
+_ROWS = 20  # of the table; longer stretches are thinned out
+_PLACES: dict[Manner, str] = {
+    "ahead": "{other} was ahead of {agent}, going the same way",
+    "behind": "{other} came from behind, going the same way",
+    "oncoming": "{other} came towards {agent}",
+    "crossing from the left": "{other} crossed from the left",
+    "crossing from the right": "{other} crossed from the right",
+    "left": "{other} was beside {agent}, to its left",
+    "right": "{other} was beside {agent}, to its right",
+}
+
+
+class Story:
+    """What happened in the last seconds of a crash; no code of the bundle is run.
+
+    Args:
+        bundle: the crash.
+        last_s: how much of it, in s.
+        braking: what counts as full braking, in m/s².
+    """
+
+    def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float = 8.0) -> None:
+        self.bundle = bundle
+        self.recording = bundle.recording()
+        self._last_s = last_s
+        self._braking = braking
+        hit, failure = bundle.result.collision, bundle.result.failure
+        agents = self.recording.agents
+        self.agent = (hit.agent if hit else failure.agent if failure else "") or (agents[0] if agents else "")
+        self.other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
+        self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
+        self.escape = (
+            last_escape(self.recording, self.agent, self.other, braking=braking)
+            if hit is not None and hit.role == "collider"
+            else None
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the shape that ``show --json`` prints."""
+        moments = self.encounter.moments if self.encounter else []
+        return {
+            "crash": self.bundle.id,
+            "summary": self.bundle.result.summary,
+            "agent": self.agent,
+            "other": self.other,
+            "words": self.words(),
+            "full_braking": self._braking,
+            "last_escape_step": self.escape,
+            "moments": [
+                {
+                    name: None if isinstance(value, float) and not math.isfinite(value) else value
+                    for name, value in asdict(moment).items()
+                }
+                | {"action": self._action(moment.step)}
+                for moment in moments
+                if moment.step >= self._first_step()
+            ],
+        }
+
+    def words(self) -> list[str]:
+        """Return what happened, a sentence each."""
+        result, recording = self.bundle.result, self.recording
+        end = recording.steps
+        sentences = [f"{result.summary}, {end * recording.prologue.step_length_s:.1f} s after it had entered the road."]
+        if self.encounter is not None and self.encounter.moments:
+            sentences += self._about_encounter(self.encounter)
+        hit = result.collision
+        if hit is not None and hit.role == "alone":
+            before = self._action(end)
+            sentences.append(f"Its last decision was {_words(before, self._names())}.")
+        if result.failure is not None:
+            sentences += self._about_failure()
+        return sentences
+
+    def describe(self) -> str:
+        """Return words and table."""
+        lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
+        lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
+        lines += ["", *self.words(), "", *self.table()]
+        return "\n".join(lines)
+
+    def table(self) -> list[str]:
+        """Return the last steps as a table."""
+        names = self._names()
+        header = ["step", "time s", f"{self.agent} m/s", *names]
+        if self.encounter is not None:
+            header += [f"{self.other} m/s", "gap m", "closing m/s", "TTC s", "needs m/s²"]
+        moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
+        rows = []
+        steps = [step for step in self.recording.all_steps if step.step >= self._first_step()]
+        for step in _thinned(steps, _ROWS, always=self.escape):
+            scene = step.scene
+            row = scene.roster.index.get(self.agent) if scene is not None else None
+            speed = f"{scene.speeds[row]:.1f}" if scene is not None and row is not None else "-"
+            time_s = f"{scene.time_s:.1f}" if scene is not None else "-"
+            cells = [str(step.step), time_s, speed, *self._decision(step.step)]
+            if self.encounter is not None:
+                moment = moments.get(step.step)
+                cells += (
+                    ["-"] * 5
+                    if moment is None
+                    else [
+                        f"{moment.other_speed:.1f}",
+                        f"{moment.gap_m:.1f}",
+                        f"{moment.closing_speed:+.1f}",
+                        f"{moment.time_to_collision_s:.1f}" if math.isfinite(moment.time_to_collision_s) else "-",
+                        f"{moment.required_deceleration:.1f}",
+                    ]
+                )
+            mark = "" if step.step != self.escape else f"<- the last step from which braking at {self._braking:g} helps"
+            rows.append([*cells, mark])
+        widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+        return [
+            "  ".join(
+                [*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), *row[len(header) :]]
+            ).rstrip()
+            for row in [header, *rows]
+        ]
+
+    def _about_encounter(self, encounter: Encounter) -> list[str]:
+        moments = encounter.moments
+        last = moments[-1]
+        earlier = next(moment for moment in moments if moment.step >= self._first_step())
+        middle = next((moment for moment in reversed(moments) if last.time_s - moment.time_s >= 1.0), earlier)
+        agent, other = encounter.agent, encounter.other
+        sentences = []
+        manner = encounter.manner(middle.step)
+        if manner is not None:
+            ago = last.time_s - middle.time_s
+            sentences.append(f"{ago:.1f} s before, {_PLACES[manner].format(agent=agent, other=other)}.")
+        closing = "closing" if earlier.closing_speed > 0 else "parting"
+        sentences.append(
+            f"{last.time_s - earlier.time_s:.1f} s before, they were {earlier.gap_m:.1f} m apart, {closing} at "
+            f"{abs(earlier.closing_speed):.1f} m/s; {agent} at {earlier.speed:.1f} m/s, "
+            f"{other} at {earlier.other_speed:.1f} m/s."
+        )
+        sentences.append(
+            f"When they touched, {agent} drove {last.speed:.1f} m/s and {other} {last.other_speed:.1f} m/s."
+        )
+        changed = self._last_lane_change()
+        if changed is not None:
+            step, side = changed
+            sentences.append(f"{agent} decided to change lanes to the {side} at step {step}.")
+        hit = self.bundle.result.collision
+        if hit is not None and hit.role == "collider":
+            sentences.append(self._about_escape(last.step, last.time_s))
+        return sentences
+
+    def _about_escape(self, end: int, end_s: float) -> str:
+        braking = f"Braking at {self._braking:g} m/s²"
+        if self.escape is None:
+            return f"{braking} would not have avoided it at any step in which both were there."
+        ago = (end - self.escape) * self.recording.prologue.step_length_s
+        if self.escape == end:
+            return f"{braking} would have avoided it until the end."
+        return f"{braking} would have avoided it until {ago:.1f} s before, at step {self.escape}; after that, nothing."
+
+    def _last_lane_change(self) -> tuple[int, str] | None:
+        names = self._names()
+        if "lane_change" not in names:
+            return None
+        for step in range(self.recording.steps, max(0, self._first_step()), -1):
+            action = self._action(step)
+            change = action[names.index("lane_change")] if action else 0.0
+            if change:
+                return step, "left" if change > 0 else "right"
+        return None
+
+    def _about_failure(self) -> list[str]:
+        failure = self.bundle.result.failure
+        assert failure is not None
+        sentences = []
+        if self.recording.all_steps and self.agent in self.recording.all_steps[-1].observations:
+            last = self.recording.all_steps[-1]
+            channel = next(agent for agent in self.recording.prologue.agents if agent.id == self.agent)
+            seen = last.observations[self.agent]
+            names = channel.observation_names or tuple(map(str, range(seen.shape[-1] if seen.ndim else 1)))
+            own = seen.reshape(-1, seen.shape[-1])[0].tolist() if seen.ndim else [seen.item()]
+            facts = ", ".join(f"{name} {value:.3g}" for name, value in zip(names, own, strict=False))
+            sentences.append(f"The last that it was shown, in step {last.step}: {facts}.")
+        frames = [line.strip() for line in failure.traceback.splitlines() if line.strip()]
+        if frames:
+            sentences += ["", *frames[-6:]]
+        return sentences
+
+    def _first_step(self) -> int:
+        return self.recording.steps - round(self._last_s / self.recording.prologue.step_length_s)
+
+    def _names(self) -> tuple[str, ...]:
+        channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
+        if channel is None:
+            return ()
+        return channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
+
+    def _action(self, step: int) -> list[float] | None:
+        """What the agent decided in a step."""
+        if not 0 <= step < len(self.recording.all_steps):
+            return None
+        array = self.recording.all_steps[step].actions.get(self.agent)
+        return None if array is None else [float(value) for value in array.reshape(-1)]
+
+    def _decision(self, step: int) -> list[str]:
+        action = self._action(step)
+        return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
+
+
+def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
+    if action is None:
+        return "not recorded"
+    return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, action, strict=False))
+
+
+def _thinned(steps: list[Any], rows: int, *, always: int | None) -> list[Any]:
+    """About so many, evenly, the last ones all."""
+    if len(steps) <= rows:
+        return steps
+    recent = steps[-rows // 2 :]
+    earlier = steps[: -rows // 2]
+    every = math.ceil(len(earlier) / (rows - len(recent)))
+    kept = {id(step) for step in earlier[::-every]}
+    return [*(step for step in earlier if id(step) in kept or step.step == always), *recent]

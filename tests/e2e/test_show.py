@@ -1,0 +1,52 @@
+"""What is told of a crash, of every kind, without running code of the bundle."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+
+@pytest.fixture
+def crash(shell):
+    words = ("run", "h", "2", "50", "800", "--arg", "speed=20:25", "--seed", "1", "--deterministic")
+    shell.crashhunt(*words)
+    return shell
+
+
+def test_a_collision_is_told_in_words_and_a_table(crash):
+    text = crash.crashhunt("show", "h").out
+    facts = crash.crashhunt("show", "h", "--json").json
+    assert facts["summary"] in text
+    assert f"{facts['other']} was ahead of ego, going the same way" in text
+    last = facts["moments"][-1]
+    assert f"ego drove {last['speed']:.1f} m/s and {facts['other']} {last['other_speed']:.1f} m/s" in text
+    (marked,) = (line for line in text.splitlines() if "<- the last step" in line)
+    assert int(marked.split()[0]) == facts["last_escape_step"]
+    assert f"at step {facts['last_escape_step']}; after that, nothing" in text
+    # The rows of the table are the moments.
+    rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d+  ", line)]
+    by_step = {moment["step"]: moment for moment in facts["moments"]}
+    for row in rows:
+        moment = by_step[int(row[0])]
+        assert float(row[2]) == pytest.approx(moment["speed"], abs=0.06)
+        assert float(row[6]) == pytest.approx(moment["gap_m"], abs=0.06)
+    harder = crash.crashhunt("show", "h", "--braking", "4", "--json").json
+    assert harder["last_escape_step"] is None or harder["last_escape_step"] < facts["last_escape_step"]
+
+
+def test_bad_numbers_are_refused(crash):
+    for words in (("--braking", "0"), ("--last-seconds", "-1"), ("--braking", "nan"), ("--crash", "999")):
+        refused = crash.crashhunt("show", "h", *words, expect=2)
+        assert len(refused.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("agent", "says"),
+    [("faulty:Raises", "ValueError: no plan"), ("faulty:Segfaults", "SIGSEGV"), ("faulty:Nan", "target_speed")],
+)
+def test_software_faults_are_told_too(shell, agent, says):
+    shell.crashhunt("run", "h", "1", "1", "100", "--agent", agent, "--set", "vehicles=10")
+    text = shell.crashhunt("show", "h").out
+    assert says in text
+    assert "The last that it was shown" in text
