@@ -17,6 +17,7 @@ from crashhunt.recording import Divergence, Recording, Tag, first_divergence, re
 from crashhunt.settings import read_settings
 from crashhunt.snapshot import Snapshot
 from crashhunt.trial import Outcome
+from crashhunt.trust import refuse_side_effects
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,12 +42,15 @@ class ReplayOptions:
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
         force: replay even from a snapshot that is damaged.
         times: how often.
+        trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
+            but simulate.
     """
 
     code: Code = "snapshot"
     changes: Mapping[str, str] = field(default_factory=dict)
     force: bool = False
     times: int = 1
+    trusted: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +193,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
             raise UsageError(
                 f"recorded actions belong to the recorded trial, and {edits[0]}", fix="replay with --code snapshot"
             )
+        if not options.trusted:
+            refuse_side_effects(scenario, settings)
         log = str((bundle.path / "log.mcap").resolve())
         scenario = scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded"))
         # An agent that failed did not act in its last step, and neither can its record.

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import NoReturn
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.errors import UsageError
 
-__all__ = ["Parser", "add_crash", "add_json", "integer", "pairs", "say"]
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.archive import Archive
+    from crashhunt.bundle import Bundle
+
+__all__ = ["Parser", "add_crash", "add_json", "integer", "opened_crash", "pairs", "say"]
 
 
 class Parser(argparse.ArgumentParser):
@@ -30,10 +38,28 @@ def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
 
 def add_crash(parser: argparse.ArgumentParser) -> None:
     """Add what chooses a crash."""
-    from pathlib import Path
-
-    parser.add_argument("directory", metavar="DIR", type=Path, help="of the hunt, or of one crash")
+    parser.add_argument(
+        "directory", metavar="DIR", type=Path, help="of the hunt, of one crash, or a file that crashhunt export wrote"
+    )
     parser.add_argument("--crash", metavar="ID", default="", help="which one; default: the one with the fewest steps")
+
+
+@contextmanager
+def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive | None]]:
+    """Yield the crash that is meant, unpacked for so long where it was exported into a file.
+
+    Raises:
+        BundleError: there is no such crash.
+    """
+    from crashhunt.bundle import find_bundle
+
+    if not directory.is_file():
+        yield find_bundle(directory, crash), None
+        return
+    from crashhunt.archive import open_archive
+
+    with open_archive(directory) as archive:
+        yield find_bundle(archive.directory, crash), archive
 
 
 def say(text: str, *, as_json: bool) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import add_crash, add_json, integer, pairs, say
+from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, pairs, say
+from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
     import argparse
@@ -39,15 +41,16 @@ def add_replay(commands: Any) -> None:
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
         help="the verdict for which the exit code is 0; default: reproduced",
     )  # fmt: skip
+    replay.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
     replay.add_argument("--force", action="store_true", help="replay even from a snapshot that is damaged")
     add_json(replay)
     replay.set_defaults(command=_replay)
 
 
 def _replay(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.bundle import find_bundle
     from crashhunt.replay import ReplayOptions, replay
     from crashhunt.report import describe_replay
+    from crashhunt.settings import read_settings
 
     chosen = ReplayOptions(
         code="log" if options.from_log else options.code,
@@ -55,7 +58,17 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         force=options.force,
         times=options.times,
     )
-    report = replay(find_bundle(options.directory, options.crash), chosen)
+    with opened_crash(options.directory, options.crash) as (bundle, archive):
+        trusted = archive is None or archive.made_here or options.trust
+        if archive is not None and not trusted and chosen.code != "log":
+            agents = {agent.agent for agent in read_settings(bundle.hunt / "hunt.toml").agents.values()}
+            raise UsageError(
+                f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
+                f"({', '.join(sorted(agents))})",
+                fix="give --trust if you trust whoever gave it to you, or --from-log to run none of it",
+                where=str(options.directory),
+            )
+        report = replay(bundle, replace(chosen, trusted=trusted))
     say(describe_replay(report), as_json=options.json)
     if options.json:
         print(json.dumps(report.to_json()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import add_crash, add_json
+from crashhunt.cli._common import add_crash, add_json, opened_crash
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -31,13 +31,12 @@ def add_show(commands: Any) -> None:
 
 
 def _show(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.bundle import find_bundle
     from crashhunt.report import Story
 
     for name, value in (("--last-seconds", options.last_seconds), ("--braking", options.braking)):
         if not 0 < value < float("inf"):
             raise UsageError(f"{name} is {value:g}", fix="give a number above 0")
-    bundle = find_bundle(options.directory, options.crash)
-    story = Story(bundle, last_s=options.last_seconds, braking=options.braking)
+    with opened_crash(options.directory, options.crash) as (bundle, _):
+        story = Story(bundle, last_s=options.last_seconds, braking=options.braking)
     print(json.dumps(story.to_json()) if options.json else story.describe())
     return 0

@@ -1,0 +1,40 @@
+"""``crashhunt export``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_crash, add_json, say
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["add_export"]
+
+
+def add_export(commands: Any) -> None:
+    """Add the command."""
+    export = commands.add_parser(
+        "export",
+        help="write a crash into one file, for another machine",
+        description="Write a crash with its snapshot into one zip file. crashhunt replay, show and report take the "
+        "file wherever they take a DIR.",
+    )
+    add_crash(export)
+    export.add_argument("file", metavar="FILE", type=Path, help="the zip file to write")
+    add_json(export)
+    export.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.archive import export_crash
+    from crashhunt.bundle import find_bundle
+
+    bundle = find_bundle(options.directory, options.crash)
+    size = export_crash(bundle, options.file)
+    say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB)", as_json=options.json)
+    if options.json:
+        print(json.dumps({"crash": bundle.id, "file": str(options.file), "bytes": size}))
+    return 0

@@ -1,0 +1,207 @@
+"""A crash in one file: it replays elsewhere, and a hostile file can do nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import stat
+import zipfile
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crashhunt.archive import open_archive
+from crashhunt.errors import BundleError
+
+AGENT = """
+class Agent:
+    def reset(self, seed): self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        assert self.step < 20
+        return 6.0, 0
+"""
+
+
+@pytest.fixture
+def exported(shell):
+    """A crash of an own agent as ``crash.zip``, the hunt and the agent gone."""
+    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
+    (shell.folder / "mine.py").write_text(AGENT)
+    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--set", "vehicles=10")
+    shell.crashhunt("export", "h", "crash ä.zip")
+    shutil.rmtree(shell.folder / "h")
+    (shell.folder / "mine.py").unlink()
+    return shell
+
+
+def test_it_replays_here_and_elsewhere_if_trusted(exported):
+    assert exported.crashhunt("replay", "crash ä.zip", "--json").json["verdict"] == "reproduced"
+    exported.environment["XDG_STATE_HOME"] = str(exported.folder / "of another machine")
+    for words in ((), ("--code", "current")):
+        refused = exported.crashhunt("replay", "crash ä.zip", *words, expect=2)
+        assert "--trust" in refused.err
+        assert "mine:Agent" in refused.err
+        assert len(refused.err.strip().splitlines()) == 1
+    assert exported.crashhunt("replay", "crash ä.zip", "--trust", "--json").json["verdict"] == "reproduced"
+    assert exported.crashhunt("replay", "crash ä.zip", "--from-log", "--json").json["code"] == "log"
+    assert "AssertionError" in exported.crashhunt("show", "crash ä.zip").out
+
+
+def rewritten(source, target, change):
+    """Copy a zip file; ``change`` is given every (name, data) and returns what to write instead."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+        for info in old.infolist():
+            for name, data in change(info.filename, old.read(info)):
+                new.writestr(name, data)
+    return target
+
+
+def with_index(change):
+    """Also change what the index says."""
+
+    def apply(name, data):
+        if name == "archive.json":
+            index = json.loads(data)
+            change(index)
+            return [(name, json.dumps(index))]
+        return [(name, data)]
+
+    return apply
+
+
+def test_a_forged_signature_is_a_strangers(exported):
+    forged = rewritten(
+        exported.folder / "crash ä.zip",
+        exported.folder / "forged.zip",
+        with_index(lambda index: index.update(made_by="you@here")),
+    )
+    assert "you@here made it" in exported.crashhunt("replay", forged.name, expect=2).err
+
+
+def test_what_should_not_be_there_is_refused(exported, tmp_path):
+    source = exported.folder / "crash ä.zip"
+    link = zipfile.ZipInfo("crashes/link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+
+    def added(name, data="x", listed=True):
+        def change(old_name, old_data):
+            if old_name != "archive.json":
+                return [(old_name, old_data)]
+            index = json.loads(old_data)
+            if listed:
+                plain = getattr(name, "filename", name)
+                index["files"][plain] = {"size": len(data), "blake2b": "0" * 32}
+            return [(name, data), (old_name, json.dumps(index))]
+
+        return change
+
+    def grown(name, data):
+        return [(name, data + b" " if name == "hunt.toml" else data)]
+
+    def cut(name, data):
+        return [] if name == "hunt.toml" else [(name, data)]
+
+    for number, (change, says) in enumerate(
+        [
+            (added("../../evil"), "leads out"),
+            (added("/etc/evil"), "leads out"),
+            (added("crashes\\..\\evil"), "leads out"),
+            (added("C:/evil"), "leads out"),
+            (added("other/evil"), "no part of a crash"),
+            (added(link), "is not a file"),
+            (added("crashes/extra", listed=False), "not listed"),
+            (added("crashes/extra"), "has changed"),
+            (grown, "larger than it says"),
+            (cut, "'hunt.toml' is missing"),
+            (with_index(lambda index: index.update(schema=99)), "schema 99"),
+            (with_index(lambda index: index.pop("files")), "not an exported crash"),
+            (lambda name, data: [] if name == "archive.json" else [(name, data)], "not an exported crash"),
+        ]
+    ):
+        bad = rewritten(source, tmp_path / f"bad-{number}.zip", change)
+        done = exported.crashhunt("show", str(bad), expect=2)
+        assert says in done.err
+        assert len(done.err.strip().splitlines()) == 1
+    assert not list(tmp_path.glob("**/evil"))
+
+
+def test_a_bomb_is_refused(exported, tmp_path):
+    def bomb(name, data):
+        if name != "archive.json":
+            return [(name, data)]
+        index = json.loads(data)
+        index["files"]["crashes/bomb"] = {"size": 10, "blake2b": "0" * 32}
+        return [("crashes/bomb", bytes(200_000_000)), (name, json.dumps(index))]
+
+    bad = rewritten(exported.folder / "crash ä.zip", tmp_path / "bomb.zip", bomb)
+    assert bad.stat().st_size < 5_000_000
+    assert "larger than it says" in exported.crashhunt("show", str(bad), expect=2).err
+
+
+@pytest.fixture(scope="module")
+def small_archive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("archive") / "small.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("hunt.toml", "x = 1")
+        index = {"schema": 1, "files": {"hunt.toml": {"size": 5, "blake2b": "0" * 32}}}
+        archive.writestr("archive.json", json.dumps(index))
+    return path.read_bytes()
+
+
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_any_damage_is_refused_or_harmless(small_archive, tmp_path, data):
+    position = data.draw(st.integers(0, len(small_archive) - 1))
+    damaged = small_archive[:position] + data.draw(st.binary(max_size=40)) + small_archive[position + 1 :]
+    path = tmp_path / "damaged.zip"
+    path.write_bytes(damaged)
+    with pytest.raises(BundleError), open_archive(path):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "says"),
+    [
+        ("scenario/scenario.toml", 'simulator = "sumo"', 'simulator = "os:system"', "os:system"),
+        ("hunt.toml", '"overlap"', '"subprocess:run"', "subprocess:run"),
+        ("scenario/scenario.toml", "[sumo.options]", '[sumo.options]\nsummary-output = "evil"', "summary-output"),
+        ("scenario/traffic.rou.xml", "<routes>", '<routes><inductionLoop id="a" file="evil"/>', "file=…"),
+    ],
+)  # fmt: skip
+def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported, tmp_path, file, before, after, says):
+    import hashlib
+
+    changed = []
+
+    def change(name, data):
+        if name.endswith(file):
+            assert before in data.decode()
+            data = data.decode().replace(before, after).encode()
+            changed.append((name, data))
+        if name == "archive.json":
+            index = json.loads(data)
+            for path, content in changed:
+                index["files"][path] = {
+                    "size": len(content), "blake2b": hashlib.blake2b(content, digest_size=16).hexdigest()
+                }  # fmt: skip
+            data = json.dumps(index)
+        return [(name, data)]
+
+    bad = rewritten(exported.folder / "crash ä.zip", tmp_path / "bad.zip", change)
+    refused = exported.crashhunt("replay", str(bad), "--from-log", "--force", expect=2)
+    assert says in refused.err
+    assert "a stranger's" in refused.err
+
+
+def test_where_an_archive_cannot_be_written_or_made(exported):
+    exported.environment.pop("XDG_STATE_HOME")
+    (exported.folder / "mine.py").write_text(AGENT)
+    exported.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--set", "vehicles=10")
+    assert "missing/x.zip" in exported.crashhunt("export", "h", "missing/x.zip", expect=2).err
+    (log,) = (exported.folder / "h" / "crashes").glob("*/log.mcap")
+    log.write_bytes(log.read_bytes()[:-100])
+    exported.crashhunt("export", "h", "x.zip", expect=2)
+    assert not (exported.folder / "x.zip").exists()
