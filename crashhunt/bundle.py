@@ -55,6 +55,13 @@ class Bundle:
         """The hunt's directory."""
         return self.path.parent.parent
 
+    @property
+    def driver(self) -> str:
+        """The agent that it is about; of one that is about none, the first."""
+        hit, failure = self.result.collision, self.result.failure
+        about = hit.agent if hit else failure.agent if failure else ""
+        return about or next(iter(self.result.spec.arguments), "")
+
     def recording(self) -> Recording:
         """Read the log.
 

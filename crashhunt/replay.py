@@ -44,6 +44,9 @@ class ReplayOptions:
         times: how often.
         trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
             but simulate.
+        until: run so many steps, in a process that has this one's terminal; 0 for all, in one of its own.
+        stop_at: the step in which to drop into the agent's code, with ``until``.
+        to_stderr: where to what the agent prints then goes.
     """
 
     code: Code = "snapshot"
@@ -51,6 +54,9 @@ class ReplayOptions:
     force: bool = False
     times: int = 1
     trusted: bool = True
+    until: int = 0
+    stop_at: int = 0
+    to_stderr: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +92,7 @@ class ReplayReport:
         rerun: what was run.
         verdict: whether it is the same; of several times, the first that was not.
         replayed: the trial that was run now.
-        steps_replayed: how many steps it completed.
+        recording: of it.
         divergence: the first difference.
         around: step, recorded and replayed value of the field that differs, in the steps around.
         reason: why the two cannot be compared.
@@ -96,7 +102,7 @@ class ReplayReport:
     rerun: Rerun
     verdict: Verdict
     replayed: TrialResult
-    steps_replayed: int
+    recording: Recording
     divergence: Divergence | None = None
     around: tuple[tuple[int, Any, Any], ...] = ()
     reason: str = ""
@@ -106,6 +112,11 @@ class ReplayReport:
     def bundle(self) -> Bundle:
         """The crash."""
         return self.rerun.bundle
+
+    @property
+    def steps_replayed(self) -> int:
+        """How many steps it completed."""
+        return self.recording.steps
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``replay --json`` prints."""
@@ -143,6 +154,8 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
     if options.times < 1:
         raise UsageError(f"--times is {options.times}", fix="give at least 1")
     rerun = prepare(bundle, options)
+    if options.until:
+        return _look_into(rerun, options)
     reports = [_run(rerun) for _ in range(options.times)]
     shown = next((report for report in reports if report.verdict != "reproduced"), reports[0])
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
@@ -232,17 +245,39 @@ def _run(rerun: Rerun) -> ReplayReport:
             raise _not_set_up(rerun, message) from error
     recorded = rerun.recorded
     if rerun.code == "log":
-        recorded, replayed = _driven_part(recorded), _driven_part(replayed)
+        return _report(rerun, _up_to(recorded, recorded.steps), _up_to(replayed, replayed.steps), result)
+    return _report(rerun, recorded, replayed, result)
+
+
+def _look_into(rerun: Rerun, options: ReplayOptions) -> ReplayReport:
+    """Run the first steps with the terminal at hand, and compare them with those of the log."""
+    from crashhunt.debugger import debug
+
+    result, replayed = debug(
+        rerun, until=options.until, stop_at=options.stop_at, agent=rerun.bundle.driver, to_stderr=options.to_stderr
+    )
+    if result.outcome is Outcome.INVALID:
+        raise _not_set_up(rerun, result.failure.message if result.failure else "it left no recording")
+    recorded = rerun.recorded
+    if options.until <= recorded.steps:
+        recorded, replayed = _up_to(recorded, options.until), _up_to(replayed, options.until)
+    report = _report(rerun, recorded, replayed, result, whole=options.until > recorded.steps)
+    return replace(report, verdicts={report.verdict: 1})
+
+
+def _report(
+    rerun: Rerun, recorded: Recording, replayed: Recording, result: TrialResult, *, whole: bool = True
+) -> ReplayReport:
     divergence = first_divergence(recorded, replayed)
-    if divergence is None and rerun.code != "log":
+    if divergence is None and rerun.code != "log" and whole:
         divergence = _outcome_divergence(rerun.bundle.result, result)
-    verdict, reason = _judge(rerun, replayed, result, divergence)
+    verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
     around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
-    return ReplayReport(rerun, verdict, result, replayed.steps, divergence, around, reason)
+    return ReplayReport(rerun, verdict, result, replayed, divergence, around, reason)
 
 
 def _judge(
-    rerun: Rerun, replayed: Recording, result: TrialResult, divergence: Divergence | None
+    rerun: Rerun, replayed: Recording, result: TrialResult, divergence: Divergence | None, *, whole: bool
 ) -> tuple[Verdict, str]:
     if divergence is None:
         return "reproduced", ""
@@ -253,9 +288,11 @@ def _judge(
     for name in _SIMULATORS.get(rerun.worker.scenario.simulator, ()):
         if name in changed:
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
-    if rerun.code != "current" and not rerun.edits:
-        return "diverged", ""
-    return ("changed" if result.outcome in rerun.worker.crash_on else "fixed"), ""
+    crashed = result.outcome in rerun.worker.crash_on
+    # Whoever stopped before the crash does not know whether it would have come.
+    if (rerun.code == "current" or rerun.edits) and (whole or crashed):
+        return ("changed" if crashed else "fixed"), ""
+    return "diverged", ""
 
 
 def _prologue_change(was: Any, now: Any) -> str:
@@ -286,7 +323,7 @@ def _outcome_divergence(was: TrialResult, now: TrialResult) -> Divergence | None
     return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
 
 
-def _driven_part(recording: Recording) -> Recording:
-    """The recording up to its last complete step: what recorded actions can bring back."""
-    last = next((n for n in range(len(recording.records) - 1, -1, -1) if recording.records[n].tag == Tag.STEP), None)
-    return recording if last is None else Recording(recording.records[: last + 1])
+def _up_to(recording: Recording, step: int) -> Recording:
+    """The recording to the end of a step. What recorded actions can bring back ends with its last complete one."""
+    ends = [number for number, record in enumerate(recording.records) if record.tag == Tag.STEP]
+    return recording if step >= len(ends) else Recording(recording.records[: ends[step] + 1])

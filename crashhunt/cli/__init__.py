@@ -31,6 +31,10 @@ examples:
       hunt your own agent on your own network
   crashhunt replay crash
       run the crash again in a fresh process and prove that it is the same
+  crashhunt replay crash --code current --expect fixed
+      has today's code got rid of it?
+  crashhunt show crash
+      what happened, in words and numbers
 
 exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid trial, 130 interrupted
 """

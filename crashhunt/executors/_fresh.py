@@ -14,16 +14,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from crashhunt.errors import CrashhuntError
+from crashhunt.executors._parts import require_origin
 from crashhunt.executors._protocol import WorkerSettings
 from crashhunt.executors._remains import died, hung, where_it_is
-from crashhunt.executors._worker import Worker, require_origin, worker_environment
+from crashhunt.executors._worker import Worker, worker_environment
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["FreshProcessExecutor"]
+__all__ = ["FreshProcessExecutor", "fresh_environment"]
 
 _LOOK_EVERY_S = 0.01
 _LAST_WORDS_S = 0.2
@@ -86,18 +87,13 @@ class FreshProcessExecutor:
             answer = self._settings.scratch / f"answer-{spec.number:06d}.json"
             answer.unlink(missing_ok=True)
             job = {"settings": self._settings.to_json(), "spec": spec.to_json(), "answer": str(answer)}
-            environment = {**os.environ, **worker_environment()}
-            if self._settings.code:
-                # Before anything is imported, so that crashhunt itself comes from there too, where it is there.
-                before = environment.get("PYTHONPATH")
-                environment["PYTHONPATH"] = os.pathsep.join(filter(None, (*self._settings.code, before)))
             with (self._settings.scratch / f"start-{spec.number:06d}.log").open("wb") as log:
                 process = subprocess.Popen(
                     [sys.executable, "-P", "-m", "crashhunt.executors._fresh"],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
-                    env=environment,
+                    env=fresh_environment(self._settings),
                     start_new_session=True,
                 )
             assert process.stdin is not None
@@ -138,6 +134,12 @@ class FreshProcessExecutor:
         if "error" in answer:
             raise CrashhuntError(**answer["error"])
         return TrialResult.from_json(answer["result"])
+
+
+def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
+    """Return the environment of a fresh process, in which crashhunt itself comes from the snapshot too."""
+    paths = os.pathsep.join(filter(None, (*settings.code, os.environ.get("PYTHONPATH"))))
+    return {**os.environ, **worker_environment(), **({"PYTHONPATH": paths} if paths else {})}
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

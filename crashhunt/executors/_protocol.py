@@ -61,7 +61,7 @@ class WorkerSettings:
             crash_on=tuple(Outcome(name) for name in data["crash_on"]),
             scratch=Path(data["scratch"]),
             code=tuple(data["code"]),
-            argument_files=data["argument_files"],
+            argument_files=data.get("argument_files", {}),
             timeout_s=data["timeout_s"],
             keep_trials=data["keep_trials"],
         )

@@ -14,22 +14,18 @@ import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.episode import run_episode
-from crashhunt.errors import CrashhuntError
+from crashhunt.executors._parts import Parts
 from crashhunt.executors._protocol import WorkerSettings, scratch_of
-from crashhunt.plugins import locate, signature_of
 from crashhunt.recording import BlackBox
 from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pathlib import Path
 
-    from crashhunt.agents import Agent
-    from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, TrialSpec
 
@@ -41,7 +37,6 @@ __all__ = [
     "Worker",
     "read_map",
     "read_tail",
-    "require_origin",
     "worker_environment",
 ]
 
@@ -76,7 +71,6 @@ class Worker:
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
         self._simulator: Simulator | None = None
-        self._factories: dict[str, Any] = {}
         self._box: BlackBox | None = None
         self._folder: Path | None = None
         self._fresh = 0
@@ -85,14 +79,11 @@ class Worker:
         # even while the simulator does not return to Python.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        if settings.code:
-            # What the snapshot does not have may come from where the hunt was started, as it did then.
-            sys.path[:0] = [*settings.code, str(Path.cwd())]
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
-        self._oracles: list[Oracle] = [locate("oracles", name)() for name in settings.oracles]
+        self._parts = Parts(settings)
         gc.freeze()  # what is loaded by now is never garbage
 
     def run(self, spec: TrialSpec) -> TrialResult:
@@ -105,15 +96,15 @@ class Worker:
         began = time.monotonic()
         simulator = self._simulator
         if simulator is None:
-            simulator = self._simulator = self._make_simulator()
+            simulator = self._simulator = self._parts.simulator()
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
         faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         result = run_episode(
             spec,
             simulator=simulator,
-            make_agent=self._make_agent,
+            make_agent=self._parts.agent,
             box=box,
-            oracles=self._oracles,
+            oracles=self._parts.oracles,
             crash_on=self._settings.crash_on,
         )
         faulthandler.cancel_dump_traceback_later()
@@ -128,13 +119,6 @@ class Worker:
             if result.failure is not None and result.failure.traceback:
                 (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return result
-
-    def _make_simulator(self) -> Simulator:
-        stage = self._settings.scratch / f"stage-{os.getpid()}"
-        stage.mkdir(exist_ok=True)
-        factory = locate("simulators", self._settings.scenario.simulator)
-        made: Simulator = factory(self._settings.scenario, stage)
-        return made
 
     def _draw_map(self, simulator: Simulator) -> None:
         """Write the map down, once for all workers, so that whoever keeps a trial can show it."""
@@ -174,27 +158,6 @@ class Worker:
         self._folder = folder
         return self._box, folder
 
-    def _make_agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
-        found = self._factories.get(agent)
-        if found is None:
-            locator = self._settings.scenario.agents[agent].agent
-            factory = locate("agents", locator)
-            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
-                require_origin(factory.__module__, self._settings.code)
-            found = self._factories[agent] = factory, signature_of(factory).spaces
-        factory, wanted = found
-        spaces: dict[str, Any] = {}
-        if "observation_space" in wanted:
-            spaces["observation_space"] = simulator.observation_spaces[agent]
-        if "action_space" in wanted:
-            spaces["action_space"] = simulator.actions[agent].space
-        files = self._settings.argument_files
-        values = {
-            name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
-        }
-        made: Agent = factory(**values, **spaces)
-        return made
-
 
 def read_map(scratch: Path) -> list[Lane]:
     """Return the map that the workers of a hunt have written down; nothing where none has."""
@@ -214,21 +177,6 @@ def read_tail(path: Path) -> str:
             return file.read().decode("utf-8", "replace")
     except OSError:
         return ""
-
-
-def require_origin(module: str, code: tuple[str, ...]) -> None:
-    """See that a module comes from the snapshot, if it is there at all, and not from where it is developed."""
-    top = module.partition(".")[0]
-    file = getattr(sys.modules[module], "__file__", None)
-    for folder in code:
-        if (Path(folder) / top).is_dir() or (Path(folder) / f"{top}.py").is_file():
-            if file is not None and not Path(file).resolve().is_relative_to(folder):
-                raise CrashhuntError(
-                    f"the module {module!r} was imported from {file}, not from the snapshot",
-                    fix="remove it from PYTHONPATH and from start-up files such as sitecustomize",
-                    where=folder,
-                )
-            return
 
 
 def _die_with_parent() -> None:

@@ -3,5 +3,15 @@
 from crashhunt.report._screen import Watcher, format_arguments, format_seconds
 from crashhunt.report._show import Story
 from crashhunt.report._summary import describe_hunt, describe_replay
+from crashhunt.report._table import format_table, steps_table
 
-__all__ = ["Story", "Watcher", "describe_hunt", "describe_replay", "format_arguments", "format_seconds"]
+__all__ = [
+    "Story",
+    "Watcher",
+    "describe_hunt",
+    "describe_replay",
+    "format_arguments",
+    "format_seconds",
+    "format_table",
+    "steps_table",
+]

@@ -43,9 +43,8 @@ class Story:
         self.recording = bundle.recording()
         self._last_s = last_s
         self._braking = braking
-        hit, failure = bundle.result.collision, bundle.result.failure
-        agents = self.recording.agents
-        self.agent = (hit.agent if hit else failure.agent if failure else "") or (agents[0] if agents else "")
+        hit = bundle.result.collision
+        self.agent = bundle.driver
         self.other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.escape = (

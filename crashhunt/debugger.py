@@ -1,0 +1,148 @@
+"""A replay to look into: up to a step, with the terminal free for a debugger inside the agent."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import os
+import pdb
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.episode import run_episode
+from crashhunt.errors import CrashhuntError
+from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment
+from crashhunt.recording import BlackBox, Recording, read_black_box
+from crashhunt.trial import TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.agents import Agent
+    from crashhunt.replay import Rerun
+    from crashhunt.simulators import Simulator
+
+__all__ = ["debug"]
+
+_LEFT = 77  # exit code
+
+
+def debug(
+    rerun: Rerun, *, until: int, stop_at: int = 0, agent: str = "", to_stderr: bool = False
+) -> tuple[TrialResult, Recording]:
+    """Run the first steps of a crash in a fresh process that has this one's terminal.
+
+    Breakpoints in the agent's code work there, and what it prints is seen at once.
+
+    Args:
+        rerun: the crash.
+        until: how many steps.
+        stop_at: the step in which to drop into the agent's ``act``; 0 for none.
+        agent: whose.
+        to_stderr: whether what it prints goes there.
+
+    Raises:
+        CrashhuntError: it could not be run.
+        KeyboardInterrupt: the debugger was left.
+    """
+    with tempfile.TemporaryDirectory(prefix="crashhunt-debug-") as folder:
+        scratch = Path(folder)
+        settings = replace(rerun.worker, scratch=scratch)
+        job = {
+            "settings": settings.to_json(),
+            "spec": replace(rerun.spec, max_steps=until).to_json(),
+            "stop_at": stop_at,
+            "agent": agent,
+        }
+        (scratch / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        command = [sys.executable, "-P", "-m", "crashhunt.debugger", folder]
+        done = subprocess.run(command, env=fresh_environment(settings), stdout=2 if to_stderr else None, check=False)
+        if done.returncode == _LEFT:
+            raise KeyboardInterrupt
+        try:
+            answer = json.loads((scratch / "answer.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            ended = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+            raise CrashhuntError(
+                f"the replay ended before its last step, with {ended}", where=rerun.bundle.id
+            ) from None
+        if "error" in answer:
+            raise CrashhuntError(**answer["error"])
+        return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / BLACK_BOX))
+
+
+class _Watched:
+    """An agent that is looked into at one step.
+
+    Args:
+        agent: who drives.
+        name: of the vehicle.
+        step: the step in which to stop.
+        simulator: for the scene.
+    """
+
+    def __init__(self, agent: Agent, name: str, step: int, simulator: Simulator) -> None:
+        self._agent = agent
+        self._name = name
+        self._stop_at = step
+        self._simulator = simulator
+        self._step = 0
+
+    def reset(self, seed: int) -> None:
+        self._step = 0
+        self._agent.reset(seed)
+
+    def act(self, observation: Any) -> Any:
+        self._step += 1
+        if self._step != self._stop_at:
+            return self._agent.act(observation)
+        # At hand in the debugger, whatever the agent calls its own.
+        for name, value in (
+            ("agent", self._agent), ("observation", observation), ("scene", self._simulator.scene()),
+            ("step", self._step),
+        ):  # fmt: skip
+            setattr(builtins, name, value)
+        print(f"step {self._step}, {self._name}: at hand are agent, observation, scene and step", flush=True)
+        return _Debugger().runcall(self._agent.act, observation)
+
+
+class _Debugger(pdb.Pdb):
+    def set_quit(self) -> None:
+        """Leave the process: whoever quits does not want a verdict."""
+        print(flush=True)
+        os._exit(_LEFT)
+
+
+def _main(folder: Path) -> None:
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
+    try:
+        parts = Parts(settings)
+
+        def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+            made = parts.agent(name, simulator, arguments)
+            return _Watched(made, name, job["stop_at"], simulator) if name == job["agent"] else made
+
+        box = BlackBox(folder / BLACK_BOX)
+        box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
+        result = run_episode(
+            spec,
+            simulator=parts.simulator(),
+            make_agent=make_agent,
+            box=box,
+            oracles=parts.oracles,
+            crash_on=settings.crash_on,
+        )
+        answer = {"result": result.to_json()}
+    except CrashhuntError as error:
+        answer = error.to_json()
+    (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))

@@ -1,0 +1,84 @@
+"""What a trial is put together from: simulator, agents and oracles, as the settings name them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import CrashhuntError
+from crashhunt.plugins import locate, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.agents import Agent
+    from crashhunt.executors._protocol import WorkerSettings
+    from crashhunt.oracles import Oracle
+    from crashhunt.simulators import Simulator
+
+__all__ = ["Parts", "require_origin"]
+
+
+class Parts:
+    """Makes the parts of trials in this process, from the code that the settings name.
+
+    Args:
+        settings: of the hunt.
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._settings = settings
+        self._factories: dict[str, Any] = {}
+        if settings.code:
+            # What the snapshot does not have may come from where the hunt was started, as it did then.
+            sys.path[:0] = [*settings.code, str(Path.cwd())]
+        self.oracles: list[Oracle] = [locate("oracles", name)() for name in settings.oracles]
+
+    def simulator(self) -> Simulator:
+        """Make a simulator, with a folder for files of its own."""
+        stage = self._settings.scratch / f"stage-{os.getpid()}"
+        stage.mkdir(exist_ok=True)
+        made: Simulator = locate("simulators", self._settings.scenario.simulator)(self._settings.scenario, stage)
+        return made
+
+    def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+        """Make the agent of a vehicle; files that its arguments name come from the snapshot.
+
+        Raises:
+            CrashhuntError: its module comes from elsewhere than the snapshot that has it.
+        """
+        found = self._factories.get(agent)
+        if found is None:
+            factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
+                require_origin(factory.__module__, self._settings.code)
+            found = self._factories[agent] = factory, signature_of(factory).spaces
+        factory, wanted = found
+        spaces: dict[str, Any] = {}
+        if "observation_space" in wanted:
+            spaces["observation_space"] = simulator.observation_spaces[agent]
+        if "action_space" in wanted:
+            spaces["action_space"] = simulator.actions[agent].space
+        files = self._settings.argument_files
+        values = {
+            name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
+        }
+        made: Agent = factory(**values, **spaces)
+        return made
+
+
+def require_origin(module: str, code: tuple[str, ...]) -> None:
+    """See that a module comes from the snapshot, if it is there at all, and not from where it is developed."""
+    top = module.partition(".")[0]
+    file = getattr(sys.modules[module], "__file__", None)
+    for folder in code:
+        if (Path(folder) / top).is_dir() or (Path(folder) / f"{top}.py").is_file():
+            if file is not None and not Path(file).resolve().is_relative_to(folder):
+                raise CrashhuntError(
+                    f"the module {module!r} was imported from {file}, not from the snapshot",
+                    fix="remove it from PYTHONPATH and from start-up files such as sitecustomize",
+                    where=folder,
+                )
+            return

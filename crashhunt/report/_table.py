@@ -1,0 +1,107 @@
+"""Chosen fields of every step of a recording, as a table."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import UsageError
+from crashhunt.oracles import approaches
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.recording import AgentChannel, Recording, StepRecord
+
+__all__ = ["format_table", "steps_table"]
+
+_SCENE = ("x", "y", "heading", "speed")
+_MEASURED = ("time_to_collision_s", "gap_m", "required_deceleration")
+
+
+def steps_table(recording: Recording, fields: Sequence[str], agent: str) -> list[dict[str, Any]]:
+    """Return one row a step: the step, the time and the fields; None where there is no value.
+
+    Args:
+        recording: of the episode.
+        fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
+            ``required_deceleration``, the parts of the action by name, ``observation[ROW,NAME]``; ``action`` for all
+            parts of the action.
+        agent: whose.
+
+    Raises:
+        UsageError: a field does not exist, with those that do.
+    """
+    channel = next(found for found in recording.prologue.agents if found.id == agent)
+    actions = channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
+    observed = _observed(channel)
+    known = [*_SCENE, "reward", *_MEASURED, *actions, *observed]
+    names: list[str] = []
+    for field in fields:
+        name = field.replace(" ", "")
+        if name != "action" and name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {close[0]!r}? " if close else ""
+            shown = ", ".join([*_SCENE, "reward", *_MEASURED, "action", *actions, *list(observed)[:3]])
+            raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint}there are {shown}, …")
+        names += actions if name == "action" else (name,)
+    measured: dict[str, Any] = {}
+    if set(names) & set(_MEASURED):
+        frames = [step.scene.frame for step in recording.all_steps if step.scene is not None]
+        measured = dict(zip(_MEASURED, approaches(frames, agent), strict=True))
+    rows = []
+    for number, step in enumerate(recording.all_steps):
+        row: dict[str, Any] = {"step": step.step, "time_s": step.scene.time_s if step.scene is not None else None}
+        for name in names:
+            if name in _MEASURED:
+                row[name] = float(measured[name][number]) if step.scene is not None else None
+            elif name in actions:
+                array = step.actions.get(agent)
+                row[name] = None if array is None else array.reshape(-1)[actions.index(name)].item()
+            elif name in observed:
+                array = step.observations.get(agent)
+                row[name] = None if array is None else array[observed[name]].item()
+            else:
+                row[name] = _of_scene(step, agent, name)
+        rows.append({name: None if _is_nothing(value) else value for name, value in row.items()})
+    return rows
+
+
+def format_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return rows as aligned lines under a heading."""
+    if not rows:
+        return []
+    cells = [list(rows[0])] + [[_format(value) for value in row.values()] for row in rows]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
+    return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells]
+
+
+def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
+    shape = tuple(channel.observation_shape)
+    if len(shape) == 2:
+        names = channel.observation_names or tuple(map(str, range(shape[1])))
+        return {
+            f"observation[{row},{name}]": (row, column) for row in range(shape[0]) for column, name in enumerate(names)
+        }
+    if len(shape) == 1:
+        return {f"observation[{place}]": (place,) for place in range(shape[0])}
+    return {}
+
+
+def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:
+    if name == "reward":
+        return step.rewards.get(agent)
+    scene = step.scene
+    row = scene.roster.index.get(agent) if scene is not None else None
+    return None if scene is None or row is None else float(scene.data[row, _SCENE.index(name)])
+
+
+def _is_nothing(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
+
+
+def _format(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

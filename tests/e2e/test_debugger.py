@@ -1,0 +1,94 @@
+"""Looking into a replay: stopping, tables, and a debugger inside the agent."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+from conftest import CRASHHUNT
+
+
+@pytest.fixture
+def crash(shell):
+    words = ("--agent", "faulty:Raises", "--arg", "at=30", "--arg", "speed=8", "--set", "vehicles=10", "--seed", "1")
+    shell.crashhunt("run", "h", "1", "1", "60", *words)
+    return shell
+
+
+def typed(shell, text: str, *words: str) -> str:
+    done = subprocess.run(
+        [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.environment, input=text,
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.stdout
+
+
+def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
+    out = typed(crash, "p 'at', step, self.step, observation.shape, len(scene.points) > 3\nc\n", "--pdb")
+    assert "('at', 30, 29, (8, 7), True)" in out  # its own counter has not moved yet
+    assert "code/faulty.py(19)act()" in out
+    assert "reproduced: 29 of 29 steps" in out
+    out = typed(crash, "p 'at', step\nc\n", "--pdb", "--before", "10")
+    assert "('at', 19)" in out
+    assert "reproduced: 19 of 29 steps" in out
+
+
+def test_quitting_the_debugger_is_no_crash_of_ours(crash):
+    done = subprocess.run(
+        [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.environment, input="q\n",
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert "reproduced" not in done.stdout
+
+
+def test_a_breakpoint_in_the_users_code_works(crash):
+    faulty = crash.folder / "faulty.py"
+    faulty.write_text(
+        faulty.read_text().replace("self.step += 1\n", "self.step += 1\n        if self.step == 7: breakpoint()\n", 1)
+    )
+    out = typed(crash, "p 'mine', self.step\nc\n", "--code", "current", "--until", "9")
+    assert "('mine', 7)" in out
+    assert "reproduced: 9 of 29 steps" in out
+
+
+def test_a_stop_compares_what_was_run(crash):
+    done = crash.crashhunt("replay", "h", "--until", "12", "--json").json
+    assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 12)
+    whole = crash.crashhunt("replay", "h", "--until", "50", "--json").json
+    assert (whole["verdict"], whole["steps_replayed"], whole["outcome_replayed"]) == ("reproduced", 29, "agent_error")
+    other = crash.crashhunt("replay", "h", "--until", "12", "--set", "speed=7", "--json", expect=1).json
+    assert (other["verdict"], other["divergence"]["step"]) == ("diverged", 1)  # whether it is fixed is not known
+
+
+def test_fields_are_printed_as_a_table(crash):
+    fields = "x, speed,action,gap_m,reward,observation[0,vx]"
+    done = crash.crashhunt("replay", "h", "--until", "5", "--print", fields, "--json")
+    table = done.json["table"]
+    assert [row["step"] for row in table] == list(range(6))
+    assert table[0]["target_speed"] is None
+    assert all(row["target_speed"] == 8.0 and row["lane_change"] == 0.0 for row in table[1:])
+    # What an agent is shown before a step is how the step before left it.
+    speeds = [row["speed"] for row in table]
+    assert [row["observation[0,vx]"] for row in table[1:]] == pytest.approx(speeds[:-1], rel=1e-6)
+    heading, *rows = done.err.splitlines()[:7]
+    assert heading.split() == [
+        "step", "time_s", "x", "speed", "target_speed", "lane_change", "gap_m", "reward", "observation[0,vx]"
+    ]  # fmt: skip
+    assert [row.split()[0] for row in rows] == list("012345")
+
+
+def test_mistakes_are_one_line(crash):
+    for words, says in (
+        (("--until", "0"), "--until"),
+        (("--before", "29"), "--before"),
+        (("--before", "-1"), "--before"),
+        (("--until", "3", "--before", "3"), "--before"),
+        (("--print", "sped"), "did you mean 'speed'"),
+        (("--pdb", "--json"), "--json"),
+    ):
+        refused = crash.crashhunt("replay", "h", *words, expect=2)
+        assert says in refused.err
+        assert len(refused.err.strip().splitlines()) == 1
