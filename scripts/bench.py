@@ -355,6 +355,74 @@ def bench_stop() -> Iterator[Figure]:
     yield Figure("crash_to_saved_s", statistics.median(seconds), "s", "lower", 1.0, note)
 
 
+def bench_report() -> Iterator[Figure]:
+    """How long the page takes to draw a step, with 200 actors and 3,000 steps, in a real browser."""
+    program, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if program is None or driver is None:
+        print("scripts/bench: report needs chromium and chromedriver, and is left out", file=sys.stderr)
+        return
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    with folder() as place:
+        hunt(place / "h", 1, 1, 1, "--scenario", str(_toy(place)), "--crash-on", "hang")
+        _large_bundle(place / "h", actors=200, steps=3000)
+        subprocess.run([CRASHHUNT, "report", place / "h"], check=True, stdout=subprocess.DEVNULL)
+        options = webdriver.ChromeOptions()
+        options.binary_location = program
+        for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,1600"):
+            options.add_argument(word)
+        browser = webdriver.Chrome(options=options, service=Service(driver))
+        try:
+            browser.get((place / "h" / "report.html").as_uri())
+            time.sleep(3)
+            drawn = browser.execute_script(
+                "const began = performance.now();"
+                "for (let n = 0; n < 300; n++) { go(n * 7); "
+                "document.getElementById('scene').getContext('2d').getImageData(0, 0, 1, 1); }"
+                "return (performance.now() - began) / 300;"
+            )
+        finally:
+            browser.quit()
+        size = (place / "h" / "report.html").stat().st_size / 2**20
+    note = f"200 actors, 3,000 steps, without a GPU; the page has {size:.0f} MiB"
+    yield Figure("report_draw_ms", drawn, "ms", "lower", 16.7, note)
+
+
+def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
+    """A made-up crash with so many actors and steps."""
+    import numpy as np
+
+    from crashhunt.bundle import write_bundle
+    from crashhunt.executors import BLACK_BOX
+    from crashhunt.recording import AgentChannel, BlackBox, Prologue, Tag, digest_of, encode_actors
+    from crashhunt.scene import Actor, Roster, Scene
+    from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+
+    scratch = directory / "scratch"
+    scratch.mkdir()
+    box = BlackBox(scratch / BLACK_BOX)
+    box.begin(pid=1, trial=0, started=0.0)
+    box.prologue(Prologue((AgentChannel("ego", "<f4", (1,), "<f8", (1,), ("speed",)),), 0.1).encode(), 1)
+    roster = Roster(tuple(Actor(f"car {n}" if n else "ego", "passenger", 4.5, 1.8) for n in range(actors)))
+    box.append(Tag.ACTORS, 0, encode_actors(roster.actors))
+    box.append(Tag.ROSTER, 0, np.arange(actors, dtype="<u4").tobytes())
+    rng = np.random.default_rng(0)
+    place, speeds = rng.uniform(-100, 100, (actors, 2)), rng.uniform(5, 20, actors)
+    for step in range(steps + 1):
+        if step:
+            box.observation(0, np.zeros(1, "<f4"))
+            box.action(0, np.ones(1))
+        points = [(float(x + speed * step / 10), float(y)) for (x, y), speed in zip(place, speeds, strict=True)]
+        box.step(step, Scene(step / 10, roster, points, [0.0] * actors, speeds.tolist()), (0.0,))
+    collision = Collision("ego", "collider", "ego", "car 1", ("overlap",))
+    spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps)
+    digest = digest_of(box.committed())
+    result = TrialResult(spec, Outcome.COLLISION, steps=steps, digest=digest, collision=collision)
+    snapshot = next((directory / "snapshots").iterdir()).name
+    write_bundle(directory, result, scratch, hunt_seed=0, snapshot=snapshot, lanes=[])
+
+
 def _toy(place: Path) -> Path:
     scenario = place / "toy"
     scenario.mkdir(exist_ok=True)
@@ -374,6 +442,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "memory": bench_memory,
     "bundle": bench_bundle,
     "stop": bench_stop,
+    "report": bench_report,
 }
 
 

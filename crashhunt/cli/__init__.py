@@ -13,6 +13,7 @@ from crashhunt.cli._common import Parser
 from crashhunt.cli._export import add_export
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._replay import add_replay
+from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
 from crashhunt.errors import CrashhuntError
@@ -66,6 +67,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (add_run, add_replay, add_show, add_export, add_lists):
+    for add in (add_run, add_replay, add_show, add_report, add_export, add_lists):
         add(commands)
     return parser

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
 
-__all__ = ["Parser", "add_crash", "add_json", "integer", "opened_crash", "pairs", "say"]
+__all__ = ["Parser", "add_crash", "add_json", "integer", "opened_crash", "opened_hunt", "pairs", "say"]
 
 
 class Parser(argparse.ArgumentParser):
@@ -60,6 +60,26 @@ def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive 
 
     with open_archive(directory) as archive:
         yield find_bundle(archive.directory, crash), archive
+
+
+@contextmanager
+def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield the directory of a hunt, and whether it was exported into a file and is only unpacked for so long.
+
+    Raises:
+        HuntDirectoryError: it is not the directory of a hunt.
+    """
+    if directory.is_file():
+        from crashhunt.archive import open_archive
+
+        with open_archive(directory) as archive:
+            yield archive.directory, True
+        return
+    from crashhunt.settings import read_settings
+
+    hunt = directory.resolve().parent.parent if (directory / "crash.json").is_file() else directory
+    read_settings(hunt / "hunt.toml")  # refuses what is no hunt
+    yield hunt, False
 
 
 def say(text: str, *, as_json: bool) -> None:

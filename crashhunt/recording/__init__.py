@@ -19,7 +19,7 @@ from crashhunt.recording._recording import (
 
 if TYPE_CHECKING:
     from crashhunt.recording._log import read_log, write_log
-    from crashhunt.recording._views import foxglove_layout
+    from crashhunt.recording._views import foxglove_layout, read_lanes
 
 __all__ = [
     "AgentChannel",
@@ -39,6 +39,7 @@ __all__ = [
     "foxglove_layout",
     "read_black_box",
     "read_header",
+    "read_lanes",
     "read_log",
     "values_around",
     "write_log",
@@ -50,8 +51,8 @@ def __getattr__(name: str) -> Any:
         from crashhunt.recording import _log
 
         return getattr(_log, name)
-    if name == "foxglove_layout":
-        from crashhunt.recording._views import foxglove_layout
+    if name in ("foxglove_layout", "read_lanes"):
+        from crashhunt.recording import _views
 
-        return foxglove_layout
+        return getattr(_views, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

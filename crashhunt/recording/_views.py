@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,19 +14,26 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import DecodeError
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
 
+from crashhunt.errors import BundleError
 from crashhunt.oracles import approaches
 from crashhunt.recording import _schemas as schemas
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from crashhunt.recording._log import LogWriter
     from crashhunt.recording._recording import Recording
     from crashhunt.scene import Actor, Lane, Scene
     from crashhunt.trial import TrialResult
 
-__all__ = ["foxglove_layout", "write_views"]
+__all__ = ["foxglove_layout", "read_lanes", "write_views"]
 
 _MAP_REACH_M = 300.0
 _HEIGHT_M = 1.5
@@ -121,6 +129,29 @@ def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], la
             for x, y in _shifted(shape, side * lane.width).tolist():
                 line.points.add(x=x, y=y)
     log.write("/map", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), to_ns(scenes[0].time_s))
+
+
+def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the lanes that a log shows: the right and the left border of each, shape (n, 2), in m.
+
+    Raises:
+        BundleError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            for _, _, message in SeekingReader(file).iter_messages(["/map"]):
+                update = SceneUpdate.FromString(message.data)
+                lines = [
+                    np.array([(point.x, point.y) for point in line.points]).reshape(-1, 2)
+                    for entity in update.entities
+                    for line in entity.lines
+                ]
+                return list(zip(lines[0::2], lines[1::2], strict=True))
+    except OSError as error:
+        raise BundleError(f"cannot be read: {error.strerror}", where=str(path)) from None
+    except (McapError, DecodeError, ValueError, EOFError, struct.error) as error:
+        raise BundleError(f"its map is damaged: {error}", fix="get an undamaged copy", where=str(path)) from None
+    return []
 
 
 def _shifted(shape: Any, distance: float) -> Any:

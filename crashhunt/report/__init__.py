@@ -1,5 +1,6 @@
 """Reports: what people are told."""
 
+from crashhunt.report._page import report_data, write_report
 from crashhunt.report._screen import Watcher, format_arguments, format_seconds
 from crashhunt.report._show import Story
 from crashhunt.report._summary import describe_hunt, describe_replay
@@ -13,5 +14,7 @@ __all__ = [
     "format_arguments",
     "format_seconds",
     "format_table",
+    "report_data",
     "steps_table",
+    "write_report",
 ]

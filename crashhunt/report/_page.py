@@ -1,0 +1,204 @@
+"""The report: one HTML file that shows a hunt and animates its crashes, with no network and no other file."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import os
+import zlib
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt import __version__
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.ledger import Ledger
+from crashhunt.oracles import approaches
+from crashhunt.recording import read_lanes
+from crashhunt.report._screen import format_arguments
+from crashhunt.report._show import Story
+from crashhunt.settings import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.bundle import Bundle
+    from crashhunt.recording import Recording
+
+__all__ = ["report_data", "write_report"]
+
+_DOTS = 4000  # trials in a plot; more cannot be told apart
+
+
+def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, name: str = "") -> int:
+    """Write the report of a hunt, all of it or nothing.
+
+    Args:
+        directory: of the hunt; its ledger may be missing, as in an exported crash.
+        bundles: the crashes to animate.
+        target: the file; one that is there is replaced.
+        name: of the hunt, for the title; its directory's by default.
+
+    Returns:
+        Its size in bytes.
+
+    Raises:
+        BundleError: a crash is damaged.
+        HuntDirectoryError: the file cannot be written.
+    """
+    data = report_data(directory, bundles, name=name or directory.resolve().name)
+    page = resources.files("crashhunt.report").joinpath("page.html").read_text(encoding="utf-8")
+    # Inside a script element, only "</" and "<!--" mean something to HTML.
+    text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
+    temporary = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise HuntDirectoryError(
+            f"the report cannot be written: {error.strerror}", fix="choose another file", where=str(target)
+        ) from error
+    return target.stat().st_size
+
+
+def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str) -> dict[str, Any]:
+    """Return everything that the page shows."""
+    settings = read_settings(directory / "hunt.toml")
+    return {
+        "version": __version__,
+        "name": name,
+        "scenario": settings.scenario,
+        "agents": {agent: chosen.agent for agent, chosen in settings.agents.items()},
+        "seed": settings.seed,
+        "planned": settings.trials,
+        **_trials(directory),
+        "crashes": [_crash(bundle) for bundle in bundles],
+    }
+
+
+def _trials(directory: Path) -> dict[str, Any]:
+    """Outcomes, and what was tried against how it went."""
+    path = directory / "ledger.sqlite"
+    if not path.exists():
+        return {"outcomes": {}, "steps": 0, "trials": [], "thinned": False}
+    ledger = Ledger(path)
+    try:
+        outcomes = ledger.outcomes()
+        total = sum(outcomes.values())
+        every = max(1, math.ceil(total / _DOTS))
+        trials = []
+        for number, result in enumerate(ledger.results()):
+            if number % every == 0 or result.outcome.category != "no crash":
+                values = {
+                    f"{agent}.{name}" if len(result.spec.arguments) > 1 else name: value
+                    for agent, given in result.spec.arguments.items()
+                    for name, value in given.items()
+                }
+                time_s = result.closest.time_to_collision_s
+                trials.append(
+                    {
+                        "number": result.spec.number,
+                        "outcome": str(result.outcome),
+                        "category": result.outcome.category,
+                        "values": {**values, **result.spec.scenario_arguments},
+                        "ttc": round(time_s, 3) if math.isfinite(time_s) else None,
+                    }
+                )
+        return {"outcomes": outcomes, "steps": ledger.steps_total(), "trials": trials, "thinned": every > 1}
+    finally:
+        ledger.close()
+
+
+def _crash(bundle: Bundle) -> dict[str, Any]:
+    story = Story(bundle)
+    recording, result = story.recording, bundle.result
+    return {
+        "id": bundle.id,
+        "summary": result.summary,
+        "outcome": str(result.outcome),
+        "category": result.outcome.category,
+        "words": story.words(),
+        "arguments": format_arguments(result),
+        "facts": {
+            "trial": str(result.spec.number),
+            "seed": str(result.spec.seed),
+            "steps": str(result.steps),
+            "simulation time": f"{result.sim_time_s:.1f} s",
+            "digest": result.digest,
+            "snapshot": bundle.snapshot,
+            "confirmed": {True: "yes, to the bit", False: "no: flaky", None: "not tried"}[bundle.confirmed],
+        },
+        "escape": story.escape,
+        "agent": story.agent,
+        "other": story.other,
+        "agents": list(recording.agents),
+        "dt": recording.prologue.step_length_s,
+        **_scenes(recording, story.agent),
+        "lanes": _lanes(bundle, recording),
+    }
+
+
+def _scenes(recording: Recording, agent: str) -> dict[str, Any]:
+    """All scenes as columns: float32, shape (steps, actors, 4), x and y from the first position of the agent."""
+    scenes = recording.scenes()
+    names: dict[str, Any] = {}
+    for scene in scenes:
+        for actor in scene.roster.actors:
+            names.setdefault(actor.id, actor)
+    place = {name: number for number, name in enumerate(names)}
+    table = np.full((len(scenes), len(names), 4), np.nan)
+    for number, scene in enumerate(scenes):
+        table[number, [place[actor.id] for actor in scene.roster.actors]] = scene.data
+    origin = _origin(recording)
+    table[:, :, :2] -= origin
+    times, gaps, _ = approaches([scene.frame for scene in scenes], agent)
+    actions = np.full((len(scenes), 0), np.nan)
+    channel = next((found for found in recording.prologue.agents if found.id == agent), None)
+    action_names: list[str] = []
+    if channel is not None:
+        size = math.prod(channel.action_shape)
+        action_names = list(channel.action_names) or [f"action[{n}]" for n in range(size)]
+        actions = np.full((len(scenes), size), np.nan)
+        for number, step in enumerate(step for step in recording.all_steps if step.scene is not None):
+            if agent in step.actions:
+                actions[number] = step.actions[agent].reshape(-1)
+    return {
+        "origin": origin.tolist(),
+        "time0": scenes[0].time_s if scenes else 0.0,
+        "actors": [[actor.id, actor.kind, actor.length, actor.width] for actor in names.values()],
+        "steps": len(scenes),
+        "table": _packed(table),
+        "ttc": _packed(times),
+        "gap": _packed(gaps),
+        "actionNames": action_names,
+        "actions": _packed(actions),
+    }
+
+
+def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:
+    origin = _origin(recording)
+    return [
+        [_packed(right - origin), _packed(left - origin)]
+        for right, left in read_lanes(bundle.path / "log.mcap")
+        if len(right) > 1
+    ]
+
+
+def _origin(recording: Recording) -> NDArray[np.float64]:
+    scenes = recording.scenes()
+    for scene in scenes[:1]:
+        for agent in recording.agents:
+            if agent in scene.roster.index:
+                return np.round(np.array(scene.points[scene.roster.index[agent]]))
+    return np.zeros(2)
+
+
+def _packed(array: NDArray[np.float64]) -> str:
+    """Little-endian float32, deflated, base64."""
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, "<f4").tobytes(), 6)).decode("ascii")

@@ -1,0 +1,201 @@
+"""The report in a real browser, from ``file://``."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from crashhunt.bundle import list_bundles
+
+selenium = pytest.importorskip("selenium")
+from selenium import webdriver  # noqa: E402
+from selenium.webdriver.chrome.service import Service  # noqa: E402
+from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    driver = shutil.which("chromedriver")
+    if program is None or driver is None:
+        if os.environ.get("CRASHHUNT_TEST_BROWSER") == "required":
+            pytest.fail("chromium and chromedriver are required and not there")
+        pytest.skip("chromium and chromedriver are not installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for word in (
+        "headless=new", "no-sandbox", "disable-gpu", "no-first-run", "disable-background-networking",
+        "disable-component-update", "disable-sync", "window-size=1280,2200", "disable-dev-shm-usage",
+        f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
+    ):  # fmt: skip
+        options.add_argument(f"--{word}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    opened = webdriver.Chrome(options=options, service=Service(driver))
+    yield opened
+    opened.quit()
+
+
+@pytest.fixture
+def hunt(shell):
+    """Five real crashes, in a directory whose name would be markup."""
+    words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
+    shell.crashhunt("run", "<b>bold&", "2", "5", "800", *words)
+    return shell
+
+
+def wait_until(condition, seconds: float = 15.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "the page did not get there"
+        time.sleep(0.02)
+
+
+def opened(browser, path: Path) -> None:
+    browser.get(path.as_uri())
+    wait_until(lambda: browser.execute_script("return crashhuntView.crash !== null"))
+
+
+def step(browser) -> int:
+    return browser.execute_script("return crashhuntView.step")
+
+
+def text(browser, name: str) -> str:
+    return browser.find_element(By.ID, name).text
+
+
+def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
+    done = hunt.crashhunt("report", "<b>bold&", "--json").json
+    opened(browser, hunt.folder / done["file"])
+    bundles = list_bundles(hunt.folder / "<b>bold&")
+    assert text(browser, "title") == "<b>bold&"  # as text, not as markup
+    assert text(browser, "tiles").split("\n")[:4] == ["5 of 5", "trials", str(len(bundles)), "crashes"]
+    assert "collision" in text(browser, "outcomes")
+    listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
+    assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
+    assert [bundle["id"] for bundle in page_data(browser)["crashes"]] == done["crashes"]
+
+    # The scene on the canvas is the one of the log.
+    for number, crash in enumerate(done["crashes"][:2]):
+        listed[number].click()
+        wait_until(lambda crash=crash: text(browser, "summary").startswith(crash))
+        bundle = next(bundle for bundle in bundles if bundle.id == crash)
+        recording = bundle.recording()
+        assert browser.execute_script("return crashhuntView.crash.steps") == recording.steps + 1
+        for at in (0, recording.steps):
+            browser.execute_script(f"go({at})")
+            scene = recording.scene(at)
+            row = scene.roster.index["ego"]
+            shown = browser.execute_script("return state(crashhuntView.step, crashhuntView.agent)")
+            origin = browser.execute_script("return crashhuntView.crash.origin")
+            assert np.array(shown[:2]) + origin == pytest.approx(scene.data[row, :2], abs=1e-3)
+            assert shown[2:] == pytest.approx(scene.data[row, 2:], rel=1e-6)
+        # The ego is in the middle, in its colour.
+        pixel = browser.execute_script(
+            "const c = document.getElementById('scene'), r = window.devicePixelRatio, p = crashhuntView.scale;"
+            "return [...c.getContext('2d').getImageData(c.width / 2 - 1.0 * p * Math.cos(arguments[0]) * r,"
+            "c.height / 2 + 1.0 * p * Math.sin(arguments[0]) * r, 1, 1).data]",
+            float(scene.headings[row]),
+        )
+        assert pixel[:3] == [0xE0, 0x8A, 0x00]
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def page_data(browser):
+    return json.loads(browser.execute_script("return document.getElementById('data').textContent"))
+
+
+def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
+    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
+    opened(browser, hunt.folder / "report.html")
+    body = browser.find_element(By.TAG_NAME, "body")
+    last = browser.execute_script("return crashhuntView.crash.steps") - 1
+    body.send_keys(Keys.HOME)
+    assert step(browser) == 0
+    body.send_keys(Keys.ARROW_RIGHT)
+    body.send_keys(Keys.SHIFT + Keys.ARROW_RIGHT)
+    assert step(browser) == min(11, last)
+    body.send_keys(Keys.NULL, Keys.ARROW_LEFT)
+    assert step(browser) == min(11, last) - 1
+    body.send_keys(Keys.END)
+    assert step(browser) == last
+    assert f"step {last} of {last}" in text(browser, "now")
+    body.send_keys(Keys.HOME)
+    browser.execute_script("document.getElementById('rate').value = '20'")
+    body.send_keys(" ")
+    wait_until(lambda: step(browser) == last and not browser.execute_script("return crashhuntView.playing"))
+    before = browser.execute_script("return crashhuntView.scale")
+    body.send_keys("+")
+    assert browser.execute_script("return crashhuntView.scale") > before
+    follow = browser.find_element(By.ID, "follow")
+    assert follow.get_attribute("aria-pressed") == "true"
+    body.send_keys("f")
+    assert follow.get_attribute("aria-pressed") == "false"
+    browser.execute_script(
+        "const s = document.getElementById('scrub'); s.value = 3; s.dispatchEvent(new Event('input'))"
+    )
+    assert step(browser) == 3
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_light_and_dark_differ_and_can_be_read(hunt, browser, scheme):
+    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+    opened(browser, hunt.folder / "report.html")
+    colors = browser.execute_script(
+        "const s = getComputedStyle(document.body);"
+        "return [s.color, s.backgroundColor].map((c) => c.match(/\\d+/g).slice(0, 3).map(Number))"
+    )
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    bright = [contrast_part(color) for color in colors]
+    assert (bright[1] > 0.5) == (scheme == "light")
+    assert (max(bright) + 0.05) / (min(bright) + 0.05) > 7  # WCAG AAA
+
+
+def contrast_part(color) -> float:
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (value / 255 for value in color)]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_software_faults_exports_and_hunts_without_crashes(shell, browser):
+    shell.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:Raises", "--set", "vehicles=10")
+    shell.crashhunt("export", "h", "one crash.zip")
+    done = shell.crashhunt("report", "one crash.zip", "--json").json
+    assert done["file"] == "one crash.zip.html"
+    opened(browser, shell.folder / done["file"])
+    assert "ValueError: no plan" in text(browser, "words")
+    shell.crashhunt("run", "calm", "1", "2", "50", "--agent", "keep-lane", "--arg", "speed=5", "--crash-on", "hang")
+    shell.crashhunt("report", "calm")
+    browser.get((shell.folder / "calm" / "report.html").as_uri())
+    assert text(browser, "tiles").startswith("2 of 2")
+    assert not browser.find_element(By.ID, "crashes-section").is_displayed()
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_mistakes_are_one_line(hunt):
+    for words in (
+        ("gone",),
+        ("<b>bold&", "-o", "missing/r.html"),
+        ("<b>bold&", "--crashes", "-1"),
+        ("<b>bold&", "--crash", "9"),
+    ):
+        refused = hunt.crashhunt("report", *words, expect=2)
+        assert len(refused.err.strip().splitlines()) == 1
+    assert hunt.crashhunt("report", "<b>bold&", "--crashes", "1", "--json").json["crashes"] == [shortest(hunt)]
+
+
+def shortest(hunt) -> str:
+    bundles = list_bundles(hunt.folder / "<b>bold&")
+    return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number)).id
