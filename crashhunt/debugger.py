@@ -18,10 +18,11 @@ from crashhunt.episode import run_episode
 from crashhunt.errors import CrashhuntError
 from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment
 from crashhunt.recording import BlackBox, Recording, read_black_box
+from crashhunt.render import explanation, labelled, save_panels, scope
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from crashhunt.agents import Agent
     from crashhunt.replay import Rerun
@@ -33,7 +34,13 @@ _LEFT = 77  # exit code
 
 
 def debug(
-    rerun: Rerun, *, until: int, stop_at: int = 0, agent: str = "", to_stderr: bool = False
+    rerun: Rerun,
+    *,
+    until: int,
+    stop_at: int = 0,
+    agent: str = "",
+    to_stderr: bool = False,
+    panels: tuple[int, Path] | None = None,
 ) -> tuple[TrialResult, Recording]:
     """Run the first steps of a crash in a fresh process that has this one's terminal.
 
@@ -45,6 +52,7 @@ def debug(
         stop_at: the step in which to drop into the agent's ``act``; 0 for none.
         agent: whose.
         to_stderr: whether what it prints goes there.
+        panels: the step from which on to draw the agents' panels, and the folder for them.
 
     Raises:
         CrashhuntError: it could not be run.
@@ -58,6 +66,7 @@ def debug(
             "spec": replace(rerun.spec, max_steps=until).to_json(),
             "stop_at": stop_at,
             "agent": agent,
+            "panels": [panels[0], str(panels[1].resolve())] if panels is not None else None,
         }
         (scratch / "job.json").write_text(json.dumps(job), encoding="utf-8")
         command = [sys.executable, "-P", "-m", "crashhunt.debugger", folder]
@@ -111,6 +120,42 @@ class _Watched:
         return _Debugger().runcall(self._agent.act, observation)
 
 
+class _Drawn:
+    """An agent whose panels are drawn after every step.
+
+    Args:
+        agent: who drives.
+        name: of the vehicle.
+        panels: gives them.
+        first: the first step to draw.
+        folder: for the pictures.
+    """
+
+    def __init__(self, agent: Agent, name: str, panels: Callable[[], Any], first: int, folder: Path) -> None:
+        self._agent = agent
+        self._name = name
+        self._first = first
+        self._folder = folder
+        self._panels = panels
+        self._step = 0
+
+    def reset(self, seed: int) -> None:
+        self._step = 0
+        self._agent.reset(seed)
+
+    def act(self, observation: Any) -> Any:
+        self._step += 1
+        action = self._agent.act(observation)
+        if self._step >= self._first:
+            with scope(self._name):
+                try:
+                    panels = labelled(self._panels())
+                except Exception as error:  # a picture that fails is no crash of the agent
+                    panels = labelled({"panels": explanation(error)})
+            save_panels(self._folder, self._step, panels)
+        return action
+
+
 class _Debugger(pdb.Pdb):
     def set_quit(self) -> None:
         """Leave the process: whoever quits does not want a verdict."""
@@ -126,7 +171,12 @@ def _main(folder: Path) -> None:
 
         def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
             made = parts.agent(name, simulator, arguments)
-            return _Watched(made, name, job["stop_at"], simulator) if name == job["agent"] else made
+            shown = getattr(made, "panels", None)
+            if name == job["agent"]:
+                made = _Watched(made, name, job["stop_at"], simulator)
+            if job["panels"] is not None and callable(shown):
+                made = _Drawn(made, name, shown, job["panels"][0], Path(job["panels"][1]))
+            return made
 
         box = BlackBox(folder / BLACK_BOX)
         box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())

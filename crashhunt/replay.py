@@ -47,6 +47,7 @@ class ReplayOptions:
         until: run so many steps, in a process that has this one's terminal; 0 for all, in one of its own.
         stop_at: the step in which to drop into the agent's code, with ``until``.
         to_stderr: where to what the agent prints then goes.
+        panels: the step from which on to draw the agents' panels, and the folder for them, with ``until``.
     """
 
     code: Code = "snapshot"
@@ -57,6 +58,7 @@ class ReplayOptions:
     until: int = 0
     stop_at: int = 0
     to_stderr: bool = False
+    panels: tuple[int, Path] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +256,12 @@ def _look_into(rerun: Rerun, options: ReplayOptions) -> ReplayReport:
     from crashhunt.debugger import debug
 
     result, replayed = debug(
-        rerun, until=options.until, stop_at=options.stop_at, agent=rerun.bundle.driver, to_stderr=options.to_stderr
+        rerun,
+        until=options.until,
+        stop_at=options.stop_at,
+        agent=rerun.bundle.driver,
+        to_stderr=options.to_stderr,
+        panels=options.panels,
     )
     if result.outcome is Outcome.INVALID:
         raise _not_set_up(rerun, result.failure.message if result.failure else "it left no recording")

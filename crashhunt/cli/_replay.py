@@ -8,13 +8,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, pairs, say
+from crashhunt.cli._film import add_film_options, film_options, filmed, recorded_shot, replayed_shot, write_films
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
+    from pathlib import Path
 
+    from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
+    from crashhunt.replay import ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
 
@@ -60,6 +64,7 @@ def add_replay(commands: Any) -> None:
         help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m, "
         "required_deceleration, action or its parts, observation[ROW,NAME]",
     )  # fmt: skip
+    add_film_options(replay)
     replay.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
     replay.add_argument("--force", action="store_true", help="replay even from a snapshot that is damaged")
     add_json(replay)
@@ -67,28 +72,52 @@ def add_replay(commands: Any) -> None:
 
 
 def _replay(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.replay import ReplayOptions, replay
-    from crashhunt.report import describe_replay, format_table, steps_table
-    from crashhunt.settings import read_settings
+    from crashhunt.replay import ReplayOptions
 
     chosen = ReplayOptions(
         code="log" if options.from_log else options.code,
         changes=pairs(options.sets, "--set"),
         force=options.force,
         times=options.times,
+        to_stderr=options.json,
     )
-    with opened_crash(options.directory, options.crash) as (bundle, archive):
-        trusted = archive is None or archive.made_here or options.trust
-        if archive is not None and not trusted and chosen.code != "log":
-            agents = {agent.agent for agent in read_settings(bundle.hunt / "hunt.toml").agents.values()}
-            raise UsageError(
-                f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
-                f"({', '.join(sorted(agents))})",
-                fix="give --trust if you trust whoever gave it to you, or --from-log to run none of it",
-                where=str(options.directory),
-            )
-        until, stop_at = _stops(options, bundle)
-        report = replay(bundle, replace(chosen, trusted=trusted, until=until, stop_at=stop_at, to_stderr=options.json))
+    film = film_options(options)
+    crashes = options.crash.split(",")
+    if len(crashes) > 1 and film is None:
+        raise UsageError(f"--crash {options.crash!r} names several", fix="give one, or make a film of them")
+    answers, shots, good = [], [], True
+    for crash in crashes:
+        with opened_crash(options.directory, crash) as (bundle, archive):
+            trusted = archive is None or archive.made_here or options.trust
+            if film is not None and options.from_log:
+                shots.append(recorded_shot(bundle))
+                continue
+            if archive is not None and not trusted and not options.from_log:
+                raise _refuse(archive, bundle, options.directory)
+            until, stop_at = _stops(options, bundle)
+            one = replace(chosen, trusted=trusted, until=until, stop_at=stop_at)
+            with filmed(one, bundle, film) as asked:
+                report, answer = _replay_one(options, bundle, asked)
+                if film is not None:
+                    shots.append(replayed_shot(report, asked))
+            answers.append(answer)
+            good = good and set(report.verdicts) == {options.expect}
+    written = write_films(options, shots, film) if film is not None else {}
+    for path, count in written.items():
+        say(f"{path} has {count} pictures", as_json=options.json)
+    if options.json:
+        answer = answers[0] if len(answers) == 1 else {"crashes": answers}
+        print(json.dumps(answer | ({"written": written} if film is not None else {})))
+    return 0 if good else 1
+
+
+def _replay_one(
+    options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
+) -> tuple[ReplayReport, dict[str, Any]]:
+    from crashhunt.replay import replay
+    from crashhunt.report import describe_replay, format_table, steps_table
+
+    report = replay(bundle, chosen)
     answer = report.to_json()
     if options.fields:
         fields = re.split(r",(?![^\[]*\])", options.fields)  # not at the comma of observation[ROW,NAME]
@@ -96,9 +125,19 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         say("\n".join([*format_table(table), ""]), as_json=options.json)
         answer["table"] = table
     say(describe_replay(report), as_json=options.json)
-    if options.json:
-        print(json.dumps(answer))
-    return 0 if set(report.verdicts) == {options.expect} else 1
+    return report, answer
+
+
+def _refuse(archive: Archive, bundle: Bundle, path: Path) -> UsageError:
+    from crashhunt.settings import read_settings
+
+    agents = {agent.agent for agent in read_settings(bundle.hunt / "hunt.toml").agents.values()}
+    return UsageError(
+        f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
+        f"({', '.join(sorted(agents))})",
+        fix="give --trust if you trust whoever gave it to you, or --from-log to run none of it",
+        where=str(path),
+    )
 
 
 def _stops(options: argparse.Namespace, bundle: Bundle) -> tuple[int, int]:

@@ -1,0 +1,127 @@
+"""The options of ``crashhunt replay`` that make films."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import integer
+from crashhunt.errors import UsageError
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterator
+
+    from crashhunt.bundle import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.render.film import FilmOptions, Shot
+    from crashhunt.replay import ReplayOptions, ReplayReport
+    from crashhunt.trial import TrialResult
+
+__all__ = ["add_film_options", "film_options", "filmed", "recorded_shot", "replayed_shot", "write_films"]
+
+
+def add_film_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    film = parser.add_argument_group(
+        "to watch it",
+        "With --from-log no code is run, and nothing is simulated; otherwise what the replay does is shown, with the "
+        "agent's own panels. Needs pip install 'crashhunt[video]'.",
+    )
+    film.add_argument("--video", metavar="FILE", type=Path, help="write an MP4 file")
+    film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
+    film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
+    film.add_argument("--fps", metavar="N", type=float, default=0.0, help="pictures a second; default: one a step")
+    film.add_argument("--size", metavar="WxH", default="960x540", help="of the scene, in pixels; default: 960x540")
+    film.add_argument("--last-seconds", metavar="S", type=float, default=0.0, help="only the end of it")
+    film.add_argument(
+        "--last-step-repeats", metavar="N", type=integer, default=10, help="of the last picture; default: 10"
+    )
+    film.add_argument("--blank-frames", metavar="N", type=integer, default=10, help="between two crashes; default: 10")
+    film.add_argument("--no-panels", action="store_true", help="show the scene alone")
+
+
+def film_options(options: argparse.Namespace) -> FilmOptions | None:
+    """Return what a film shall look like; None where none is wanted.
+
+    Raises:
+        UsageError: an option cannot be meant, or Pillow is not installed.
+    """
+    if not (options.video or options.gif or options.frames):
+        return None
+    try:
+        from crashhunt.render.film import FilmOptions, check_places
+    except ImportError as error:
+        raise UsageError(f"a film needs Pillow: {error}", fix="pip install 'crashhunt[video]'") from None
+    check_places(video=options.video, gif=options.gif, folder=options.frames)
+    width, _, height = options.size.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise UsageError(f"--size {options.size!r} is no size", fix="write 960x540")
+    return FilmOptions(
+        fps=options.fps,
+        size=(int(width), int(height)),
+        last_s=options.last_seconds,
+        last_step_repeats=options.last_step_repeats,
+        blank_frames=options.blank_frames,
+        panels=not options.no_panels,
+    )
+
+
+@contextmanager
+def filmed(chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None) -> Iterator[ReplayOptions]:
+    """Yield how to replay so that the agent's panels are drawn, and where they then are."""
+    if film is None or not film.panels:
+        yield chosen
+        return
+    with tempfile.TemporaryDirectory(prefix="crashhunt-panels-") as folder:
+        first = 0
+        if film.last_s:
+            dt = bundle.recording().prologue.step_length_s
+            first = max(0, bundle.result.steps - round(film.last_s / dt) - 1)
+        # The process that draws is not watched over: it stops before what ended the one of the hunt.
+        fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
+        until = chosen.until or (bundle.result.steps if fatal else bundle.result.spec.max_steps)
+        yield replace(chosen, until=until, panels=(first, Path(folder)))
+
+
+def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
+    """Return what a replay did, to be filmed."""
+    from crashhunt.render import load_panels
+
+    panels = load_panels(chosen.panels[1]) if chosen.panels is not None else {}
+    crashed = report.replayed.outcome in report.rerun.worker.crash_on
+    return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed)
+
+
+def recorded_shot(bundle: Bundle) -> Shot:
+    """Return what was recorded, to be filmed."""
+    return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=True)
+
+
+def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
+    """Write what was asked for; return file to number of pictures.
+
+    Raises:
+        CrashhuntError: a file cannot be written, or what writes it is not installed.
+    """
+    from crashhunt.render.film import write_frames, write_gif, write_video
+
+    written = {}
+    for path, write in ((options.video, write_video), (options.gif, write_gif), (options.frames, write_frames)):
+        if path is not None:
+            written[str(path)] = write(path, shots, film)
+    return written
+
+
+def _shot(bundle: Bundle, recording: Recording, result: TrialResult, panels: Any, *, crashed: bool) -> Shot:
+    from crashhunt.recording import read_lanes
+    from crashhunt.render.film import Shot
+
+    hit = result.collision
+    other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
+    lanes = read_lanes(bundle.path / "log.mcap")
+    return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels)

@@ -1,0 +1,156 @@
+"""The scene from above, following one vehicle."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from crashhunt.render._draw import FAINT, INK, as_array, font
+from crashhunt.scene import corners
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.recording import Recording
+    from crashhunt.scene import Scene
+
+__all__ = ["SceneView"]
+
+_SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
+_EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
+_TRAIL_S = 4.0
+_FINE = 2  # drawn so many times larger, for smooth edges
+_LEGEND_STEP = 22
+
+
+class SceneView:
+    """Draws the scenes of a recording.
+
+    Args:
+        recording: of the episode.
+        lanes: the right and left border of each, shape (n, 2), in m.
+        agent: whom to follow.
+        other: the one it crashed with; empty for none.
+        width: in pixels.
+        height: in pixels.
+        scale: pixels a metre.
+        crash_step: where to mark the crash; -1 for nowhere.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+        *,
+        agent: str,
+        other: str = "",
+        width: int = 960,
+        height: int = 540,
+        scale: float = 8.0,
+        crash_step: int = -1,
+    ) -> None:
+        self.width, self.height = width, height
+        self._recording = recording
+        self._lanes = [(right, left, _box(right, left)) for right, left in lanes if len(right) > 1]
+        self._agent, self._other = agent, other
+        self._agents = set(recording.agents)
+        self._scale = scale
+        self._crash_step = crash_step
+        self._center = np.zeros(2)
+        self._trail = round(_TRAIL_S / recording.prologue.step_length_s)
+
+    def draw(self, step: int) -> NDArray[np.uint8]:
+        """Return a scene as uint8, shape (height, width, 3).
+
+        Raises:
+            IndexError: the recording has no such step.
+        """
+        scene = self._recording.scene(step)
+        row = scene.roster.index.get(self._agent)
+        if row is not None:
+            self._center = scene.centers[row]
+        size = self.width * _FINE, self.height * _FINE
+        image = Image.new("RGB", size, _SKY)
+        draw = ImageDraw.Draw(image)
+        self._draw_road(draw)
+        for name, color in ((self._other, _CRASH), (self._agent, _EGO)):
+            self._draw_trail(draw, name, color, step)
+        for other, actor in enumerate(scene.roster.actors):
+            self._draw_vehicle(draw, scene, other, self._color(actor.id))
+        if step == self._crash_step and row is not None:
+            x, y = self._place(np.array([scene.points[row]]))[0]
+            for radius in (34, 38):
+                draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_CRASH, width=3)
+        smooth = image.reduce(_FINE)
+        self._label(ImageDraw.Draw(smooth), scene, step, row)
+        return as_array(smooth)
+
+    def _place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Metres to pixels of the fine image."""
+        offset = (points - self._center) * (self._scale * _FINE)
+        offset[:, 1] *= -1
+        placed: NDArray[np.float64] = offset + np.array([self.width, self.height]) * (_FINE / 2)
+        return placed
+
+    def _draw_road(self, draw: ImageDraw.ImageDraw) -> None:
+        reach = np.array([self.width, self.height]) / (2 * self._scale)
+        low, high = self._center - reach, self._center + reach
+        seen = [lane for lane in self._lanes if (lane[2][0] <= high).all() and (lane[2][1] >= low).all()]
+        for right, left, _ in seen:
+            draw.polygon(self._place(np.concatenate((right, left[::-1]))).ravel().tolist(), fill=_ROAD)
+        for right, left, _ in seen:
+            for border in (right, left):
+                draw.line(self._place(border.copy()).ravel().tolist(), fill=_MARK, width=_FINE)
+
+    def _draw_trail(self, draw: ImageDraw.ImageDraw, name: str, color: tuple[int, int, int], step: int) -> None:
+        points = []
+        for number in range(max(0, step - self._trail), step + 1):
+            scene = self._recording.scene(number)
+            row = scene.roster.index.get(name)
+            if row is not None:
+                points.append(scene.points[row])
+        if len(points) > 1:
+            pale = tuple((part + 255) // 2 for part in color)
+            draw.line(self._place(np.array(points)).ravel().tolist(), fill=pale, width=2 * _FINE)
+
+    def _draw_vehicle(self, draw: ImageDraw.ImageDraw, scene: Scene, row: int, color: tuple[int, int, int]) -> None:
+        outline = self._place(corners(scene, row))
+        if not ((outline > -50).all() and (outline < np.array([self.width, self.height]) * _FINE + 50).all()):
+            return
+        draw.polygon(outline.ravel().tolist(), fill=color, outline=tuple(part // 2 for part in color))
+        front, back = (outline[0] + outline[3]) / 2, (outline[1] + outline[2]) / 2
+        glass = [front + (back - front) * share + (outline[0] - outline[3]) * side
+                 for share, side in ((0.22, 0.38), (0.34, 0.42), (0.34, -0.42), (0.22, -0.38))]  # fmt: skip
+        draw.polygon(np.array(glass).ravel().tolist(), fill=tuple(part // 2 for part in color))
+
+    def _color(self, name: str) -> tuple[int, int, int]:
+        if name == self._agent:
+            return _EGO
+        if name == self._other:
+            return _CRASH
+        return _AGENT if name in self._agents else _OTHER
+
+    def _label(self, draw: ImageDraw.ImageDraw, scene: Scene, step: int, row: int | None) -> None:
+        speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone"
+        draw.text((12, 10), f"{scene.time_s:.1f} s   step {step}   {self._agent} {speed}", INK, font(15))
+        names = [(self._agent, _EGO), (self._other, _CRASH)]
+        names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
+        for place, (name, color) in enumerate((name, color) for name, color in names if name):
+            top = 36 + _LEGEND_STEP * place
+            draw.rectangle((13, top + 3, 25, top + 15), fill=color)
+            draw.text((32, top), name, INK, font(13))
+        if step == self._crash_step:
+            draw.text((self.width / 2, 14), "CRASH", _CRASH, font(26), anchor="ma")
+        meters = next((length for length in (5, 10, 20, 50, 100) if length * self._scale > 60), 200)
+        bottom = self.height - 12
+        draw.line((14, bottom, 14 + meters * self._scale, bottom), FAINT, 2)
+        draw.text((14, bottom - 6), f"{meters} m", FAINT, font(12), anchor="ls")
+
+
+def _box(right: NDArray[np.float64], left: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    both = np.concatenate((right, left))
+    return both.min(axis=0), both.max(axis=0)

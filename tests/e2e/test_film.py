@@ -1,0 +1,172 @@
+"""Films through the command line: what is in them, with and without the agent's code."""
+
+from __future__ import annotations
+
+import json
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+SHOWY = """
+from crashhunt import render
+
+
+class Showy:
+    def __init__(self, speed: float = 20.0, broken: bool = False):
+        self.speed, self.broken = speed, broken
+
+    def reset(self, seed):
+        self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        self.seen = observation
+        if self.step == 40:
+            raise ValueError("no plan")
+        return self.speed, 0
+
+    def panels(self):
+        if self.broken and self.step > 20:
+            raise KeyError("no picture")
+        with render.scope("mind"):
+            return {"seen": render.Heatmap(self.seen), "step": [render.Text(str(self.step), title="count")]}
+"""
+BUILTIN = 4
+WORDS = ("--arg", "speed=8", "--set", "vehicles=10", "--seed", "1", "--crash-on", "agent_error")
+
+
+@pytest.fixture
+def crash(shell):
+    (shell.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
+    shell.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", *WORDS)
+    return shell
+
+
+def pictures(path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def size(path) -> tuple[int, int]:
+    with Image.open(path) as image:
+        return image.size
+
+
+def test_a_replay_is_filmed_with_the_agents_own_panels(crash):
+    words = ("--video", "out.mp4", "--gif", "out.gif", "--frames", "f", "--size", "480x320", "--last-step-repeats", "2")
+    done = crash.crashhunt("replay", "h", *words, "--json").json
+    assert done["verdict"] == "reproduced"
+    assert done["written"] == {"out.mp4": 42, "out.gif": 42, "f": 42}
+    video = pictures(crash.folder / "out.mp4")
+    assert len(video) == 42
+    # Four built-in panels and two of its own, in the step before the crash; there are none before the first step.
+    assert video[0].shape == video[-1].shape
+    last, first = (np.asarray(Image.open(crash.folder / f"f/{n:06d}.png")) for n in (38, 0))
+    assert last.shape == video[0].shape
+    viridis = ((last == (68, 1, 84)).all(axis=2).sum(), (first == (68, 1, 84)).all(axis=2).sum())
+    assert viridis[0] > 500 > viridis[1]
+    assert size(crash.folder / "out.gif") == (last.shape[1], last.shape[0])
+
+
+def test_a_film_from_the_log_runs_no_code_at_all(crash):
+    (crash.folder / "showy.py").unlink()
+    for found in crash.folder.glob("h/snapshots/*/code/showy.py"):
+        found.write_text("raise SystemExit('run')", encoding="utf-8")
+    done = crash.crashhunt("replay", "h", "--from-log", "--video", "log.mp4", "--size", "320x200", "--json")
+    assert done.json["written"] == {"log.mp4": 39 + 1 + 10}
+    assert "run" not in done.err.replace("crashhunt", "")
+
+
+def test_panels_that_fail_are_told_in_the_film_and_do_not_change_the_verdict(crash):
+    crash.crashhunt("run", "b", "1", "1", "60", "--agent", "showy:Showy", "--arg", "broken=true", *WORDS)
+    done = crash.crashhunt("replay", "b", "--frames", "f", "--size", "240x160", "--json").json
+    assert done["verdict"] == "reproduced"
+    good, bad = (np.asarray(Image.open(crash.folder / f"f/{n:06d}.png")) for n in (20, 21))
+    assert good.shape == bad.shape
+    assert (good != bad).any()
+
+
+def test_no_panels_and_the_last_seconds(crash):
+    words = ("--no-panels", "--last-seconds", "1", "--size", "200x100", "--last-step-repeats", "0")
+    done = crash.crashhunt("replay", "h", "--frames", "f", *words, "--json").json
+    assert done["written"] == {"f": 11}
+    assert size(crash.folder / "f/000000.png") == (200, 100)
+    crash.crashhunt("replay", "h", "--frames", "g", "--last-seconds", "1", "--size", "200x100")
+    assert size(crash.folder / "g/000000.png") > (200, 100)
+
+
+def test_several_crashes_in_one_film(shell):
+    words = ("--agent", "faulty:Raises", "--arg", "at=12", "--set", "vehicles=10", "--seed", "1", "--keep-going")
+    found = shell.crashhunt("run", "h", "2", "2", "40", *words, "--json").json
+    names = ",".join(crash["id"] for crash in found["crashes"])
+    for who in ((), ("--from-log",)):
+        out = shell.crashhunt("replay", "h", "--crash", names, *who, "--frames", f"f{len(who)}", "--size", "128x128",
+                              "--blank-frames", "3", "--last-step-repeats", "1")  # fmt: skip
+        assert f"f{len(who)} has {13 * 2 + 3} pictures" in out.out
+    done = shell.crashhunt("replay", "h", "--crash", names, expect=2)
+    assert "names several" in done.err
+
+
+@pytest.mark.parametrize("agent", ["Segfaults", "HangsHoldingTheInterpreter"])
+def test_a_crash_that_kills_the_process_is_filmed_up_to_it(shell, agent):
+    words = ("--agent", f"faulty:{agent}", "--arg", "at=15", "--set", "vehicles=10", "--seed", "1", "--timeout", "2")
+    shell.crashhunt("run", "h", "1", "1", "40", *words)
+    done = shell.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json").json
+    assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 14)
+    assert done["written"] == {"f": 14 + 1 + 10}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--video", "out.avi"), "--video 'out.avi' does not end in .mp4"),
+        (("--gif", "no/out.gif"), "there is no folder 'no'"),
+        (("--frames", "faulty.py"), "--frames 'faulty.py' is not an empty folder"),
+        (("--video", "a.mp4", "--size", "huge"), "--size 'huge' is no size"),
+        (("--video", "a.mp4", "--size", "10x10"), "--size is 10"),
+        (("--video", "a.mp4", "--fps", "-1"), "--fps is -1"),
+        (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),
+    ],
+)
+def test_bad_options_are_told_before_anything_is_run(crash, words, message):
+    done = crash.crashhunt("replay", "h", *words, expect=2)
+    assert message in done.err
+    assert "reproduced" not in done.out
+    assert not list(crash.folder.glob("*.mp4"))
+
+
+@pytest.mark.parametrize(("missing", "word"), [("PIL", "Pillow"), ("av", "PyAV")])
+def test_what_is_not_installed_is_named(crash, missing, word):
+    folder = crash.folder / "hidden"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(
+        f"""
+import sys
+class Hide:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == {missing!r}:
+            raise ImportError("No module named " + repr(name), name=name)
+sys.meta_path.insert(0, Hide())
+""",
+        encoding="utf-8",
+    )
+    crash.environment["PYTHONPATH"] = str(folder)
+    done = crash.crashhunt("replay", "h", "--from-log", "--video", "a.mp4", expect=2)
+    assert word in done.err
+    assert "crashhunt[video]" in done.err
+
+
+def test_a_full_disk_leaves_no_half_film(crash):
+    import resource
+
+    # A limit on the size of a file stands in for a disk that is full.
+    done = crash.start(
+        "replay", "h", "--from-log", "--video", "a.mp4", "--fps", "100", "--json",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)),
+    )  # fmt: skip
+    out, _ = done.communicate(timeout=100)
+    assert done.returncode == 2, out
+    assert "cannot be written" in json.loads(out)["error"]["message"]
+    assert not list(crash.folder.glob("*.mp4")) + list(crash.folder.glob(".*.mp4"))
