@@ -313,6 +313,10 @@ def bench_bundle() -> Iterator[Figure]:
         size = sum(path.stat().st_size for path in (place / "h" / "crashes").glob("*/log.mcap"))
         note = f"log.mcap with view channels, {crash['step']} steps, trial {crash['trial']} of {found['trials_run']}"
         yield Figure("log_bytes_per_step", size / max(1, crash["step"]), "B", "lower", None, note)
+        out = place / "crash.zip"
+        subprocess.run([CRASHHUNT, "export", place / "h", out], check=True, stdout=subprocess.DEVNULL)
+        note = "an exported crash with its snapshot, crashhunt itself in it"
+        yield Figure("export_kib", out.stat().st_size / 1024, "KiB", "lower", None, note)
 
 
 _CRASHES_AMONG_HANGING = """
@@ -353,6 +357,88 @@ def bench_stop() -> Iterator[Figure]:
             seconds.append(crashes.stat().st_mtime - raised)  # the bundle's folder is renamed into place last
     note = "from the crash to all workers killed and the bundle saved, with two of three workers hung in C"
     yield Figure("crash_to_saved_s", statistics.median(seconds), "s", "lower", 1.0, note)
+
+
+_RAISES_LATE = """
+class Agent:
+    def reset(self, seed):
+        self.step = 0
+
+    def act(self, observation):
+        self.step += 1
+        if self.step > 2000:
+            raise RuntimeError("on purpose")
+        return 5.0, 0
+"""
+
+
+def child_replay(directory: str) -> dict[str, float]:
+    """Steps a second of a hunt and of the replays of its crash."""
+    from crashhunt.bundle import find_bundle
+    from crashhunt.ledger import Ledger
+    from crashhunt.replay import replay
+
+    bundle = find_bundle(Path(directory))
+    began = time.perf_counter()
+    results = [replay(bundle).replayed for _ in range(3)]
+    whole = (time.perf_counter() - began) / len(results)
+    stepping = statistics.median(result.wall_s - result.setup_s for result in results)
+    (hunted,) = Ledger(Path(directory) / "ledger.sqlite").results()
+    return {"hunt": hunted.wall_s - hunted.setup_s, "replay": stepping, "rest": whole - stepping}
+
+
+def bench_replay() -> Iterator[Figure]:
+    """How fast a replay is."""
+    with folder() as place:
+        (place / "bench_agent.py").write_text(_RAISES_LATE)
+        words = ["run", "h", "1", "1", "2500", "--agent", "bench_agent:Agent", "--seed", "1"]
+        subprocess.run([str(CRASHHUNT), *words], cwd=place, stdout=subprocess.DEVNULL, check=True)
+        found = in_child("child_replay", str(place / "h"))
+    note = f"2,000 steps in {found['replay']:.2f} s; process, warm-up and comparison take {found['rest']:.2f} s"
+    yield Figure("replay_speed", found["hunt"] / found["replay"], "of the hunt's", "higher", 0.9, note)
+
+
+def bench_panels() -> Iterator[Figure]:
+    """The same two panels, drawn by us and by matplotlib."""
+    import matplotlib as mpl
+    import numpy as np
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    from crashhunt.render import Curve, Heatmap
+
+    rng = np.random.default_rng(0)
+    maps, curves = rng.normal(size=(200, 8, 7)), np.cumsum(rng.normal(size=(200, 100)), axis=1)
+
+    def ours(number: int) -> None:
+        Heatmap(maps[number]).draw(label="observation")
+        Curve({"speed": curves[number]}).draw(label="speed")
+
+    def theirs(number: int) -> None:
+        for kind in ("map", "curve"):
+            figure, axes = plt.subplots(figsize=(2.4, 1.6), dpi=100)
+            if kind == "map":
+                figure.colorbar(axes.imshow(maps[number], aspect="auto"))
+            else:
+                axes.plot(curves[number], label="speed")
+                axes.legend()
+            axes.set_title("title")
+            figure.canvas.draw()
+            np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
+            plt.close(figure)
+
+    def per_frame(draw: Callable[[int], None], count: int) -> float:
+        draw(0)
+        began = time.perf_counter()
+        for number in range(count):
+            draw(number)
+        return (time.perf_counter() - began) / count
+
+    rounds = [(per_frame(theirs, 10), per_frame(ours, 200)) for _ in range(3)]
+    ratio = statistics.median(slow / fast for slow, fast in rounds)
+    note = f"a heatmap and a curve in {1000 * rounds[0][1]:.2f} ms; matplotlib takes {1000 * rounds[0][0]:.0f} ms"
+    yield Figure("panels_vs_matplotlib", ratio, "x", "higher", 20.0, note)
 
 
 def bench_report() -> Iterator[Figure]:
@@ -442,6 +528,8 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "memory": bench_memory,
     "bundle": bench_bundle,
     "stop": bench_stop,
+    "replay": bench_replay,
+    "panels": bench_panels,
     "report": bench_report,
 }
 
