@@ -97,6 +97,7 @@ class Worker:
         simulator = self._simulator
         if simulator is None:
             simulator = self._simulator = self._parts.simulator()
+        made = time.monotonic()
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
         faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         result = run_episode(
@@ -112,7 +113,8 @@ class Worker:
             self._draw_map(simulator)
         kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
         failure = result.failure and replace(result.failure, last_output=read_tail(folder / OUTPUT))
-        result = replace(result, worker=os.getpid(), kept=kept, wall_s=time.monotonic() - began, failure=failure)
+        wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
+        result = replace(result, worker=os.getpid(), kept=kept, wall_s=wall_s, setup_s=setup_s, failure=failure)
         if kept:
             # The next trial gets a folder of its own; this one now belongs to the hunt.
             self._folder = None
