@@ -10,12 +10,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.episode import run_episode
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, labelled, save_panels, scope
@@ -28,49 +28,66 @@ if TYPE_CHECKING:
     from crashhunt.replay import Rerun
     from crashhunt.simulators import Simulator
 
-__all__ = ["debug"]
+__all__ = ["Look", "debug"]
 
 _LEFT = 77  # exit code
 
 
-def debug(
-    rerun: Rerun,
-    *,
-    until: int,
-    stop_at: int = 0,
-    agent: str = "",
-    to_stderr: bool = False,
-    panels: tuple[int, Path] | None = None,
-) -> tuple[TrialResult, Recording]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What to look at in a replay.
+
+    Args:
+        until: how many steps to run.
+        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
+        to_stderr: whether what is printed goes there.
+        panels: the step from which on to draw the agents' panels, and the folder for them.
+        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
+    """
+
+    until: int
+    stop_at: int = 0
+    to_stderr: bool = False
+    panels: tuple[int, Path] | None = None
+    window: float | None = None
+
+
+def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
     """Run the first steps of a crash in a fresh process that has this one's terminal.
 
     Breakpoints in the agent's code work there, and what it prints is seen at once.
 
     Args:
         rerun: the crash.
-        until: how many steps.
-        stop_at: the step in which to drop into the agent's ``act``; 0 for none.
-        agent: whose.
-        to_stderr: whether what it prints goes there.
-        panels: the step from which on to draw the agents' panels, and the folder for them.
+        look: at what.
 
     Raises:
+        UsageError: there is no display for a window.
         CrashhuntError: it could not be run.
-        KeyboardInterrupt: the debugger was left.
+        KeyboardInterrupt: the debugger was left, or the window closed.
     """
+    if look.window is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise UsageError("a window needs a display, and DISPLAY is not set", fix="log in with ssh -X, or give --video")
+    collision = rerun.bundle.result.collision
+    involved = {collision.collider, collision.victim} if collision is not None else set()
     with tempfile.TemporaryDirectory(prefix="crashhunt-debug-") as folder:
         scratch = Path(folder)
         settings = replace(rerun.worker, scratch=scratch)
         job = {
             "settings": settings.to_json(),
-            "spec": replace(rerun.spec, max_steps=until).to_json(),
-            "stop_at": stop_at,
-            "agent": agent,
-            "panels": [panels[0], str(panels[1].resolve())] if panels is not None else None,
+            "spec": replace(rerun.spec, max_steps=look.until).to_json(),
+            "stop_at": look.stop_at,
+            "agent": rerun.bundle.driver,
+            "other": next(iter(involved - {rerun.bundle.driver}), ""),
+            "panels": [look.panels[0], str(look.panels[1].resolve())] if look.panels is not None else None,
+            "window": look.window,
+            "pause_before": min(look.until, max(1, rerun.bundle.result.steps)),
         }
         (scratch / "job.json").write_text(json.dumps(job), encoding="utf-8")
         command = [sys.executable, "-P", "-m", "crashhunt.debugger", folder]
-        done = subprocess.run(command, env=fresh_environment(settings), stdout=2 if to_stderr else None, check=False)
+        done = subprocess.run(
+            command, env=fresh_environment(settings), stdout=2 if look.to_stderr else None, check=False
+        )
         if done.returncode == _LEFT:
             raise KeyboardInterrupt
         try:
@@ -156,6 +173,56 @@ class _Drawn:
         return action
 
 
+class _Windowed:
+    """A simulator in a window of its own, slowed down.
+
+    Args:
+        simulator: what is simulated.
+        job: who is followed, how long a step takes, and before which step to pause.
+    """
+
+    def __init__(self, simulator: Simulator, job: Mapping[str, Any]) -> None:
+        self._simulator: Any = simulator
+        open_window = getattr(simulator, "open_window", None)
+        if open_window is None:
+            raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
+        open_window()
+        self._job = job
+        self._step = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._simulator, name)
+
+    def reset(self, **options: Any) -> Any:
+        began = self._simulator.reset(**options)
+        self._simulator.follow(self._job["agent"], self._job["other"])
+        return began
+
+    def step(self, actions: Any) -> Any:
+        self._step += 1
+        if self._step == self._job["pause_before"]:
+            self._pause(f"step {self._step} is next. Press Enter to see what happens: ")
+        try:
+            done = self._simulator.step(actions)
+            self._simulator.follow(self._job["agent"], self._job["other"])
+        except Exception:
+            if not self._simulator.window_open:
+                print("the window was closed", flush=True)
+                os._exit(_LEFT)
+            raise
+        time.sleep(self._job["window"])
+        return done
+
+    def leave(self) -> None:
+        """Wait until everything has been looked at."""
+        self._pause("Press Enter to close the window: ")
+
+    def _pause(self, prompt: str) -> None:
+        print(prompt, end="", flush=True)
+        if not sys.stdin.readline():
+            print(flush=True)
+
+
 class _Debugger(pdb.Pdb):
     def set_quit(self) -> None:
         """Leave the process: whoever quits does not want a verdict."""
@@ -165,8 +232,8 @@ class _Debugger(pdb.Pdb):
 
 def _main(folder: Path) -> None:
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
     try:
+        settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
         parts = Parts(settings)
 
         def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
@@ -178,16 +245,21 @@ def _main(folder: Path) -> None:
                 made = _Drawn(made, name, shown, job["panels"][0], Path(job["panels"][1]))
             return made
 
+        simulator: Any = parts.simulator()
+        if job["window"] is not None:
+            simulator = _Windowed(simulator, job)
         box = BlackBox(folder / BLACK_BOX)
         box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
         result = run_episode(
             spec,
-            simulator=parts.simulator(),
+            simulator=simulator,
             make_agent=make_agent,
             box=box,
             oracles=parts.oracles,
             crash_on=settings.crash_on,
         )
+        if job["window"] is not None:
+            simulator.leave()
         answer = {"result": result.to_json()}
     except CrashhuntError as error:
         answer = error.to_json()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.debugger import Look, debug
 from crashhunt.edits import edited_spec
 from crashhunt.environment import environment_changes
 from crashhunt.errors import BundleError, CrashhuntError, UsageError
@@ -44,10 +45,7 @@ class ReplayOptions:
         times: how often.
         trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
             but simulate.
-        until: run so many steps, in a process that has this one's terminal; 0 for all, in one of its own.
-        stop_at: the step in which to drop into the agent's code, with ``until``.
-        to_stderr: where to what the agent prints then goes.
-        panels: the step from which on to draw the agents' panels, and the folder for them, with ``until``.
+        look: what to look at, in a process that has this one's terminal; without it, it runs in one of its own.
     """
 
     code: Code = "snapshot"
@@ -55,10 +53,7 @@ class ReplayOptions:
     force: bool = False
     times: int = 1
     trusted: bool = True
-    until: int = 0
-    stop_at: int = 0
-    to_stderr: bool = False
-    panels: tuple[int, Path] | None = None
+    look: Look | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +151,8 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
     if options.times < 1:
         raise UsageError(f"--times is {options.times}", fix="give at least 1")
     rerun = prepare(bundle, options)
-    if options.until:
-        return _look_into(rerun, options)
+    if options.look is not None:
+        return _look_into(rerun, options.look)
     reports = [_run(rerun) for _ in range(options.times)]
     shown = next((report for report in reports if report.verdict != "reproduced"), reports[0])
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
@@ -251,24 +246,15 @@ def _run(rerun: Rerun) -> ReplayReport:
     return _report(rerun, recorded, replayed, result)
 
 
-def _look_into(rerun: Rerun, options: ReplayOptions) -> ReplayReport:
+def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
     """Run the first steps with the terminal at hand, and compare them with those of the log."""
-    from crashhunt.debugger import debug
-
-    result, replayed = debug(
-        rerun,
-        until=options.until,
-        stop_at=options.stop_at,
-        agent=rerun.bundle.driver,
-        to_stderr=options.to_stderr,
-        panels=options.panels,
-    )
+    result, replayed = debug(rerun, look)
     if result.outcome is Outcome.INVALID:
         raise _not_set_up(rerun, result.failure.message if result.failure else "it left no recording")
     recorded = rerun.recorded
-    if options.until <= recorded.steps:
-        recorded, replayed = _up_to(recorded, options.until), _up_to(replayed, options.until)
-    report = _report(rerun, recorded, replayed, result, whole=options.until > recorded.steps)
+    if look.until <= recorded.steps:
+        recorded, replayed = _up_to(recorded, look.until), _up_to(replayed, look.until)
+    report = _report(rerun, recorded, replayed, result, whole=look.until > recorded.steps)
     return replace(report, verdicts={report.verdict: 1})
 
 

@@ -63,6 +63,14 @@ class Shell:
         )
 
 
+def needed(*names: str) -> str:
+    """Where a program that is no Python package is; without it, the test cannot run, and in CI fails."""
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        (pytest.fail if os.environ.get("CRASHHUNT_TEST_SCREEN") == "required" else pytest.skip)(f"needs {names[0]}")
+    return found
+
+
 @pytest.fixture
 def shell(tmp_path: Path) -> Shell:
     """An empty folder with a module `faulty` of agents that go wrong."""

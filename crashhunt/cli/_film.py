@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import integer
+from crashhunt.debugger import Look
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.replay import ReplayOptions, ReplayReport
     from crashhunt.trial import TrialResult
 
-__all__ = ["add_film_options", "film_options", "filmed", "recorded_shot", "replayed_shot", "write_films"]
+__all__ = ["add_film_options", "film_options", "filmed", "look_at_all", "recorded_shot", "replayed_shot", "write_films"]
 
 
 def add_film_options(parser: argparse.ArgumentParser) -> None:
@@ -71,8 +72,18 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     )
 
 
+def look_at_all(bundle: Bundle, **options: Any) -> Look | None:
+    """Return how to look at a whole crash; None where nothing of it can be looked at."""
+    # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
+    fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
+    until = bundle.result.steps if fatal else bundle.result.spec.max_steps
+    return Look(until=until, **options) if until else None
+
+
 @contextmanager
-def filmed(chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None) -> Iterator[ReplayOptions]:
+def filmed(
+    chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None, *, to_stderr: bool
+) -> Iterator[ReplayOptions]:
     """Yield how to replay so that the agent's panels are drawn, and where they then are."""
     if film is None or not film.panels:
         yield chosen
@@ -82,17 +93,15 @@ def filmed(chosen: ReplayOptions, bundle: Bundle, film: FilmOptions | None) -> I
         if film.last_s:
             dt = bundle.recording().prologue.step_length_s
             first = max(0, bundle.result.steps - round(film.last_s / dt) - 1)
-        # The process that draws is not watched over: it stops before what ended the one of the hunt.
-        fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
-        until = chosen.until or (bundle.result.steps if fatal else bundle.result.spec.max_steps)
-        yield replace(chosen, until=until, panels=(first, Path(folder)))
+        look = chosen.look or look_at_all(bundle, to_stderr=to_stderr)
+        yield replace(chosen, look=look and replace(look, panels=(first, Path(folder))))
 
 
 def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
     """Return what a replay did, to be filmed."""
     from crashhunt.render import load_panels
 
-    panels = load_panels(chosen.panels[1]) if chosen.panels is not None else {}
+    panels = load_panels(chosen.look.panels[1]) if chosen.look is not None and chosen.look.panels is not None else {}
     crashed = report.replayed.outcome in report.rerun.worker.crash_on
     return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed)
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, pairs, say
-from crashhunt.cli._film import add_film_options, film_options, filmed, recorded_shot, replayed_shot, write_films
+from crashhunt.cli._film import (
+    add_film_options,
+    film_options,
+    filmed,
+    look_at_all,
+    recorded_shot,
+    replayed_shot,
+    write_films,
+)
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
@@ -18,6 +27,7 @@ if TYPE_CHECKING:
 
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
+    from crashhunt.debugger import Look
     from crashhunt.replay import ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
@@ -64,6 +74,14 @@ def add_replay(commands: Any) -> None:
         help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m, "
         "required_deceleration, action or its parts, observation[ROW,NAME]",
     )  # fmt: skip
+    look.add_argument(
+        "--gui", action="store_true",
+        help="open the simulator's own window (sumo-gui), follow the agent, and pause before the crash",
+    )  # fmt: skip
+    look.add_argument(
+        "--sleep", metavar="S", type=float,
+        help="with --gui: wall time between two steps, in s; default: as long as a step simulates",
+    )  # fmt: skip
     add_film_options(replay)
     replay.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
     replay.add_argument("--force", action="store_true", help="replay even from a snapshot that is damaged")
@@ -79,7 +97,6 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         changes=pairs(options.sets, "--set"),
         force=options.force,
         times=options.times,
-        to_stderr=options.json,
     )
     film = film_options(options)
     crashes = options.crash.split(",")
@@ -94,9 +111,8 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
                 continue
             if archive is not None and not trusted and not options.from_log:
                 raise _refuse(archive, bundle, options.directory)
-            until, stop_at = _stops(options, bundle)
-            one = replace(chosen, trusted=trusted, until=until, stop_at=stop_at)
-            with filmed(one, bundle, film) as asked:
+            one = replace(chosen, trusted=trusted, look=_look(options, bundle))
+            with filmed(one, bundle, film, to_stderr=options.json) as asked:
                 report, answer = _replay_one(options, bundle, asked)
                 if film is not None:
                     shots.append(replayed_shot(report, asked))
@@ -140,22 +156,42 @@ def _refuse(archive: Archive, bundle: Bundle, path: Path) -> UsageError:
     )
 
 
-def _stops(options: argparse.Namespace, bundle: Bundle) -> tuple[int, int]:
-    """Where to stop, and where to drop into the agent's code; 0 for nowhere."""
-    crash = bundle.result.steps
+def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
+    """Return what to look at; None for nothing."""
+    from crashhunt.debugger import Look
+
     if options.json and options.pdb:
         raise UsageError("--pdb needs the terminal, and --json is for programs", fix="leave one of them out")
+    if options.sleep is not None and not (options.gui and 0 <= options.sleep < math.inf):
+        raise UsageError(f"--sleep is {options.sleep:g}", fix="give at least 0, and --gui, which it slows down")
+    until = _last_step(options, bundle)
+    if options.gui:
+        whole = look_at_all(bundle)
+        if whole is None:
+            raise UsageError(
+                f"{bundle.id} ended before its first step, and there is nothing to see", fix="leave --gui out"
+            )
+        real_time = bundle.recording().prologue.step_length_s
+        return replace(
+            whole,
+            until=until or whole.until,
+            stop_at=until if options.pdb else 0,
+            to_stderr=options.json,
+            window=real_time if options.sleep is None else options.sleep,
+        )
+    return Look(until=until, stop_at=until if options.pdb else 0, to_stderr=options.json) if until else None
+
+
+def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
+    """Where to stop; 0 where that was not asked for."""
+    crash = bundle.result.steps
     if options.before is not None:
-        until = crash - options.before
-        if not 1 <= until <= crash:
+        if not 0 <= options.before < crash:
             raise UsageError(f"--before is {options.before}, and the crash is at step {crash}", fix="give less")
-    elif options.until is not None:
-        until = options.until
-        if until < 1:
-            raise UsageError(f"--until is {until}", fix="give at least 1")
-    elif options.pdb:
-        # An agent that failed did so in the step after the last complete one.
-        until = crash + (bundle.result.outcome is Outcome.AGENT_ERROR)
-    else:
-        return 0, 0
-    return until, until if options.pdb else 0
+        return crash - int(options.before)
+    if options.until is not None:
+        if options.until < 1:
+            raise UsageError(f"--until is {options.until}", fix="give at least 1")
+        return int(options.until)
+    # An agent that failed did so in the step after the last complete one.
+    return crash + (bundle.result.outcome is Outcome.AGENT_ERROR) if options.pdb else 0

@@ -151,8 +151,8 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 def main() -> None:
     """Run the one trial that standard input describes."""
     job = json.load(sys.stdin)
-    settings = WorkerSettings.from_json(job["settings"])
     try:
+        settings = WorkerSettings.from_json(job["settings"])
         require_origin("crashhunt", settings.code)
         answer = {"result": Worker(settings).run(TrialSpec.from_json(job["spec"])).to_json()}
     except CrashhuntError as error:

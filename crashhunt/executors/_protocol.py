@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from crashhunt import __version__
+from crashhunt.errors import CrashhuntError
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["Executor", "WorkerSettings", "scratch_of"]
+
+_SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,13 +49,24 @@ class WorkerSettings:
         """Return plain dicts, strings and numbers."""
         data = asdict(self)
         data["scenario"]["folder"] = str(self.scenario.folder)
-        return {**data, "scratch": str(self.scratch), "crash_on": [str(outcome) for outcome in self.crash_on]}
+        crash_on = [str(outcome) for outcome in self.crash_on]
+        return {**data, "schema": _SCHEMA, "scratch": str(self.scratch), "crash_on": crash_on}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
-        """Rebuild what `to_json` returned."""
+        """Rebuild what `to_json` returned.
+
+        Raises:
+            CrashhuntError: a crashhunt of another version wrote it.
+        """
         from crashhunt.scenario import scenario_from_dict
 
+        if data.get("schema") != _SCHEMA:
+            raise CrashhuntError(
+                f"the snapshot has crashhunt {__version__}, and the one that replays is of a version that runs trials "
+                "in another way",
+                fix=f"pip install crashhunt=={__version__}, or replay with --code current",
+            )
         scenario = dict(data["scenario"])
         folder = Path(scenario.pop("folder"))
         notes = tuple(scenario.pop("notes", ()))

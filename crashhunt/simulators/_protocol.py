@@ -44,7 +44,9 @@ class Simulator(Protocol):
 
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
-    A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`.
+    A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`. One that
+    has a window of its own offers ``open_window()``, called before the first `reset`, ``follow(agent, other)``, which
+    marks the two and keeps the agent in view, and ``window_open``; none of them changes what is simulated.
     """
 
     @property

@@ -39,6 +39,8 @@ LOOK_AROUND_EVERY = 10
 lane of each vehicle: a string each is too dear for every step."""
 
 _SIGHT_SQUARED = SIGHT_M**2
+_FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
+_SEEN_M = 150.0  # of the network, in a window that follows a vehicle
 _RADIANS = math.pi / 180.0
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
@@ -71,6 +73,28 @@ class SumoSimulator:
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._lanes: list[Lane] | None = None
+        self._program = ["sumo"]
+
+    def open_window(self) -> None:
+        """Show the episodes in sumo-gui, which libsumo brings along."""
+        self._program = ["sumo-gui", "--start", "--delay", "0", "--window-size", "1200,800"]
+
+    @property
+    def window_open(self) -> bool:
+        """Whether nobody has closed the window."""
+        return bool(libsumo.isLoaded())
+
+    def follow(self, agent: str, other: str) -> None:
+        """Mark two vehicles in the window, and keep the first in view."""
+        present = sumo.vehicle_getIDList()
+        for name, color in ((agent, _FOLLOWED), (other, _MARKED)):
+            if name in present:
+                libsumo.vehicle.setColor(name, color)
+        if agent in present:
+            (view, *_) = libsumo.gui.getIDList()
+            if libsumo.gui.getTrackedVehicle(view) != agent:
+                libsumo.gui.trackVehicle(view, agent)
+                libsumo.gui.setZoom(view, libsumo.gui.getZoom(view) * max(1.0, self._span_m() / _SEEN_M))
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
@@ -81,7 +105,7 @@ class SumoSimulator:
             if libsumo.isLoaded():
                 libsumo.load(command)
             else:
-                libsumo.start(["sumo", *command])
+                libsumo.start([*self._program, *command])
             _current = weakref.ref(self)
             self._enter()
         except _TRACI_ERRORS as error:
@@ -146,6 +170,11 @@ class SumoSimulator:
         """End the simulation, unless another simulator of this process has begun one since."""
         if _current is not None and _current() is self and libsumo.isLoaded():
             libsumo.close()
+
+    def _span_m(self) -> float:
+        """How wide the network is, which the window shows whole at first."""
+        (left, _), (right, _) = libsumo.simulation.getNetBoundary()
+        return float(right - left)
 
     def _enter(self) -> None:
         """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road."""

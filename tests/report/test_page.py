@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from conftest import needed
 
 from crashhunt.bundle import list_bundles
 
@@ -22,17 +21,10 @@ from selenium.webdriver.common.keys import Keys  # noqa: E402
 if TYPE_CHECKING:
     from pathlib import Path
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    driver = shutil.which("chromedriver")
-    if program is None or driver is None:
-        if os.environ.get("CRASHHUNT_TEST_BROWSER") == "required":
-            pytest.fail("chromium and chromedriver are required and not there")
-        pytest.skip("chromium and chromedriver are not installed")
+    program, driver = needed("chromium", "chromium-browser", "google-chrome"), needed("chromedriver")
     options = webdriver.ChromeOptions()
     options.binary_location = program
     for word in (

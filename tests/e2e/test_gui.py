@@ -1,0 +1,103 @@
+"""The simulator's own window, on a virtual screen."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+
+import numpy as np
+import pytest
+from conftest import needed
+from PIL import ImageGrab
+
+ORANGE, RED = (224, 138, 0), (198, 40, 40)
+
+
+@pytest.fixture
+def screen():
+    command = [needed("Xvfb"), "-displayfd", "1", "-screen", "0", "1280x1024x24", "-nolisten", "tcp"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        assert server.stdout is not None
+        yield f":{server.stdout.readline().strip()}"
+        server.terminate()
+
+
+@pytest.fixture
+def crash(shell):
+    words = ("--arg", "speed=20", "--seed", "1", "--crash-on", "collision")
+    shell.crashhunt("run", "h", "1", "9", "800", *words)
+    return shell
+
+
+def seen(screen: str) -> dict[str, int]:
+    """How many pixels of the two vehicles are on the screen."""
+    picture = np.asarray(ImageGrab.grab(xdisplay=screen).convert("RGB"))
+    return {name: int((picture == color).all(axis=2).sum()) for name, color in (("ego", ORANGE), ("other", RED))}
+
+
+def read_until(stream, text: str) -> str:
+    """What a process has printed, up to some text without a line end."""
+    found = ""
+    while text not in found:
+        letter = stream.read(1)
+        assert letter, found
+        found += letter
+    return found
+
+
+def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
+    crash.environment["DISPLAY"] = screen
+    process = crash.start("replay", "h", "--gui", "--sleep", "0", stdin=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    read_until(process.stdout, "Press Enter to see what happens: ")
+    time.sleep(1)  # it paints on a thread of its own
+    paused = seen(screen)
+    assert paused["ego"] > 20
+    assert paused["other"] > 20
+    process.stdin.write("\n")
+    process.stdin.flush()
+    read_until(process.stdout, "Press Enter to close the window: ")
+    out, _ = process.communicate("\n", timeout=60)
+    assert process.returncode == 0
+    assert "reproduced" in out  # the window changes nothing, to the bit
+
+
+def test_nobody_at_the_terminal_is_not_waited_for(crash, screen):
+    crash.environment["DISPLAY"] = screen
+    process = crash.start("replay", "h", "--gui", "--sleep", "0", "--until", "20", "--json", stdin=subprocess.DEVNULL)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert '"steps_replayed": 20' in out
+
+
+def test_sleep_slows_it_down(crash, screen):
+    crash.environment["DISPLAY"] = screen
+    began = time.monotonic()
+    process = crash.start("replay", "h", "--gui", "--sleep", "0.2", "--until", "20", stdin=subprocess.DEVNULL)
+    process.communicate(timeout=60)
+    assert time.monotonic() - began > 4
+
+
+def test_a_closed_window_is_no_divergence(crash, screen):
+    crash.environment["DISPLAY"] = screen
+    process = crash.start("replay", "h", "--gui", "--sleep", "0.05", stdin=subprocess.DEVNULL)
+    keys = needed("xdotool")
+    for _ in range(100):
+        time.sleep(0.1)
+        found = subprocess.run([keys, "search", "--name", "SUMO"], env=crash.environment, capture_output=True,
+                               text=True, check=False).stdout.split()  # fmt: skip
+        if len(found) and seen(screen)["ego"]:
+            break
+    subprocess.run([keys, "windowfocus", found[-1], "key", "ctrl+q"], env=crash.environment, check=True)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "the window was closed" in out
+    assert "diverged" not in out
+
+
+def test_what_cannot_be_shown_is_said(crash, shell):
+    shell.environment.pop("DISPLAY", None)
+    assert "DISPLAY is not set" in crash.crashhunt("replay", "h", "--gui", expect=2).err
+    assert "--sleep is 3" in crash.crashhunt("replay", "h", "--sleep", "3", expect=2).err
+    assert "--sleep is -1" in crash.crashhunt("replay", "h", "--gui", "--sleep", "-1", expect=2).err
