@@ -186,7 +186,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             yield from [last[1]] * options.last_step_repeats
 
 
-def frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
+def _frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
     """Return how many pictures a second the film has."""
     return options.fps or 1.0 / min(shot.recording.prologue.step_length_s for shot in shots)
 
@@ -208,7 +208,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
             stream: Any = None
             for picture in frames(shots, options):
                 if stream is None:
-                    rate = Fraction(frame_rate(shots, options)).limit_denominator(1000)
+                    rate = Fraction(_frame_rate(shots, options)).limit_denominator(1000)
                     stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"
@@ -239,7 +239,7 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
             temporary,
             save_all=True,
             append_images=pictures[1:],
-            duration=max(20, round(1000 / frame_rate(shots, options))),  # players slow down what is faster
+            duration=max(20, round(1000 / _frame_rate(shots, options))),  # players slow down what is faster
             loop=0,
         )
         temporary.replace(path)

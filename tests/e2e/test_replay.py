@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt import __version__
+
 AGENT = '''
 import helper
 
@@ -234,6 +236,18 @@ def test_what_cannot_be_compared_says_which(crash):
     assert (other["verdict"], other["reason"]) == (
         "not_comparable", f"the simulator differs: libsumo was 1.2.3 and is {now}"
     )  # fmt: skip
+
+
+def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash):
+    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
+    code = snapshot / "code" / "crashhunt"
+    edit(code / "executors" / "_protocol.py", "_SCHEMA = 1", "_SCHEMA = 99")
+    edit(code / "__init__.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
+    for words in ((), ("--until", "5")):
+        refused = crash.crashhunt("replay", "h", "--force", *words, expect=2)
+        assert "the snapshot has crashhunt 7.8.9" in refused.err
+        assert "pip install crashhunt==7.8.9" in refused.err
+    assert crash.crashhunt("replay", "h", "--force", "--code", "current", "--json").json["verdict"] == "reproduced"
 
 
 def test_the_recorded_actions_run_no_code_of_the_bundle(crash):
