@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import queue
 import signal
@@ -11,6 +10,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.context import ForkServerContext
 from typing import TYPE_CHECKING, Any
 
 from pebble import ProcessExpired, ProcessPool
@@ -20,6 +20,7 @@ from crashhunt.executors._worker import run_trial, start_worker, worker_environm
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from multiprocessing.synchronize import RLock
 
     from pebble import ProcessFuture
 
@@ -127,7 +128,7 @@ class PoolExecutor:
     def _open(self) -> ProcessPool:
         if self._pool is None or not self._pool.active:
             # The fork server has libsumo loaded, so that a new worker is there in milliseconds, not in seconds.
-            context = multiprocessing.get_context("forkserver")
+            context = _Context()
             preload = [start_worker.__module__]
             if self._settings.scenario.simulator == "sumo":
                 preload.append("crashhunt.simulators.sumo")
@@ -194,6 +195,20 @@ class PoolExecutor:
             elif now - header.started > self._settings.timeout_s + _LAST_WORDS_S and not running.killed:
                 running.killed = True
                 _kill(header.pid)
+
+
+class _Context(ForkServerContext):
+    """Keeps locks until the pool is gone: pebble drops its own before it has stopped the workers that are starting."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._locks: list[RLock] = []
+
+    def RLock(self) -> RLock:  # noqa: N802 - the name is multiprocessing's
+        """Make a lock."""
+        lock = super().RLock()
+        self._locks.append(lock)
+        return lock
 
 
 def _kill(pid: int) -> None:

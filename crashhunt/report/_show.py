@@ -122,7 +122,7 @@ class Story:
                         f"{moment.gap_m:.1f}",
                         f"{moment.closing_speed:+.1f}",
                         f"{moment.time_to_collision_s:.1f}" if math.isfinite(moment.time_to_collision_s) else "-",
-                        f"{moment.required_deceleration:.1f}",
+                        f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
                     ]
                 )
             mark = "" if step.step != self.escape else f"<- the last step from which braking at {self._braking:g} helps"
