@@ -59,7 +59,7 @@ def test_every_command_does_what_it_says(shown):
             )
             assert done.returncode == 0, done.stderr
             assert re.search(r"'outcome': '\w+'|^[\d.]+ s: \[", done.stdout), done.stdout
-    assert len(ran) == 9
+    assert len(ran) == 10
 
 
 def test_the_shown_scenario_is_valid(shown):
