@@ -90,6 +90,10 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         )
         if done.returncode == _LEFT:
             raise KeyboardInterrupt
+        if look.window is not None and done.returncode < 0:
+            # sumo-gui does not always survive being closed in the middle of a step.
+            print(f"the window was closed, with signal {-done.returncode}", file=sys.stderr)
+            raise KeyboardInterrupt
         try:
             answer = json.loads((scratch / "answer.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -207,7 +211,7 @@ class _Windowed:
             self._simulator.follow(self._job["agent"], self._job["other"])
         except Exception:
             if not self._simulator.window_open:
-                print("the window was closed", flush=True)
+                print("the window was closed", file=sys.stderr, flush=True)
                 os._exit(_LEFT)
             raise
         time.sleep(self._job["window"])

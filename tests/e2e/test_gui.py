@@ -92,7 +92,7 @@ def test_a_closed_window_is_no_divergence(crash, screen):
     subprocess.run([keys, "windowfocus", found[-1], "key", "ctrl+q"], env=crash.environment, check=True)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert "the window was closed" in out
+    assert "the window was closed" in err
     assert "diverged" not in out
 
 
