@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from crashhunt.agents import Agent
-    from crashhunt.replay import Rerun
+    from crashhunt.replays import Rerun
     from crashhunt.simulators import Simulator
 
 __all__ = ["Look", "debug"]

@@ -6,20 +6,20 @@ import os
 import shutil
 import signal
 import time
-from collections import Counter
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
-from crashhunt.bundle import Bundle, list_bundles, write_bundle, write_trial
+from crashhunt.bundle import list_bundles, write_bundle, write_trial
 from crashhunt.directory import HuntDirectory
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_of
 from crashhunt.ledger import Ledger
 from crashhunt.plan import spec_of, with_settings
 from crashhunt.plugins import locate
-from crashhunt.replay import confirm
+from crashhunt.progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.replays import confirm
 from crashhunt.snapshot import Snapshot, SnapshotOptions, take_snapshot
+from crashhunt.status import this_process
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -33,94 +33,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
-StoppedBecause = Literal["crash", "all_trials", "interrupted", "no_valid_trial"]
-
 _TICK_S = 0.1
 _HEARTBEAT_S = 1.0
 _INVALID_BEFORE_GIVING_UP = 10
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
-
-
-@dataclass(frozen=True, slots=True)
-class HuntStatus:
-    """How a hunt is going, for people who watch.
-
-    Args:
-        phase: ``hunting``, ``saving``, ``confirming`` or ``done``.
-        planned: trials in all.
-        done: trials that have ended, in earlier runs of the hunt too.
-        outcomes: how they ended.
-        rate_per_s: trials a second in this run.
-        elapsed_s: wall time of this run.
-        nearest: the trial that came nearest to a crash without one.
-        workers: trial number to where it is.
-        crashes: saved so far.
-    """
-
-    phase: str
-    planned: int
-    done: int
-    outcomes: dict[str, int]
-    rate_per_s: float
-    elapsed_s: float
-    nearest: TrialResult | None
-    workers: dict[int, BlackBoxHeader]
-    crashes: int
-
-
-@dataclass(frozen=True, slots=True)
-class HuntReport:
-    """What came of a hunt.
-
-    Args:
-        directory: of the hunt.
-        settings: what was asked.
-        stopped_because: why it ended.
-        outcomes: how the trials ended.
-        steps_total: steps of all trials.
-        wall_s: wall time of this run.
-        crashes: what was found, the one with the fewest steps first.
-        reason: in words, where not one trial was valid.
-    """
-
-    directory: Path
-    settings: HuntSettings
-    stopped_because: StoppedBecause
-    outcomes: dict[str, int]
-    steps_total: int
-    wall_s: float
-    crashes: tuple[Bundle, ...]
-    reason: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the shape that ``run --json`` prints."""
-        return {
-            "dir": str(self.directory),
-            "hunt_seed": self.settings.seed,
-            "trials_planned": self.settings.trials,
-            "trials_run": sum(self.outcomes.values()),
-            "outcomes": self.outcomes,
-            "stopped_because": self.stopped_because,
-            "wall_s": round(self.wall_s, 3),
-            "steps_total": self.steps_total,
-            "crashes": [bundle.summary() for bundle in self.crashes],
-        }
-
-
-@dataclass(slots=True)
-class _Progress:
-    """What this run of the hunt has seen."""
-
-    began: float = field(default_factory=time.monotonic)
-    ended_here: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    steps_total: int = 0
-    crashes: list[Bundle] = field(default_factory=list)
-    found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
-    nearest: TrialResult | None = None
-    last_invalid: TrialResult | None = None
-    untold: dict[int, TrialResult] = field(default_factory=dict)  # that the sampler has not been told yet
-    next_told: int = 0
 
 
 class Hunt:
@@ -176,13 +92,13 @@ class Hunt:
             ledger = Ledger(self.directory / "ledger.sqlite", writable=True)
             try:
                 return self._run(ledger, watch or (lambda _: None))
-            except CrashhuntError:
+            except CrashhuntError as error:
                 with suppress(CrashhuntError):
-                    ledger.note(state="error")
+                    ledger.enter("error", str(error))
                 raise
             except OSError as error:
                 with suppress(CrashhuntError):
-                    ledger.note(state="error")
+                    ledger.enter("error", f"{error.strerror or error}: {error.filename or self.directory}")
                 raise HuntDirectoryError(
                     f"{error.strerror or error}",
                     fix="free some space or make the folder writable, and run the same command again",
@@ -190,7 +106,7 @@ class Hunt:
                 ) from error
             finally:
                 with suppress(CrashhuntError):
-                    ledger.note(pid=None, heartbeat=time.time())
+                    ledger.note(owner=None, heartbeat=time.time())
                 ledger.close()
                 shutil.rmtree(self._place.scratch, ignore_errors=True)
 
@@ -198,14 +114,21 @@ class Hunt:
         settings = self.settings
         snapshot = take_snapshot(self.directory / "snapshots", self.scenario, settings, self._snapshot_options)
         sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
-        progress = _Progress()
+        progress = Progress()
         finished = ledger.finished()
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         progress.crashes = list_bundles(self.directory)
         for result in ledger.results() if sampler.learns else ():
             self._teach(result, sampler, progress)
-        ledger.note(state="running", pid=os.getpid(), heartbeat=time.time(), planned=settings.trials)
+        ledger.enter(
+            "running",
+            owner=this_process(),
+            began=time.time(),
+            done_before=len(finished),
+            heartbeat=time.time(),
+            planned=settings.trials,
+        )
         stopped: StoppedBecause | None = None
         if progress.crashes and not settings.run.keep_going:
             stopped = "crash"
@@ -213,11 +136,11 @@ class Hunt:
             stopped = self._hunt(ledger, sampler, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
-        ledger.note(state=stopped, heartbeat=time.time())
         watch(self._status(progress, "done"))
         reason = ""
         if stopped == "no_valid_trial" and progress.last_invalid is not None:
             reason = _why_invalid(progress.last_invalid)
+        ledger.enter(stopped, reason, heartbeat=time.time())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
             self.directory,
@@ -235,7 +158,7 @@ class Hunt:
         ledger: Ledger,
         sampler: Sampler,
         snapshot: Snapshot,
-        progress: _Progress,
+        progress: Progress,
         finished: set[int],
         watch: Callable[[HuntStatus], None],
     ) -> StoppedBecause:
@@ -299,7 +222,7 @@ class Hunt:
         return "all_trials"
 
     def _take(
-        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: _Progress
+        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: Progress
     ) -> None:
         """Account for a trial that has ended."""
         settings = self.settings
@@ -322,7 +245,7 @@ class Hunt:
             write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
 
-    def _teach(self, result: TrialResult, sampler: Sampler, progress: _Progress) -> None:
+    def _teach(self, result: TrialResult, sampler: Sampler, progress: Progress) -> None:
         """Tell a sampler that learns how trials ended, in the order of their numbers."""
         if not sampler.learns:
             return
@@ -331,7 +254,7 @@ class Hunt:
             sampler.tell(progress.untold.pop(progress.next_told))
             progress.next_told += 1
 
-    def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: _Progress) -> None:
+    def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
         """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
         bundle = write_bundle(
             self.directory,
@@ -344,7 +267,7 @@ class Hunt:
         progress.crashes.append(bundle)
         ledger.record(result, snapshot=snapshot.digest)
 
-    def _confirm(self, progress: _Progress) -> None:
+    def _confirm(self, progress: Progress) -> None:
         """Run every crash that nobody has confirmed yet once more, in a fresh process."""
         for place, bundle in enumerate(progress.crashes):
             if bundle.confirmed is None and not self._interrupted:
@@ -352,12 +275,12 @@ class Hunt:
                 confirmed.write()
                 progress.crashes[place] = confirmed
 
-    def _hopeless(self, progress: _Progress, finished: set[int]) -> bool:
+    def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
         enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
         invalid = progress.outcomes[str(Outcome.INVALID)]
         return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
 
-    def _status(self, progress: _Progress, phase: str, workers: dict[int, BlackBoxHeader] | None = None) -> HuntStatus:
+    def _status(self, progress: Progress, phase: str, workers: dict[int, BlackBoxHeader] | None = None) -> HuntStatus:
         elapsed = time.monotonic() - progress.began
         return HuntStatus(
             phase,

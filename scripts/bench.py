@@ -376,7 +376,7 @@ def child_replay(directory: str) -> dict[str, float]:
     """Steps a second of a hunt and of the replays of its crash."""
     from crashhunt.bundle import find_bundle
     from crashhunt.ledger import Ledger
-    from crashhunt.replay import replay
+    from crashhunt.replays import replay
 
     bundle = find_bundle(Path(directory))
     began = time.perf_counter()

@@ -16,6 +16,8 @@ from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
+from crashhunt.cli._status import add_status
+from crashhunt.cli._trials import add_trials
 from crashhunt.errors import CrashhuntError
 
 if TYPE_CHECKING:
@@ -67,6 +69,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (add_run, add_replay, add_show, add_report, add_export, add_lists):
+    for add in (add_run, add_replay, add_show, add_report, add_export, add_status, add_trials, add_lists):
         add(commands)
     return parser

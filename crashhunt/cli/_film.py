@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
     from crashhunt.recording import Recording
     from crashhunt.render.film import FilmOptions, Shot
-    from crashhunt.replay import ReplayOptions, ReplayReport
+    from crashhunt.replays import ReplayOptions, ReplayReport
     from crashhunt.trial import TrialResult
 
 __all__ = ["add_film_options", "film_options", "filmed", "look_at_all", "recorded_shot", "replayed_shot", "write_films"]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
-    from crashhunt.replay import ReplayOptions, ReplayReport
+    from crashhunt.replays import ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
 
@@ -90,7 +90,7 @@ def add_replay(commands: Any) -> None:
 
 
 def _replay(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.replay import ReplayOptions
+    from crashhunt.replays import ReplayOptions
 
     chosen = ReplayOptions(
         code="log" if options.from_log else options.code,
@@ -130,7 +130,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
 def _replay_one(
     options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
 ) -> tuple[ReplayReport, dict[str, Any]]:
-    from crashhunt.replay import replay
+    from crashhunt.replays import replay
     from crashhunt.report import describe_replay, format_table, steps_table
 
     report = replay(bundle, chosen)

@@ -10,7 +10,7 @@ from crashhunt.report._screen import format_arguments, format_seconds
 if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
     from crashhunt.hunt import HuntReport
-    from crashhunt.replay import ReplayReport
+    from crashhunt.replays import ReplayReport
     from crashhunt.trial import TrialResult
 
 __all__ = ["describe_hunt", "describe_replay"]

@@ -1,0 +1,88 @@
+"""``crashhunt status``."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json
+
+if TYPE_CHECKING:
+    import argparse
+
+    from rich.table import Table
+
+    from crashhunt.status import HuntState
+
+__all__ = ["add_status"]
+
+_COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
+
+
+def add_status(commands: Any) -> None:
+    """Add the command."""
+    status = commands.add_parser(
+        "status",
+        help="say where hunts stand",
+        description="Say where hunts stand, also while they run and after they were killed.",
+    )
+    status.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of a hunt or a suite")
+    status.add_argument("--watch", action="store_true", help="refresh every second, until all have ended")
+    add_json(status)
+    status.set_defaults(command=_status)
+
+
+def _status(options: argparse.Namespace, _words: list[str]) -> int:
+    from rich.console import Console
+    from rich.live import Live
+
+    if options.json:
+        print(json.dumps({"hunts": [state.to_json() for state in _states(options.directories)]}))
+        return 0
+    console = Console(highlight=False)
+    states = _states(options.directories)
+    if not options.watch:
+        console.print(_table(states))
+        return 0
+    with Live(_table(states), console=console, auto_refresh=False) as live:
+        while any(state.state in ("running", "queued") for state in states):
+            time.sleep(1.0)
+            states = _states(options.directories)
+            live.update(_table(states), refresh=True)
+    return 0
+
+
+def _states(directories: list[Path]) -> list[HuntState]:
+    from crashhunt.status import find_hunts, hunt_state
+
+    return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
+
+
+def _table(states: list[HuntState]) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from crashhunt.report import format_seconds
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("hunt", overflow="fold")
+    table.add_column("state")
+    for name in ("trials", "per s", "left", "crashes", "errors"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("outcomes", overflow="fold")
+    for state in states:
+        said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
+        table.add_row(
+            Text(state.dir),
+            Text(state.state, style=_COLORS.get(state.state, "")),
+            f"{state.trials_run}/{state.trials_planned}",
+            f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
+            format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
+            str(state.crashes),
+            str(state.errors),
+            Text("; ".join(filter(None, (said, state.detail.splitlines()[0] if state.detail else "")))),
+        )
+    return table

@@ -1,0 +1,70 @@
+"""``crashhunt trials``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import HuntDirectoryError, UsageError
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["add_trials"]
+
+
+def add_trials(commands: Any) -> None:
+    """Add the command."""
+    from crashhunt.trial import Outcome
+
+    trials = commands.add_parser(
+        "trials",
+        help="write the trials of a hunt as a table",
+        description="Write the trials of a hunt as a table, a row each: number, seed, outcome, steps, how near it "
+        "came, and every argument.",
+    )
+    trials.add_argument("directory", metavar="DIR", type=Path, help="of the hunt")
+    trials.add_argument(
+        "--format", choices=("csv", "json", "jsonl", "parquet"), default="csv",
+        help="default: csv; parquet needs --out and pip install 'crashhunt[parquet]'",
+    )  # fmt: skip
+    trials.add_argument("--out", metavar="FILE", type=Path, help="where; default: standard output")
+    trials.add_argument(
+        "--outcome", metavar="KIND,…", default="", help=f"only these: {', '.join(str(kind) for kind in Outcome)}"
+    )
+    trials.set_defaults(command=_trials)
+
+
+def _trials(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.results import HuntResults
+    from crashhunt.tables import write_parquet, write_text
+    from crashhunt.trial import Outcome
+
+    outcomes = [name for name in options.outcome.split(",") if name]
+    for name in outcomes:
+        if name not in list(Outcome):
+            raise UsageError(f"--outcome {name!r} is none", fix=f"give some of {','.join(Outcome)}")
+    hunt = HuntResults(options.directory)
+    if options.out is None:
+        if options.format == "parquet":
+            raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")
+        write_text(hunt, sys.stdout, options.format, outcomes=outcomes)
+        return 0
+    try:
+        if options.format == "parquet":
+            count = write_parquet(hunt, options.out, outcomes=outcomes)
+        else:
+            temporary = options.out.with_name(f".{options.out.name}.part")
+            try:
+                with temporary.open("w", encoding="utf-8", newline="") as file:
+                    count = write_text(hunt, file, options.format, outcomes=outcomes)
+                temporary.replace(options.out)
+            finally:
+                temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise HuntDirectoryError(
+            f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(options.out)
+        ) from error
+    print(f"{options.out} has {count} trials", file=sys.stderr)
+    return 0

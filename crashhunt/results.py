@@ -1,0 +1,218 @@
+"""What hunts have left on disk, as objects: ``crashhunt.load(directory)``."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.bundle import Bundle, list_bundles
+from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.executors import Parts, WorkerSettings
+from crashhunt.ledger import Ledger
+from crashhunt.plan import with_settings
+from crashhunt.settings import HuntSettings, read_settings
+from crashhunt.snapshot import Snapshot
+from crashhunt.status import HuntState, find_hunts, hunt_state
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.agents import Agent
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import TrialResult
+
+__all__ = ["HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load", "row_of"]
+
+_COLUMNS = (
+    "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
+    "wall_s", "digest",
+)  # fmt: skip
+
+
+class UnfinishedWarning(UserWarning):
+    """What was loaded is not, or not yet, what was asked for."""
+
+
+class HuntResults:
+    """A hunt that has been run, or is running.
+
+    Args:
+        directory: of the hunt.
+
+    Raises:
+        HuntDirectoryError: it is not one.
+    """
+
+    def __init__(self, directory: Path | str) -> None:
+        self.directory = Path(directory)
+        self.state: HuntState = hunt_state(self.directory)
+
+    def __repr__(self) -> str:
+        state = self.state
+        return (
+            f"<hunt {str(self.directory)!r}: {state.state}, {state.trials_run} of {state.trials_planned} trials, "
+            f"{state.crashes} crash{'' if state.crashes == 1 else 'es'}>"
+        )
+
+    @cached_property
+    def settings(self) -> HuntSettings:
+        """What was asked."""
+        return read_settings(self.directory / "hunt.toml")
+
+    @property
+    def crashes(self) -> list[Bundle]:
+        """What was found, in order of the trials; `Bundle.recording` has the arrays."""
+        return list_bundles(self.directory)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario as it ran, with the agents at the wheel."""
+        return with_settings(self._snapshot().scenario(), self.settings)
+
+    def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
+        """Yield the trials in order of their numbers, all or those that ended in one of some ways."""
+        ledger = Ledger(self.directory / "ledger.sqlite")
+        try:
+            yield from ledger.results(outcomes=tuple(outcomes))
+        finally:
+            ledger.close()
+
+    def trial(self, number: int) -> TrialResult:
+        """Return one trial.
+
+        Raises:
+            UsageError: it has not ended.
+        """
+        ledger = Ledger(self.directory / "ledger.sqlite")
+        try:
+            found = ledger.result(number)
+        finally:
+            ledger.close()
+        if found is None:
+            raise UsageError(f"trial {number} has not ended", fix=f"{self.state.trials_run} trials have")
+        return found
+
+    def trials(self) -> NDArray[Any]:
+        """Return a row per trial, as a structured array, shape (trials,).
+
+        Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A number that
+        there is none of is NaN.
+        """
+        names = columns_of(self.settings)
+        columns: dict[str, list[Any]] = {name: [] for name in names}
+        for result in self.results():
+            for name, value in row_of(result, names).items():
+                columns[name].append(value)
+        arrays = {name: _column(values) for name, values in columns.items()}
+        table = np.empty(len(columns["number"]), [(name, array.dtype) for name, array in arrays.items()])
+        for name, array in arrays.items():
+            table[name] = array
+        return table
+
+    def dataframe(self) -> Any:
+        """Return the same as a `pandas.DataFrame`.
+
+        Raises:
+            UsageError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise UsageError("a dataframe needs pandas", fix="pip install pandas, or take trials()") from None
+        return pd.DataFrame(self.trials())
+
+    def agent(self, trial: int, agent: str = "") -> Agent:
+        """Return an agent made as in a trial, with today's code.
+
+        Args:
+            trial: its number.
+            agent: the vehicle's id; may be empty where there is one.
+
+        Raises:
+            UsageError: there is no such vehicle or trial.
+        """
+        import tempfile
+
+        arguments = self.trial(trial).spec.arguments
+        name = agent or next(iter(arguments))
+        if name not in arguments:
+            raise UsageError(f"there is no controlled vehicle {name!r}", fix=f"give one of {', '.join(arguments)}")
+        with tempfile.TemporaryDirectory(prefix="crashhunt-") as folder:
+            settings = WorkerSettings(scenario=self.scenario, oracles=(), crash_on=(), scratch=Path(folder))
+            parts = Parts(settings)
+            return parts.agent(name, parts.simulator(), arguments[name])
+
+    def _snapshot(self) -> Snapshot:
+        snapshots = sorted((self.directory / "snapshots").glob("[!.]*"), key=lambda path: path.stat().st_mtime)
+        if not snapshots:
+            raise HuntDirectoryError("the hunt has not begun: it has no snapshot", where=str(self.directory))
+        return Snapshot(snapshots[-1])
+
+
+class SuiteResults(dict[str, HuntResults]):
+    """The hunts of a suite: id and run, such as ``town/0``, to the hunt."""
+
+    def __init__(self, directory: Path, hunts: Sequence[Path]) -> None:
+        super().__init__({path.relative_to(directory).as_posix(): HuntResults(path) for path in hunts})
+        self.directory = directory
+
+    def __repr__(self) -> str:
+        states = [hunt.state.state for hunt in self.values()]
+        counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+        return f"<suite {str(self.directory)!r}: {len(self)} hunts, {counts}>"
+
+
+def load(directory: Path | str) -> HuntResults | SuiteResults:
+    """Load a hunt, or all hunts of a suite. What is not finished is loaded as far as it is, with a warning.
+
+    Raises:
+        HuntDirectoryError: there is no hunt.
+    """
+    place = Path(directory)
+    hunts = find_hunts(place)
+    found: HuntResults | SuiteResults = HuntResults(place) if hunts == [place] else SuiteResults(place, hunts)
+    for hunt in [found] if isinstance(found, HuntResults) else found.values():
+        if hunt.state.state not in ("finished", "crashed"):
+            detail = f": {hunt.state.detail}" if hunt.state.detail else ""
+            warnings.warn(f"{hunt!r} is not finished{detail}", UnfinishedWarning, stacklevel=2)
+    return found
+
+
+def columns_of(settings: HuntSettings) -> tuple[str, ...]:
+    """Return the columns of a table of trials: facts, then ``AGENT.ARGUMENT``, then the scenario's arguments."""
+    arguments = [f"{agent}.{name}" for agent, chosen in settings.agents.items() for name in sorted(chosen.arguments)]
+    return (*_COLUMNS, *arguments, *sorted(settings.scenario_arguments))
+
+
+def row_of(result: TrialResult, columns: Sequence[str]) -> dict[str, Any]:
+    """Return a trial as a row of the table; None where it has no such value."""
+    spec, closest = result.spec, result.closest.to_json()
+    values: dict[str, Any] = {
+        **spec.scenario_arguments,
+        **{f"{agent}.{name}": value for agent, given in spec.arguments.items() for name, value in given.items()},
+        **closest,
+        "number": spec.number,
+        "seed": spec.seed,
+        "outcome": str(result.outcome),
+        "steps": result.steps,
+        "sim_time_s": result.sim_time_s,
+        "wall_s": result.wall_s,
+        "digest": result.digest,
+    }
+    return {name: values.get(name) for name in columns}
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    if all(isinstance(value, bool) for value in values):
+        return np.array(values, bool)
+    if all(isinstance(value, int) for value in values):
+        return np.array(values, np.int64)
+    if all(value is None or isinstance(value, int | float) for value in values):
+        return np.array([np.nan if value is None else value for value in values], float)
+    return np.array(["" if value is None else str(value) for value in values])

@@ -1,0 +1,107 @@
+"""Trials as tables in files: CSV, JSON, JSON lines and Parquet, written row by row."""
+
+from __future__ import annotations
+
+import csv
+import json
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TextIO
+
+from crashhunt.errors import UsageError
+from crashhunt.results import HuntResults, columns_of, row_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+__all__ = ["FORMATS", "write_parquet", "write_text"]
+
+FORMATS = ("csv", "json", "jsonl", "parquet")
+_BATCH = 10_000  # rows of a Parquet row group that are in memory at a time
+
+
+def write_text(hunt: HuntResults, out: TextIO, form: str, *, outcomes: Sequence[str] = ()) -> int:
+    """Write the trials of a hunt as text; return how many.
+
+    Args:
+        hunt: whose.
+        out: where.
+        form: ``csv``, ``json`` (one array) or ``jsonl`` (an object per line).
+        outcomes: only those; empty for all.
+    """
+    names = columns_of(hunt.settings)
+    count = 0
+    if form == "csv":
+        writer = csv.writer(out)
+        writer.writerow(names)
+        for row in _rows(hunt, names, outcomes):
+            writer.writerow(["" if value is None else value for value in row.values()])
+            count += 1
+        return count
+    opening, between, closing = ("[\n", ",\n", "\n]\n") if form == "json" else ("", "\n", "\n")
+    out.write(opening)
+    for row in _rows(hunt, names, outcomes):
+        out.write((between if count else "") + json.dumps(row))
+        count += 1
+    out.write(closing if count or form == "json" else "")
+    return count
+
+
+def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()) -> int:
+    """Write the trials of a hunt as a Parquet file; return how many.
+
+    Raises:
+        UsageError: fastparquet is not installed.
+    """
+    try:
+        # Not pyarrow: libsumo brings an Arrow of its own along, and warns of every other in the same environment.
+        import fastparquet
+        import pandas as pd
+    except ImportError:
+        raise UsageError("Parquet needs fastparquet", fix="pip install 'crashhunt[parquet]', or give csv") from None
+    names = columns_of(hunt.settings)
+    rows = _rows(hunt, names, outcomes)
+    batch = list(islice(rows, _BATCH))
+    kinds = _kinds(hunt, batch)
+    count = 0
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        while batch or not count:
+            frame = pd.DataFrame(
+                {name: pd.array([_as(row[name], kinds[name]) for row in batch], dtype=kinds[name]) for name in names}
+            )
+            fastparquet.write(str(temporary), frame, append=count > 0, write_index=False)
+            count += len(batch)
+            batch = list(islice(rows, _BATCH))
+            if not count:
+                break
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
+
+
+def _rows(hunt: HuntResults, names: Sequence[str], outcomes: Sequence[str]) -> Iterator[dict[str, Any]]:
+    for result in hunt.results(outcomes=outcomes):
+        yield row_of(result, names)
+
+
+def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
+    """The type of each column, which a row group cannot find out by itself."""
+    settings = hunt.settings
+    specs = dict(settings.scenario_arguments)
+    for agent, chosen in settings.agents.items():
+        specs |= {f"{agent}.{name}": spec for name, spec in chosen.arguments.items()}
+    known = {"int": "Int64", "float": "Float64", "bool": "boolean", "str": "string"}
+    kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "string", "digest": "string"}
+    for name in columns_of(settings):
+        kind = specs[name].kind if name in specs else "float"
+        if kind is None:  # the agent does not say; what was tried first does
+            numeric = all(isinstance(row[name], int | float | None) for row in batch)
+            kind = "float" if numeric else "str"
+        kinds.setdefault(name, known[kind])
+    return kinds
+
+
+def _as(value: Any, kind: str) -> Any:
+    return str(value) if kind == "string" and value is not None else value
