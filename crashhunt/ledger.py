@@ -190,10 +190,10 @@ class Ledger:
         ]
         return self.result(min(least)[1]) if least else None
 
-    def table(self) -> Iterator[tuple[int, int, str, int]]:
-        """Yield number, seed, outcome and steps of every trial, in no particular order."""
+    def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
+        """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order."""
         yield from self._database.execute(
-            "SELECT number, seed, outcome, steps FROM trials INDEXED BY trials_by_outcome"
+            "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome"
         )
 
     def last_ended_at(self) -> float | None:

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load", "row_of"]
+__all__ = ["FACTS", "HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load", "row_of"]
 
-_COLUMNS = (
+FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
     "wall_s", "digest",
 )  # fmt: skip
@@ -187,7 +187,7 @@ def load(directory: Path | str) -> HuntResults | SuiteResults:
 def columns_of(settings: HuntSettings) -> tuple[str, ...]:
     """Return the columns of a table of trials: facts, then ``AGENT.ARGUMENT``, then the scenario's arguments."""
     arguments = [f"{agent}.{name}" for agent, chosen in settings.agents.items() for name in sorted(chosen.arguments)]
-    return (*_COLUMNS, *arguments, *sorted(settings.scenario_arguments))
+    return (*FACTS, *arguments, *sorted(settings.scenario_arguments))
 
 
 def row_of(result: TrialResult, columns: Sequence[str]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt import __version__
 from crashhunt.cli._common import Parser
+from crashhunt.cli._compare import add_compare
 from crashhunt.cli._export import add_export
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._replay import add_replay
@@ -69,6 +70,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (add_run, add_replay, add_show, add_report, add_export, add_status, add_trials, add_lists):
+    for add in (add_run, add_replay, add_show, add_report, add_export, add_status, add_trials, add_compare, add_lists):
         add(commands)
     return parser

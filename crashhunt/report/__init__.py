@@ -1,5 +1,6 @@
 """Reports: what people are told."""
 
+from crashhunt.report._compare import comparison_page, describe_comparison
 from crashhunt.report._page import report_data, write_report
 from crashhunt.report._screen import Watcher, format_arguments, format_seconds
 from crashhunt.report._show import Story
@@ -9,6 +10,8 @@ from crashhunt.report._table import format_table, steps_table
 __all__ = [
     "Story",
     "Watcher",
+    "comparison_page",
+    "describe_comparison",
     "describe_hunt",
     "describe_replay",
     "format_arguments",

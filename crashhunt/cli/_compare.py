@@ -1,0 +1,47 @@
+"""``crashhunt compare``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json, say
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["add_compare"]
+
+
+def add_compare(commands: Any) -> None:
+    """Add the command."""
+    compare = commands.add_parser(
+        "compare",
+        help="say which of several hunts crashes less",
+        description="Compare hunts: crash rates with their confidence intervals, and over trials with the same seeds "
+        "whether one crashes less than the first. Run two versions of an agent with the same --seed and --keep-going.",
+    )
+    compare.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of two hunts or more")
+    compare.add_argument("--csv", action="store_true", help="print a line per hunt as CSV")
+    compare.add_argument("--html", metavar="FILE", type=Path, help="write a page with plots")
+    add_json(compare)
+    compare.set_defaults(command=_compare)
+
+
+def _compare(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.comparison import compare
+    from crashhunt.report import comparison_page, describe_comparison
+
+    found = compare(*options.directories)
+    if options.csv:
+        found.write_csv(sys.stdout)
+    else:
+        say(describe_comparison(found), as_json=options.json)
+    if options.html is not None:
+        comparison_page(found, options.html)
+        say(f"{options.html} has the plots", as_json=options.json or options.csv)
+    if options.json:
+        print(json.dumps(found.to_json()))
+    return 0

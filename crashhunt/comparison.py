@@ -1,0 +1,243 @@
+"""Which of several hunts crashes more often, and whether that is more than chance."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+
+from crashhunt.errors import UsageError
+from crashhunt.ledger import Ledger
+from crashhunt.results import HuntResults
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["Comparison", "HuntFigures", "Pair", "compare"]
+
+_CONFIDENCE = 0.95
+_INDEPENDENT = ("random",)  # samplers that draw every trial independently of the others
+
+
+@dataclass(frozen=True, slots=True)
+class HuntFigures:
+    """One hunt in numbers.
+
+    Args:
+        dir: its directory.
+        state: where it stands.
+        agents: vehicle to who drives it.
+        trials: that were valid.
+        crashes: of them.
+        crash_rate: of them, from 0 to 1; NaN where there is no trial.
+        interval: Clopper and Pearson's, of 95 % confidence; None where the trials do not allow one.
+        why_not: why there is no interval.
+        median_steps_to_crash: NaN where there was no crash.
+        median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
+            on a collision course.
+        outcomes: how many trials ended how, invalid ones too.
+    """
+
+    dir: str
+    state: str
+    agents: dict[str, str]
+    trials: int
+    crashes: int
+    crash_rate: float
+    interval: tuple[float, float] | None
+    why_not: str
+    median_steps_to_crash: float
+    median_time_to_collision_s: float
+    outcomes: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two hunts over the trials that have the same number and seed.
+
+    Args:
+        first: directory.
+        second: directory.
+        trials: how many pairs.
+        only_first: pairs in which only the first crashed.
+        only_second: pairs in which only the second did.
+        both: in which both did.
+        p_value: of McNemar's exact test that neither crashes more often; 1 where nothing tells them apart.
+        caution: why the answer may mean something else; empty for nothing.
+    """
+
+    first: str
+    second: str
+    trials: int
+    only_first: int
+    only_second: int
+    both: int
+    p_value: float
+    caution: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The answer in words."""
+        if not self.trials:
+            return f"{self.first} and {self.second} have no seed in common: run both with the same --seed"
+        counts = (
+            f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
+            f"{self.only_second} only in {self.second}, {self.both} in both "
+            f"(McNemar's exact test: p = {self.p_value:.2g})"
+        )
+        if self.p_value >= 1 - _CONFIDENCE:
+            return f"no difference that chance does not explain: {counts}"
+        better = self.second if self.only_first > self.only_second else self.first
+        return f"{better} crashes less: {counts}"
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Several hunts side by side.
+
+    Args:
+        hunts: in the order in which they were given.
+        pairs: the first against each other one.
+    """
+
+    hunts: tuple[HuntFigures, ...]
+    pairs: tuple[Pair, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the shape that ``compare --json`` prints; what is no finite number is null."""
+        return {
+            "hunts": [_finite(asdict(hunt)) for hunt in self.hunts],
+            "pairs": [{**_finite(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
+        }
+
+    def write_csv(self, out: TextIO) -> None:
+        """Write a line per hunt."""
+        names = ("dir", "state", "trials", "crashes", "crash_rate", "rate_low", "rate_high", "why_not",
+                 "median_steps_to_crash", "median_time_to_collision_s", *map(str, Outcome))  # fmt: skip
+        writer = csv.DictWriter(out, names)
+        writer.writeheader()
+        for hunt in self.hunts:
+            low, high = hunt.interval or ("", "")
+            row = {name: getattr(hunt, name) for name in names if hasattr(hunt, name)}
+            counts = {str(kind): hunt.outcomes.get(kind, 0) for kind in Outcome}
+            writer.writerow({**row, **counts, "rate_low": low, "rate_high": high})
+
+    def __repr__(self) -> str:
+        rates = ", ".join(f"{hunt.dir}: {hunt.crashes} of {hunt.trials}" for hunt in self.hunts)
+        return f"<comparison {rates}>"
+
+
+def compare(*directories: Path | str) -> Comparison:
+    """Compare hunts: how often each crashed, and over trials with the same seeds, whether one crashes less.
+
+    Raises:
+        UsageError: fewer than two are given.
+        HuntDirectoryError: one is not the directory of a hunt.
+    """
+    if len(directories) < 2:
+        raise UsageError("there is nothing to compare with", fix="give the directories of two hunts or more")
+    hunts = [HuntResults(directory) for directory in directories]
+    tables = [_table(hunt) for hunt in hunts]
+    figures = tuple(_figures(hunt, table) for hunt, table in zip(hunts, tables, strict=True))
+    pairs = tuple(_pair(hunts[0], tables[0], hunt, table) for hunt, table in zip(hunts[1:], tables[1:], strict=True))
+    return Comparison(figures, pairs)
+
+
+def _table(hunt: HuntResults) -> NDArray[Any]:
+    """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers."""
+    kinds = {str(kind): kind for kind in Outcome}
+    crash_on = hunt.settings.crash_on
+    ledger = Ledger(hunt.directory / "ledger.sqlite")
+    fields = [("number", "i8"), ("seed", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
+    try:
+        rows = (
+            (number, seed, steps, np.inf if ttc is None else ttc, kind is not Outcome.INVALID, kind in crash_on)
+            for number, seed, name, steps, ttc in ledger.table()
+            for kind in (kinds[name],)
+        )
+        table = np.fromiter(rows, fields)
+    finally:
+        ledger.close()
+    return np.sort(table, order="number")
+
+
+def _figures(hunt: HuntResults, table: NDArray[Any]) -> HuntFigures:
+    valid = table[table["valid"]]
+    crashes = int(valid["crash"].sum())
+    crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
+    why_not = _why_no_interval(hunt, crashes)
+    interval = None
+    if not why_not and len(valid):
+        from scipy.stats import binomtest
+
+        found = binomtest(crashes, len(valid)).proportion_ci(_CONFIDENCE, "exact")
+        interval = (float(found.low), float(found.high))
+    return HuntFigures(
+        str(hunt.directory),
+        hunt.state.state,
+        {agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
+        len(valid),
+        crashes,
+        crashes / len(valid) if len(valid) else float("nan"),
+        interval,
+        why_not if len(valid) else "there is no valid trial",
+        float(np.median(crashed["steps"])) if crashes else float("nan"),
+        float(np.median(fine["ttc"])) if len(fine) else float("nan"),
+        hunt.state.outcomes,
+    )
+
+
+def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
+    settings = hunt.settings
+    if settings.sampler not in _INDEPENDENT:
+        return f"the sampler {settings.sampler} does not draw trials independently"
+    if crashes and not settings.run.keep_going:
+        return "it stopped at its first crash, and the rate of such a hunt is too high; use --keep-going"
+    if hunt.state.state not in ("finished", "crashed"):
+        return f"it is {hunt.state.state}, and quick trials are over-represented"
+    return ""
+
+
+def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: NDArray[Any]) -> Pair:
+    _, in_left, in_right = np.intersect1d(left["number"], right["number"], assume_unique=True, return_indices=True)
+    left, right = left[in_left], right[in_right]
+    same = (left["seed"] == right["seed"]) & left["valid"] & right["valid"]
+    a, b = left["crash"][same], right["crash"][same]
+    only_first, only_second = int((a & ~b).sum()), int((~a & b).sum())
+    p_value = 1.0
+    if only_first + only_second:
+        from scipy.stats import binomtest
+
+        p_value = float(binomtest(only_first, only_first + only_second).pvalue)
+    return Pair(
+        str(first.directory),
+        str(second.directory),
+        int(same.sum()),
+        only_first,
+        only_second,
+        int((a & b).sum()),
+        p_value,
+        _caution(first, second),
+    )
+
+
+def _caution(first: HuntResults, second: HuntResults) -> str:
+    one, other = first.settings, second.settings
+    if (one.scenario_arguments, one.scenario_digest) != (other.scenario_arguments, other.scenario_digest):
+        return "their scenarios differ, so that the same seed is another traffic"
+    if one.crash_on != other.crash_on:
+        return "they do not count the same outcomes as crashes"
+    if not (one.run.keep_going and other.run.keep_going):
+        return "one that stops at its first crash runs fewer trials; use --keep-going"
+    return ""
+
+
+def _finite(data: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value for name, value in data.items()
+    }

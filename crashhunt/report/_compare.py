@@ -1,0 +1,203 @@
+"""Several hunts side by side: a table for the terminal, and a page with plots."""
+
+from __future__ import annotations
+
+import html
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.results import FACTS, HuntResults, columns_of, row_of
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.comparison import Comparison, HuntFigures
+
+__all__ = ["comparison_page", "describe_comparison"]
+
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
+_BINS = 10
+_MOST = 200_000  # trials of a hunt that the plots are made from
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1b2430; --faint: #5d6b7d; --line: #d9dfe7; --paper: #fff; --back: #f6f7f9; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6ebf2; --faint: #9aa8ba; --line: #38465a; --paper: #1d2632; --back: #131a23; } }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 68rem; padding: 0 1rem;
+  color: var(--ink); background: var(--back); }
+table { border-collapse: collapse; width: 100%; background: var(--paper); }
+th, td { text-align: left; padding: .4rem .7rem; border: 1px solid var(--line); }
+.plots { display: flex; flex-wrap: wrap; gap: 1rem; }
+figure { margin: 0; padding: .7rem; background: var(--paper); border: 1px solid var(--line); border-radius: 6px; }
+figcaption { font-weight: 600; } svg text { font-size: 11px; fill: var(--faint); }
+.key { display: inline-block; width: .8em; height: .8em; border-radius: 2px; margin-right: .4em; }
+svg .axis { stroke: var(--line); fill: none; }
+"""
+
+
+def describe_comparison(found: Comparison) -> str:
+    """Return a comparison for people."""
+    header = ("hunt", "trials", "crashes", "crash rate", "95 % interval", "median step", "median TTC")
+    rows = [
+        (
+            hunt.dir,
+            str(hunt.trials),
+            str(hunt.crashes),
+            f"{hunt.crash_rate:.2%}" if hunt.trials else "-",
+            f"{hunt.interval[0]:.2%} to {hunt.interval[1]:.2%}" if hunt.interval else "-",
+            f"{hunt.median_steps_to_crash:g}" if hunt.crashes else "-",
+            f"{hunt.median_time_to_collision_s:.2f} s" if np.isfinite(hunt.median_time_to_collision_s) else "-",
+        )
+        for hunt in found.hunts
+    ]
+    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]).rstrip()
+        for row in [header, *rows]
+    ]
+    lines += [f"{hunt.dir}: no interval, for {hunt.why_not}" for hunt in found.hunts if hunt.why_not]
+    for pair in found.pairs:
+        lines += ["", pair.verdict]
+        if pair.caution:
+            lines.append(f"  but {pair.caution}")
+    return "\n".join(lines)
+
+
+def comparison_page(found: Comparison, path: Path) -> None:
+    """Write a page that works without a network: rates with intervals, outcomes, crash rate against each argument.
+
+    Raises:
+        HuntDirectoryError: it cannot be written.
+    """
+    colors = {hunt.dir: _COLORS[place % len(_COLORS)] for place, hunt in enumerate(found.hunts)}
+    answers = "".join(
+        f"<p>{html.escape(pair.verdict)}{f'; but {html.escape(pair.caution)}' if pair.caution else ''}</p>"
+        for pair in found.pairs
+    )
+    keys = "".join(
+        f'<span><span class="key" style="background:{color}"></span>{html.escape(name)}&emsp;</span>'
+        for name, color in colors.items()
+    )
+    plots = "".join(_argument_plots(found.hunts, colors))
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Comparison</title>'
+        f"<style>{_STYLE}</style></head><body><h1>Comparison</h1>{answers}<p>{keys}</p>"
+        f"<h2>Crash rate</h2>{_rates(found.hunts, colors)}"
+        f"<h2>Outcomes</h2>{_outcomes(found.hunts)}"
+        f'<h2>Crash rate against each argument</h2><div class="plots">{plots}</div></body></html>\n'
+    )
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_text(page, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise HuntDirectoryError(
+            f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(path)
+        ) from error
+
+
+def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
+    most = max([hunt.interval[1] if hunt.interval else hunt.crash_rate for hunt in hunts if hunt.trials] or [1.0])
+    scale, parts = 560 / max(most, 1e-9), []
+    for place, hunt in enumerate(hunts):
+        y = 18 + 30 * place
+        rate = hunt.crash_rate if hunt.trials else 0.0
+        said = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
+        parts.append(f'<rect x="0" y="{y - 9}" width="{rate * scale:.1f}" height="18" fill="{colors[hunt.dir]}"/>')
+        end = rate
+        if hunt.interval:
+            low, end = hunt.interval
+            parts.append(
+                f'<path d="M{low * scale:.1f} {y}H{end * scale:.1f}M{low * scale:.1f} {y - 5}v10M{end * scale:.1f} '
+                f'{y - 5}v10" stroke="currentColor" stroke-width="1.5"/>'
+            )
+        parts.append(f'<text x="{end * scale + 8:.1f}" y="{y + 4}">{said}</text>')
+    return (
+        f'<figure><svg width="720" height="{30 * len(hunts) + 8}" role="img" aria-label="crash rates with 95 % '
+        f'intervals">{"".join(parts)}</svg></figure>'
+    )
+
+
+def _outcomes(hunts: Sequence[HuntFigures]) -> str:
+    kinds = [str(kind) for kind in Outcome if any(hunt.outcomes.get(kind) for hunt in hunts)]
+    head = "".join(f"<th>{kind}</th>" for kind in kinds)
+    rows = "".join(
+        f"<tr><th>{html.escape(hunt.dir)}</th>{''.join(f'<td>{hunt.outcomes.get(k, 0)}</td>' for k in kinds)}</tr>"
+        for hunt in hunts
+    )
+    return f"<table><tr><th>hunt</th>{head}</tr>{rows}</table>"
+
+
+def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> list[str]:
+    values: dict[str, dict[str, tuple[NDArray[Any], NDArray[Any]]]] = {}
+    for hunt in hunts:
+        for name, pair in _arguments(HuntResults(hunt.dir)).items():
+            values.setdefault(name, {})[hunt.dir] = pair
+    return [_argument_plot(name, of, colors) for name, of in values.items()]
+
+
+def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
+    """Every argument that varies: its values, and whether the trial crashed."""
+    names = [name for name in columns_of(hunt.settings) if name not in FACTS]
+    columns: dict[str, list[Any]] = {name: [] for name in names}
+    crashed: list[bool] = []
+    crash_on = hunt.settings.crash_on
+    for count, result in enumerate(hunt.results()):
+        if count >= _MOST:
+            break
+        if result.outcome is Outcome.INVALID:
+            continue
+        crashed.append(result.outcome in crash_on)
+        for name, value in row_of(result, names).items():
+            columns[name].append(value)
+    hit = np.array(crashed, bool)
+    return {name: (np.array(found), hit) for name, found in columns.items() if len({str(v) for v in found}) > 1}
+
+
+def _argument_plot(name: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], colors: dict[str, str]) -> str:
+    numeric = all(np.issubdtype(values.dtype, np.number) for values, _ in of.values())
+    lines: dict[str, list[tuple[float, float, int]]] = {}
+    if numeric:
+        low = min(float(values.min()) for values, _ in of.values())
+        high = max(float(values.max()) for values, _ in of.values())
+        edges: NDArray[Any] = np.linspace(low, high, _BINS + 1)
+        labels = [f"{low:.4g}", f"{high:.4g}"]
+    else:
+        words = sorted({str(value) for values, _ in of.values() for value in values})
+        labels = words
+        edges = np.arange(len(words) + 1, dtype=float) - 0.5
+    for hunt, (values, crashed) in of.items():
+        numbers = values.astype(float) if numeric else np.array([labels.index(str(value)) for value in values], float)
+        bins = np.clip(np.digitize(numbers, edges) - 1, 0, len(edges) - 2)
+        lines[hunt] = []
+        for place in range(len(edges) - 1):
+            inside = bins == place
+            if inside.any():
+                middle = (place + 0.5) / (len(edges) - 1)
+                lines[hunt].append((middle, float(crashed[inside].mean()), int(inside.sum())))
+    most = max([rate for line in lines.values() for _, rate, _ in line] + [1e-9])
+    parts = ['<path class="axis" d="M40 8V148H268"/>', f'<text x="36" y="16" text-anchor="end">{most:.0%}</text>',
+             '<text x="36" y="150" text-anchor="end">0</text>']  # fmt: skip
+    for place, label in enumerate(labels):
+        x = 40 + 228 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
+        anchor = ("start" if not place else "end") if numeric else "middle"
+        parts.append(f'<text x="{x:.0f}" y="163" text-anchor="{anchor}">{html.escape(label)}</text>')
+    for hunt, line in lines.items():
+        at = [(40 + 228 * x, 148 - 136 * rate / most, count, rate) for x, rate, count in line]
+        path = "L".join(f"{x:.1f} {y:.1f}" for x, y, _, _ in at)
+        parts.append(f'<path d="M{path}" fill="none" stroke="{colors[hunt]}" stroke-width="2"/>')
+        parts += [
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colors[hunt]}"><title>{rate:.1%} of {count} trials</title>'
+            "</circle>"
+            for x, y, count, rate in at
+        ]
+    return (
+        f'<figure><figcaption>{html.escape(name)}</figcaption><svg width="280" height="170" role="img" '
+        f'aria-label="crash rate against {html.escape(name)}">{"".join(parts)}</svg></figure>'
+    )
