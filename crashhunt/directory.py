@@ -21,6 +21,9 @@ __all__ = ["HuntDirectory"]
 _DIFFERENCES_SHOWN = 4
 # What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
 _OWN = ("snapshots", "crashes", "trials", "ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm", "hunt.toml")
+# What may be there before: of a run of a suite that is planned, or could not begin.
+_PLANNED = (".lock", ".scratch", "request.json", "run.log", "error.log", "ledger.sqlite", "ledger.sqlite-wal",
+            "ledger.sqlite-shm")  # fmt: skip
 
 
 class HuntDirectory:
@@ -109,7 +112,7 @@ class HuntDirectory:
     def _refuse_foreign(self) -> None:
         if (self.path / "hunt.toml").exists():
             return
-        foreign = sorted(path.name for path in self.path.iterdir() if path.name not in (".lock", ".scratch"))
+        foreign = sorted(path.name for path in self.path.iterdir() if path.name not in _PLANNED)
         if foreign:
             raise HuntDirectoryError(
                 f"the folder is not empty and not a hunt: it has {foreign[0]!r}",

@@ -15,7 +15,7 @@ from crashhunt.executors import Parts, WorkerSettings
 from crashhunt.ledger import Ledger
 from crashhunt.plan import with_settings
 from crashhunt.settings import HuntSettings, read_settings
-from crashhunt.snapshot import Snapshot
+from crashhunt.snapshot import Snapshot, latest_snapshot
 from crashhunt.status import HuntState, find_hunts, hunt_state
 
 if TYPE_CHECKING:
@@ -149,10 +149,10 @@ class HuntResults:
             return parts.agent(name, parts.simulator(), arguments[name])
 
     def _snapshot(self) -> Snapshot:
-        snapshots = sorted((self.directory / "snapshots").glob("[!.]*"), key=lambda path: path.stat().st_mtime)
-        if not snapshots:
+        found = latest_snapshot(self.directory)
+        if found is None:
             raise HuntDirectoryError("the hunt has not begun: it has no snapshot", where=str(self.directory))
-        return Snapshot(snapshots[-1])
+        return found
 
 
 class SuiteResults(dict[str, HuntResults]):

@@ -148,6 +148,12 @@ class Snapshot:
 _UNDAMAGED = "get an undamaged copy of the hunt's directory"
 
 
+def latest_snapshot(hunt: Path) -> Snapshot | None:
+    """Return the snapshot that a hunt took last; None where it has none."""
+    found = sorted((hunt / "snapshots").glob("[!.]*"), key=lambda path: path.stat().st_mtime)
+    return Snapshot(found[-1]) if found else None
+
+
 def take_snapshot(
     snapshots: Path, scenario: Scenario, settings: HuntSettings, options: SnapshotOptions | None = None
 ) -> Snapshot:

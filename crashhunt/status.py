@@ -17,6 +17,7 @@ __all__ = ["HuntState", "State", "find_hunts", "hunt_state", "this_process"]
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
+_SIGNS = ("ledger.sqlite", "request.json", "hunt.toml")  # of a hunt, or of one that is planned
 _DEPTH = 2  # of hunts below the directory of a suite
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
@@ -74,14 +75,15 @@ def find_hunts(directory: Path) -> list[Path]:
     """
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt or a suite")
-    if (directory / "ledger.sqlite").exists() or (directory / "hunt.toml").exists():
+    if any((directory / name).exists() for name in _SIGNS):
         return [directory]
-    found: list[Path] = []
+    found: set[Path] = set()
     for depth in range(1, _DEPTH + 1):
-        for ledger in directory.glob(f"{'*/' * depth}ledger.sqlite"):
-            parts = ledger.relative_to(directory).parts
-            if not any(part.startswith(".") for part in parts):
-                found.append(ledger.parent)
+        for name in _SIGNS:
+            for sign in directory.glob(f"{'*/' * depth}{name}"):
+                parts = sign.relative_to(directory).parts
+                if not any(part.startswith(".") or ".replaced-" in part for part in parts):
+                    found.add(sign.parent)
     if not found:
         raise HuntDirectoryError(
             f"there is no hunt in {str(directory)!r}", fix="give a directory that crashhunt run or suite run made"
@@ -95,7 +97,7 @@ def hunt_state(directory: Path) -> HuntState:
     Raises:
         HuntDirectoryError: it is not the directory of a hunt.
     """
-    if not (directory / "ledger.sqlite").exists() and (directory / "hunt.toml").exists():
+    if not (directory / "ledger.sqlite").exists() and any((directory / name).exists() for name in _SIGNS):
         return HuntState(str(directory), "queued")
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")

@@ -13,11 +13,13 @@ from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._export import add_export
 from crashhunt.cli._list import add_lists
+from crashhunt.cli._logs import add_logs
 from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
 from crashhunt.cli._status import add_status
+from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
 from crashhunt.errors import CrashhuntError
 
@@ -70,6 +72,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (add_run, add_replay, add_show, add_report, add_export, add_status, add_trials, add_compare, add_lists):
+    for add in (
+        add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
+        add_compare, add_lists,
+    ):  # fmt: skip
         add(commands)
     return parser

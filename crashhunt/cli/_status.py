@@ -12,11 +12,11 @@ from crashhunt.cli._common import add_json
 if TYPE_CHECKING:
     import argparse
 
-    from rich.table import Table
+    from rich.console import Group
 
     from crashhunt.status import HuntState
 
-__all__ = ["add_status"]
+__all__ = ["add_status", "states_table"]
 
 _COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
@@ -44,13 +44,13 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
     console = Console(highlight=False)
     states = _states(options.directories)
     if not options.watch:
-        console.print(_table(states))
+        console.print(states_table(states))
         return 0
-    with Live(_table(states), console=console, auto_refresh=False) as live:
+    with Live(states_table(states), console=console, auto_refresh=False) as live:
         while any(state.state in ("running", "queued") for state in states):
             time.sleep(1.0)
             states = _states(options.directories)
-            live.update(_table(states), refresh=True)
+            live.update(states_table(states), refresh=True)
     return 0
 
 
@@ -60,8 +60,10 @@ def _states(directories: list[Path]) -> list[HuntState]:
     return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
 
 
-def _table(states: list[HuntState]) -> Table:
+def states_table(states: list[HuntState]) -> Group:
+    """Return hunts as a table for a terminal, and below it why some failed."""
     from rich import box
+    from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
@@ -83,6 +85,7 @@ def _table(states: list[HuntState]) -> Table:
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
             str(state.crashes),
             str(state.errors),
-            Text("; ".join(filter(None, (said, state.detail.splitlines()[0] if state.detail else "")))),
+            Text(said),
         )
-    return table
+    why = [f"{state.dir}: {state.detail.splitlines()[0]}" for state in states if state.detail]
+    return Group(table, *(Text(line) for line in why))

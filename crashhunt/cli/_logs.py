@@ -1,0 +1,74 @@
+"""``crashhunt logs``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import integer
+from crashhunt.errors import UsageError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterator
+
+__all__ = ["add_logs"]
+
+
+def add_logs(commands: Any) -> None:
+    """Add the command."""
+    logs = commands.add_parser(
+        "logs",
+        help="show what hunts and trials have printed, and their errors",
+        description="Show what hunts and trials have printed (run), why they failed (error), and when a hunt got into "
+        "which state (state). Of trials there are the crashes, and those that were kept.",
+    )
+    logs.add_argument("directory", metavar="DIR", type=Path, help="of a hunt or a suite")
+    logs.add_argument("--run", metavar="ID", default="", help="of a suite: only this run, such as town/0")
+    logs.add_argument("--trial", metavar="N", type=integer, help="only this trial")
+    logs.add_argument("--type", choices=("run", "error", "state"), help="default: all")
+    logs.add_argument("--errors-only", action="store_true", help="the same as --type error")
+    logs.add_argument("--follow", action="store_true", help="go on while something is running")
+    logs.set_defaults(command=_logs)
+
+
+def _logs(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.logs import LogKind, read_logs
+    from crashhunt.status import find_hunts, hunt_state
+
+    if options.errors_only and options.type not in (None, "error"):
+        raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")
+    hunts = find_hunts(options.directory)
+    names = {hunt: hunt.relative_to(options.directory).as_posix() for hunt in hunts}
+    if options.run:
+        hunts = [hunt for hunt in hunts if options.run in (names[hunt], names[hunt].partition("/")[0])]
+        if not hunts:
+            raise UsageError(f"--run: there is no run {options.run!r}", fix=f"give one of {', '.join(names.values())}")
+    kinds: tuple[LogKind, ...] = ("run", "error", "state")
+    if options.errors_only or options.type is not None:
+        kinds = ("error",) if options.errors_only else (options.type,)
+    shown: dict[str, int] = {}
+
+    def fresh() -> Iterator[tuple[str, str]]:
+        for hunt in hunts:
+            for title, text in read_logs(hunt, kinds, trial=options.trial):
+                where = title if names[hunt] == "." else f"{names[hunt]}: {title}"
+                before = shown.get(where, 0)
+                if len(text) > before:
+                    shown[where] = len(text)
+                    yield where, text[before:]
+
+    found = False
+    while True:
+        running = options.follow and any(hunt_state(hunt).state in ("running", "queued") for hunt in hunts)
+        for where, text in fresh():
+            found = True
+            print(f"==> {where} <==\n{text.rstrip()}\n", flush=True)
+        if not running:
+            break
+        time.sleep(0.5)
+    if not found:
+        print("there is nothing to show", file=sys.stderr)
+    return 0

@@ -1,0 +1,159 @@
+"""``crashhunt suite`` and ``crashhunt rerun``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json, integer, pairs, say
+from crashhunt.cli._status import states_table
+from crashhunt.errors import UsageError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+
+    from crashhunt.status import HuntState
+
+__all__ = ["add_rerun", "add_suite"]
+
+
+def add_suite(commands: Any) -> None:
+    """Add the command."""
+    suite = commands.add_parser(
+        "suite",
+        help="run many hunts from one file",
+        description="Run many hunts from one file, each several times with a seed of its own.",
+    )
+    verbs = suite.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    run = verbs.add_parser(
+        "run",
+        help="run what has not ended",
+        description="Plan every run as a folder of DIR, and run those that have not ended, whatever becomes of the "
+        "others. Done again, it goes on. Exits with 1 where a hunt could not run.",
+    )
+    run.add_argument("file", metavar="FILE", type=Path, help="a suite.toml")
+    run.add_argument("directory", metavar="DIR", type=Path, help="made if it is not there")
+    run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
+                     help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+    add_json(run)
+    run.set_defaults(command=_run)
+    defaults = verbs.add_parser(
+        "defaults",
+        help="print a suite of every shipped scenario",
+        description="Print a suite of every shipped scenario, ready to be edited.",
+    )
+    defaults.set_defaults(command=_defaults)
+
+
+def add_rerun(commands: Any) -> None:
+    """Add the command."""
+    rerun = commands.add_parser(
+        "rerun",
+        help="run again what failed, or a hunt with other settings elsewhere",
+        description="Run again what failed: hunts that ended in an error anew, those that were interrupted or killed "
+        "from where they were, and trials that could not be set up. What is replaced is kept beside it. With --to, run "
+        "one hunt with other settings in another directory.",
+    )
+    rerun.add_argument("directory", metavar="DIR", type=Path, help="of a hunt or a suite")
+    rerun.add_argument("--run", metavar="ID", action="append", default=[],
+                       help="of a suite: only this run, such as town/0, or those of town; may be repeated")  # fmt: skip
+    which = rerun.add_mutually_exclusive_group()
+    which.add_argument("--failed", action="store_true", help="only what failed (the default)")
+    which.add_argument("--all", action="store_true", help="everything, anew")
+    rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
+                       help="with --to or --all: another specification for an argument (ID.NAME for one of several "
+                       "agents), or for trials, max_steps or seed")  # fmt: skip
+    rerun.add_argument("--to", metavar="DIR", type=Path, help="leave DIR as it is, and run there")
+    rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
+                       help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+    add_json(rerun)
+    rerun.set_defaults(command=_rerun)
+
+
+def _run(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.suite import Suite
+
+    suite = Suite.read(options.file)
+    watch, finish = _watcher(as_json=options.json)
+    try:
+        states = suite.run(options.directory, options.parallel, watch=watch)
+    except KeyboardInterrupt:
+        say("Interrupted; the same command goes on from here.", as_json=options.json)
+        raise
+    finally:
+        finish()
+    return _tell(states, options.directory, as_json=options.json)
+
+
+def _defaults(_options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.suite import default_suite
+
+    print(default_suite(), end="")
+    return 0
+
+
+def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.reruns import rerun
+    from crashhunt.status import find_hunts
+
+    hunts = find_hunts(options.directory)
+    if options.run:
+        names = {hunt: hunt.relative_to(options.directory).as_posix() for hunt in hunts}
+        for run in options.run:
+            if not any(run in (name, name.partition("/")[0]) for name in names.values()):
+                raise UsageError(f"--run: there is no run {run!r}", fix=f"give one of {', '.join(names.values())}")
+        hunts = [hunt for hunt, name in names.items() if {name, name.partition("/")[0]} & set(options.run)]
+    watch, finish = _watcher(as_json=options.json)
+    try:
+        states, replaced = rerun(
+            hunts,
+            everything=options.all,
+            changes=pairs(options.sets, "--set"),
+            to=options.to,
+            parallel=options.parallel,
+            watch=watch,
+        )
+    finally:
+        finish()
+    for place in replaced:
+        say(f"replaced: {place}", as_json=options.json)
+    return _tell(states, options.to or options.directory, as_json=options.json, replaced=replaced)
+
+
+def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
+    """What shows how it goes, and what ends the showing: a table on a terminal, a line per change elsewhere."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=as_json, highlight=False)
+    if console.is_terminal:
+        live = Live(console=console, auto_refresh=False, transient=True)
+        live.start()
+        return (lambda states: live.update(states_table(states), refresh=True)), live.stop
+    known: dict[str, str] = {}
+
+    def tell(states: list[HuntState]) -> None:
+        for state in states:
+            if known.get(state.dir, "queued") != state.state:
+                console.print(f"{state.dir}: {state.state}", markup=False, soft_wrap=True)
+            known[state.dir] = state.state
+
+    return tell, lambda: None
+
+
+def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None) -> int:
+    from rich.console import Console
+
+    if as_json:
+        extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
+        print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))
+    console = Console(stderr=as_json, highlight=False)
+    console.print(states_table(states))
+    errors = [state for state in states if state.state == "error"]
+    if errors:
+        some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"
+        fix = f"see crashhunt logs {directory} --errors-only, then crashhunt rerun {directory}"
+        console.print(f"{some}; {fix}", markup=False, soft_wrap=True)
+    return 1 if errors else 0

@@ -1,0 +1,220 @@
+"""Hunts that run in processes of their own, several at a time; whatever becomes of one, the others go on."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import deque
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.ledger import Ledger
+from crashhunt.plan import Request, plan, with_settings
+from crashhunt.scenario import load_scenario
+from crashhunt.settings import RunSettings, read_settings
+from crashhunt.snapshot import latest_snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.settings import HuntSettings
+
+__all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "write_request"]
+
+REQUEST = "request.json"
+_LOOK_EVERY_S = 0.1
+_WATCH_EVERY_S = 1.0
+_BUSY_S = 15.0  # for the process of an earlier run to leave the directory
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run of a suite will be: `request.json` in its folder.
+
+    Args:
+        request: of the hunt.
+        folder: from where agents are imported.
+    """
+
+    request: Request
+    folder: str
+
+    @classmethod
+    def read(cls, file: Path) -> RunRequest:
+        """Read one.
+
+        Raises:
+            HuntDirectoryError: it is missing or damaged.
+        """
+        try:
+            data = json.loads(file.read_text(encoding="utf-8"))
+            given = data["request"]
+            run = RunSettings(**given.pop("run"))
+            return cls(Request(**{**given, "crash_on": tuple(given["crash_on"]), "run": run}), data["folder"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite anew", where=str(file)) from None
+
+
+def write_request(folder: Path, request: RunRequest) -> None:
+    """Write ``request.json``, all of it or nothing."""
+    temporary = folder / f".{REQUEST}.{os.getpid()}"
+    temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
+    temporary.replace(folder / REQUEST)
+
+
+def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], None] | None = None) -> None:
+    """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
+
+    Args:
+        folders: of the runs, each with its ``request.json``.
+        parallel: trials at a time, of all hunts together; 0 for one per core.
+        watch: called about once a second, and at the end.
+
+    Raises:
+        KeyboardInterrupt: interrupted; what has finished is kept, and the hunts have stopped.
+    """
+    slots = parallel if parallel > 0 else len(os.sched_getaffinity(0))
+    waiting = deque(folders)
+    running: dict[subprocess.Popen[bytes], int] = {}
+    watched = 0.0
+    with _signals() as asked:
+        try:
+            while waiting or running:
+                for process in [process for process in running if process.poll() is not None]:
+                    del running[process]
+                free = slots - sum(running.values())
+                while waiting and free > 0 and not asked:
+                    # Towards the end there are fewer hunts than slots: then each gets several.
+                    width = max(1, free // len(waiting))
+                    running[_start(waiting.popleft(), width)] = width
+                    free -= width
+                if asked:
+                    waiting.clear()
+                    for process in running:
+                        for number in asked:
+                            process.send_signal(number)
+                    asked.clear()
+                if watch is not None and time.monotonic() - watched > _WATCH_EVERY_S:
+                    watched = time.monotonic()
+                    watch()
+                time.sleep(_LOOK_EVERY_S)
+        finally:
+            for process in running:
+                process.kill()
+                process.wait()
+        if watch is not None:
+            watch()
+
+
+def set_aside(folder: Path) -> Path:
+    """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now."""
+    number = 0
+    while (aside := folder.with_name(f"{folder.name}.replaced-{number}")).exists():
+        number += 1
+    folder.rename(aside)
+    folder.mkdir()
+    if (aside / REQUEST).exists():
+        write_request(folder, RunRequest.read(aside / REQUEST))
+    return aside
+
+
+def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
+    request = RunRequest.read(folder / REQUEST)
+    with (folder / "run.log").open("ab") as log:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "crashhunt.runs", str(folder.resolve()), str(width), str(os.getpid())],
+            cwd=request.folder if Path(request.folder).is_dir() else None,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is passed on by us, once
+        )
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM, to be passed on; a second one ends this process at once, and with it the hunts."""
+    asked: list[int] = []
+    seen: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        if seen:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        seen.append(number)
+        asked.append(number)
+
+    try:
+        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread
+        before = {}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if seen:
+        raise KeyboardInterrupt
+
+
+def _main(folder: Path, parallel: int, parent: int) -> None:
+    if sys.platform == "linux":  # a suite that is killed takes its hunts along, and they keep what has finished
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:
+            return
+    from crashhunt.hunt import Hunt
+    from crashhunt.report import describe_hunt
+
+    try:
+        scenario, settings = _planned(folder, parallel)
+        deadline = time.monotonic() + _BUSY_S
+        while True:
+            try:
+                report = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"]).run()
+                break
+            except HuntDirectoryError as error:
+                if "another hunt is running" not in error.message or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.5)
+        print(describe_hunt(report), flush=True)
+    except CrashhuntError as error:
+        _fail(folder, str(error), "")
+    except Exception as error:
+        _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def _planned(folder: Path, parallel: int) -> tuple[Scenario, HuntSettings]:
+    """What to run: what is there already, or what was asked for."""
+    request = RunRequest.read(folder / REQUEST).request
+    if not (folder / "hunt.toml").exists():
+        return plan(replace(request, run=replace(request.run, parallel=parallel)))
+    settings = read_settings(folder / "hunt.toml")
+    snapshot = latest_snapshot(folder)
+    scenario = load_scenario(request.scenario, ego=request.ego) if snapshot is None else snapshot.scenario()
+    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, parallel=parallel))
+
+
+def _fail(folder: Path, message: str, trace: str) -> None:
+    """Write down why a hunt could not run."""
+    print(f"crashhunt: {message}", file=sys.stderr, flush=True)
+    (folder / "error.log").write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
+    with suppress(CrashhuntError):
+        ledger = Ledger(folder / "ledger.sqlite", writable=True)
+        if ledger.facts().get("state") != "error":
+            ledger.enter("error", message)
+        ledger.close()
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
