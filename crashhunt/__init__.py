@@ -1,9 +1,29 @@
-"""A parallel crash-hunting fuzzer for traffic agents."""
+"""A parallel crash-hunting fuzzer for traffic agents.
+
+``crashhunt.run``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does.
+"""
 
 import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from crashhunt.api import Hunt, Suite, compare, load, replay, run
 
 __version__ = "0.1.0"
-__all__ = ["__version__"]
+__all__ = ["Hunt", "Suite", "__version__", "compare", "load", "replay", "run"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the functions when they are first asked for: a worker needs none of them."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from crashhunt import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def _register_environment() -> None:

@@ -185,16 +185,16 @@ def load(directory: Path | str) -> HuntResults | SuiteResults:
 
 
 def columns_of(settings: HuntSettings) -> tuple[str, ...]:
-    """Return the columns of a table of trials: facts, then ``AGENT.ARGUMENT``, then the scenario's arguments."""
+    """Return the columns of a table of trials: facts, then ``AGENT.ARGUMENT``, then ``scenario.ARGUMENT``."""
     arguments = [f"{agent}.{name}" for agent, chosen in settings.agents.items() for name in sorted(chosen.arguments)]
-    return (*FACTS, *arguments, *sorted(settings.scenario_arguments))
+    return (*FACTS, *arguments, *(f"scenario.{name}" for name in sorted(settings.scenario_arguments)))
 
 
 def row_of(result: TrialResult, columns: Sequence[str]) -> dict[str, Any]:
     """Return a trial as a row of the table; None where it has no such value."""
     spec, closest = result.spec, result.closest.to_json()
     values: dict[str, Any] = {
-        **spec.scenario_arguments,
+        **{f"scenario.{name}": value for name, value in spec.scenario_arguments.items()},
         **{f"{agent}.{name}": value for agent, given in spec.arguments.items() for name, value in given.items()},
         **closest,
         "number": spec.number,

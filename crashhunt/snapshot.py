@@ -21,7 +21,7 @@ from crashhunt.space import Choice, Constant
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Snapshot", "SnapshotOptions", "scenario_digest", "take_snapshot"]
+__all__ = ["Snapshot", "SnapshotOptions", "latest_snapshot", "scenario_digest", "take_snapshot"]
 
 SCHEMA = 1
 _MEGABYTE = 10**6

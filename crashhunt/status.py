@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import time
@@ -98,7 +99,7 @@ def hunt_state(directory: Path) -> HuntState:
         HuntDirectoryError: it is not the directory of a hunt.
     """
     if not (directory / "ledger.sqlite").exists() and any((directory / name).exists() for name in _SIGNS):
-        return HuntState(str(directory), "queued")
+        return HuntState(str(directory), "queued", trials_planned=_planned(directory / "request.json"))
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")
     try:
@@ -142,6 +143,13 @@ def hunt_state(directory: Path) -> HuntState:
 def this_process() -> dict[str, Any]:
     """Return what tells this process from every other, so that anybody can see later whether it is still there."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
+
+
+def _planned(request: Path) -> int:
+    try:
+        return int(json.loads(request.read_text(encoding="utf-8"))["request"]["trials"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
 
 
 def _is_alive(owner: dict[str, Any], heartbeat: float) -> bool:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "write_parquet", "write_text"]
 
 FORMATS = ("csv", "json", "jsonl", "parquet")
-_BATCH = 10_000  # rows of a Parquet row group that are in memory at a time
+_LOOKED_AT = 1000  # rows, to find out the type of an argument of which nobody says it
 
 
 def write_text(hunt: HuntResults, out: TextIO, form: str, *, outcomes: Sequence[str] = ()) -> int:
@@ -35,7 +35,7 @@ def write_text(hunt: HuntResults, out: TextIO, form: str, *, outcomes: Sequence[
         writer = csv.writer(out)
         writer.writerow(names)
         for row in _rows(hunt, names, outcomes):
-            writer.writerow(["" if value is None else value for value in row.values()])
+            writer.writerow([_cell(value) for value in row.values()])
             count += 1
         return count
     opening, between, closing = ("[\n", ",\n", "\n]\n") if form == "json" else ("", "\n", "\n")
@@ -51,33 +51,24 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
     """Write the trials of a hunt as a Parquet file; return how many.
 
     Raises:
-        UsageError: fastparquet is not installed.
+        UsageError: polars is not installed.
     """
     try:
         # Not pyarrow: libsumo brings an Arrow of its own along, and warns of every other in the same environment.
-        import fastparquet
-        import pandas as pd
+        import polars as pl
     except ImportError:
-        raise UsageError("Parquet needs fastparquet", fix="pip install 'crashhunt[parquet]', or give csv") from None
-    names = columns_of(hunt.settings)
-    rows = _rows(hunt, names, outcomes)
-    batch = list(islice(rows, _BATCH))
-    kinds = _kinds(hunt, batch)
-    count = 0
-    temporary = path.with_name(f".{path.name}.part")
+        raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
+    kinds = _kinds(hunt, list(islice(_rows(hunt, columns_of(hunt.settings), outcomes), _LOOKED_AT)))
+    temporary, table = path.with_name(f".{path.name}.part"), path.with_name(f".{path.name}.csv")
     try:
-        while batch or not count:
-            frame = pd.DataFrame(
-                {name: pd.array([_as(row[name], kinds[name]) for row in batch], dtype=kinds[name]) for name in names}
-            )
-            fastparquet.write(str(temporary), frame, append=count > 0, write_index=False)
-            count += len(batch)
-            batch = list(islice(rows, _BATCH))
-            if not count:
-                break
+        with table.open("w", encoding="utf-8", newline="") as file:
+            count = write_text(hunt, file, "csv", outcomes=outcomes)
+        schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
+        pl.scan_csv(table, schema=schema).sink_parquet(temporary)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+        table.unlink(missing_ok=True)
     return count
 
 
@@ -89,19 +80,22 @@ def _rows(hunt: HuntResults, names: Sequence[str], outcomes: Sequence[str]) -> I
 def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
     """The type of each column, which a row group cannot find out by itself."""
     settings = hunt.settings
-    specs = dict(settings.scenario_arguments)
+    specs = {f"scenario.{name}": spec for name, spec in settings.scenario_arguments.items()}
     for agent, chosen in settings.agents.items():
         specs |= {f"{agent}.{name}": spec for name, spec in chosen.arguments.items()}
-    known = {"int": "Int64", "float": "Float64", "bool": "boolean", "str": "string"}
-    kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "string", "digest": "string"}
-    for name in columns_of(settings):
+    known = {"int": "Int64", "float": "Float64", "bool": "Boolean", "str": "String"}
+    kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
+    columns = columns_of(settings)
+    for name in columns:
         kind = specs[name].kind if name in specs else "float"
         if kind is None:  # the agent does not say; what was tried first does
             numeric = all(isinstance(row[name], int | float | None) for row in batch)
             kind = "float" if numeric else "str"
         kinds.setdefault(name, known[kind])
-    return kinds
+    return {name: kinds[name] for name in columns}
 
 
-def _as(value: Any, kind: str) -> Any:
-    return str(value) if kind == "string" and value is not None else value
+def _cell(value: Any) -> Any:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else value

@@ -76,3 +76,29 @@ def shell(tmp_path: Path) -> Shell:
     """An empty folder with a module `faulty` of agents that go wrong."""
     shutil.copy(FAULTY, tmp_path / "faulty.py")
     return Shell(tmp_path)
+
+
+TOY = """
+title = "A toy"
+simulator = "toy"
+[arguments.gap_m]
+default = 30.0
+range = "10:60"
+[arguments.step_wall_s]
+default = 0.0
+[arguments.fail_reset]
+default = false
+[agents.ego]
+agent = "crashhunt.agents:KeepLaneWithSpeed"
+[agents.ego.arguments.speed]
+default = 8.0
+range = "4:14"
+"""
+
+
+@pytest.fixture
+def toy(shell: Shell) -> Shell:
+    """The same with a scenario `toy`, which takes microseconds a step; above 10 m/s it soon crashes."""
+    (shell.folder / "toy").mkdir()
+    (shell.folder / "toy" / "scenario.toml").write_text(TOY, encoding="utf-8")
+    return shell

@@ -23,7 +23,7 @@ def add_compare(commands: Any) -> None:
         description="Compare hunts: crash rates with their confidence intervals, and over trials with the same seeds "
         "whether one crashes less than the first. Run two versions of an agent with the same --seed and --keep-going.",
     )
-    compare.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of two hunts or more")
+    compare.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of two hunts or more, or of suites")
     compare.add_argument("--csv", action="store_true", help="print a line per hunt as CSV")
     compare.add_argument("--html", metavar="FILE", type=Path, help="write a page with plots")
     add_json(compare)
@@ -33,8 +33,9 @@ def add_compare(commands: Any) -> None:
 def _compare(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.comparison import compare
     from crashhunt.report import comparison_page, describe_comparison
+    from crashhunt.status import find_hunts
 
-    found = compare(*options.directories)
+    found = compare(*(hunt for directory in options.directories for hunt in find_hunts(directory)))
     if options.csv:
         found.write_csv(sys.stdout)
     else:

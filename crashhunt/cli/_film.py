@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import integer
-from crashhunt.debugger import Look
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.bundle import Bundle
+    from crashhunt.debugger import Look
     from crashhunt.recording import Recording
     from crashhunt.render.film import FilmOptions, Shot
     from crashhunt.replays import ReplayOptions, ReplayReport
@@ -74,6 +74,8 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
 
 def look_at_all(bundle: Bundle, **options: Any) -> Look | None:
     """Return how to look at a whole crash; None where nothing of it can be looked at."""
+    from crashhunt.debugger import Look
+
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
     fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
     until = bundle.result.steps if fatal else bundle.result.spec.max_steps

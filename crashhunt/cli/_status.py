@@ -12,11 +12,12 @@ from crashhunt.cli._common import add_json
 if TYPE_CHECKING:
     import argparse
 
-    from rich.console import Group
+    from rich.console import Console
+    from rich.table import Table
 
     from crashhunt.status import HuntState
 
-__all__ = ["add_status", "states_table"]
+__all__ = ["add_status", "show_states", "states_table"]
 
 _COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
@@ -44,7 +45,7 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
     console = Console(highlight=False)
     states = _states(options.directories)
     if not options.watch:
-        console.print(states_table(states))
+        show_states(states, console)
         return 0
     with Live(states_table(states), console=console, auto_refresh=False) as live:
         while any(state.state in ("running", "queued") for state in states):
@@ -60,10 +61,9 @@ def _states(directories: list[Path]) -> list[HuntState]:
     return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
 
 
-def states_table(states: list[HuntState]) -> Group:
-    """Return hunts as a table for a terminal, and below it why some failed."""
+def states_table(states: list[HuntState]) -> Table:
+    """Return hunts as a table for a terminal."""
     from rich import box
-    from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
@@ -87,5 +87,12 @@ def states_table(states: list[HuntState]) -> Group:
             str(state.errors),
             Text(said),
         )
-    why = [f"{state.dir}: {state.detail.splitlines()[0]}" for state in states if state.detail]
-    return Group(table, *(Text(line) for line in why))
+    return table
+
+
+def show_states(states: list[HuntState], console: Console) -> None:
+    """Print hunts as a table, and below it why some failed."""
+    console.print(states_table(states))
+    for state in states:
+        if state.detail:
+            console.print(f"{state.dir}: {state.detail.splitlines()[0]}", markup=False, soft_wrap=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json, integer, pairs, say
-from crashhunt.cli._status import states_table
+from crashhunt.cli._status import show_states, states_table
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: 
         extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
         print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))
     console = Console(stderr=as_json, highlight=False)
-    console.print(states_table(states))
+    show_states(states, console)
     errors = [state for state in states if state.state == "error"]
     if errors:
         some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import queue
 import signal
+import sys
+import threading
 import time
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.context import ForkServerContext
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from pebble import ProcessExpired, ProcessPool
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PoolExecutor"]
 
+_main_lock = threading.Lock()
 _LOOK_EVERY_S = 0.1
 _GRACE_S = 1.0  # for the pool to notice by itself that a worker is gone, with its exit code
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
@@ -197,8 +201,24 @@ class PoolExecutor:
                 _kill(header.pid)
 
 
+class _Process(ForkServerProcess):
+    """Does not run the script that started the hunt again in every worker: nothing in there is needed."""
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:  # noqa: N802 - the name is multiprocessing's
+        with _main_lock:
+            script = sys.modules["__main__"]
+            sys.modules["__main__"] = ModuleType("__main__")
+            try:
+                return ForkServerProcess._Popen(process_obj)
+            finally:
+                sys.modules["__main__"] = script
+
+
 class _Context(ForkServerContext):
     """Keeps locks until the pool is gone: pebble drops its own before it has stopped the workers that are starting."""
+
+    Process = _Process
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,0 +1,235 @@
+"""Suites: many hunts from one file, also when some cannot run, when somebody interrupts, and when it is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+import tomllib
+
+import pytest
+
+SUITE = """
+[defaults]
+scenario = "toy"
+trials = 30
+max_steps = 100
+seed = 3
+
+[[hunts]]
+id = "fast"
+runs = 2
+arguments.speed = "12:14"
+
+[[hunts]]
+id = "slow"
+arguments = { speed = 4 }
+scenario_arguments.gap_m = 50
+"""
+BROKEN = """
+[[hunts]]
+id = "unimportable"
+agent = "nothing:There"
+
+[[hunts]]
+id = "a-word"
+arguments.speed = "fast"
+
+[[hunts]]
+id = "raises"
+agent = "explodes:Agent"
+
+[[hunts]]
+id = "no-scenario"
+scenario = "nowhere"
+"""
+SLOW = """
+[defaults]
+scenario = "toy"
+trials = 120
+max_steps = 50
+seed = 3
+scenario_arguments = { step_wall_s = 0.001 }
+arguments.speed = 4
+[[hunts]]
+id = "a"
+[[hunts]]
+id = "b"
+[[hunts]]
+id = "c"
+"""
+
+
+def written(shell, text: str) -> None:
+    (shell.folder / "suite.toml").write_text(text, encoding="utf-8")
+
+
+def states(shell, directory: str = "out") -> dict[str, str]:
+    found = shell.crashhunt("status", directory, "--json").json["hunts"]
+    return {hunt["dir"].removeprefix(f"{directory}/"): hunt["state"] for hunt in found}
+
+
+def numbers(shell, hunt: str) -> list[int]:
+    return [int(line.partition(",")[0]) for line in shell.crashhunt("trials", hunt).out.splitlines()[1:]]
+
+
+def wait_for(condition, timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def test_every_hunt_stops_at_its_own_first_crash(toy):
+    written(toy, SUITE)
+    done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json
+    found = {hunt["dir"].removeprefix("out/"): hunt for hunt in done["hunts"]}
+    assert {name: hunt["state"] for name, hunt in found.items()} == {
+        "fast/0": "crashed", "fast/1": "crashed", "slow/0": "finished",
+    }  # fmt: skip
+    assert found["slow/0"]["trials_run"] == found["slow/0"]["trials_planned"] == 30
+    seeds = {tomllib.loads((toy.folder / f"out/{name}/hunt.toml").read_text())["seed"] for name in found}
+    assert len(seeds) == 2  # a seed a run; the same seed for equal numbers
+    assert toy.crashhunt("replay", "out/fast/1", "--json").json["verdict"] == "reproduced"
+    # Again, nothing runs.
+    before = (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns
+    assert toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json["hunts"] == done["hunts"]
+    assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
+
+
+def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
+    written(toy, SUITE + BROKEN)
+    (toy.folder / "explodes.py").write_text("raise OSError('no such luck')")
+    done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
+    assert "4 hunts could not run" in done.out
+    found = states(toy)
+    assert {name for name, state in found.items() if state == "error"} == {
+        "unimportable/0", "a-word/0", "raises/0", "no-scenario/0",
+    }  # fmt: skip
+    assert found["fast/0"] == "crashed"
+    assert found["slow/0"] == "finished"
+    logs = toy.crashhunt("logs", "out", "--errors-only").out
+    for words in ("No module named 'nothing'", "'fast' is not a number", "no such luck", "nowhere"):
+        assert words in logs
+    assert "unimportable/0: error" in logs
+    table = toy.crashhunt("status", "out").out
+    assert "out/a-word/0: --arg speed: 'fast' is not a number" in " ".join(table.split())
+
+
+def test_what_failed_runs_again_and_nothing_else(toy):
+    written(toy, SUITE + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
+    toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
+    (toy.folder / "nothing.py").write_text("from crashhunt.agents import KeepLaneWithSpeed as There")
+    finished = (toy.folder / "out/slow/0/ledger.sqlite").read_bytes()
+    again = toy.crashhunt("rerun", "out", "--run", "unimportable", "--json").json
+    assert [hunt["state"] for hunt in again["hunts"]] == ["crashed"]
+    assert again["replaced"] == ["out/unimportable/0.replaced-0"]
+    assert "No module named" in (toy.folder / again["replaced"][0] / "error.log").read_text()
+    assert (toy.folder / "out/slow/0/ledger.sqlite").read_bytes() == finished
+    assert states(toy)["a-word/0"] == "error"
+    # All of it: with the same seeds, the same crashes.
+    crash = {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()}
+    everything = toy.crashhunt("rerun", "out", "--all", "--parallel", "1", "--json", expect=1).json
+    assert len(everything["replaced"]) == len(everything["hunts"]) == 5
+    assert {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()} == crash
+    assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
+
+
+def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
+    written(toy, SLOW)
+    process = toy.start("suite", "run", "suite.toml", "out", "2")
+    wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    wait_for(lambda: "running" not in states(toy).values())
+    assert states(toy)["c/0"] == "queued"
+    before = {name: dict(digests(toy, f"out/{name}/0")) for name in ("a", "b")}
+    assert any(before.values())
+    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
+    assert set(states(toy).values()) == {"finished"}
+    for name in "abc":
+        assert numbers(toy, f"out/{name}/0") == list(range(120))
+    for name, rows in before.items():
+        after = digests(toy, f"out/{name}/0")
+        assert {number: after[number] for number in rows} == rows
+    log = toy.crashhunt("logs", "out", "--run", "a/0", "--type", "state").out
+    assert log.count("running") == 2
+
+
+def digests(shell, hunt: str) -> dict[int, tuple[str, str]]:
+    lines = shell.crashhunt("trials", hunt, "--format", "jsonl").out.splitlines()
+    return {row["number"]: (row["digest"], row["wall_s"]) for row in map(json.loads, lines)}
+
+
+def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
+    written(toy, SLOW)
+    process = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
+    wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "the same command goes on from here" in err
+    found = states(toy)
+    assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
+
+
+def test_the_last_hunts_share_all_slots(toy):
+    written(toy, SLOW.replace('[[hunts]]\nid = "b"\n[[hunts]]\nid = "c"\n', ""))
+    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
+    workers = {row["worker"] for row in _results(toy, "out/a/0")}
+    assert len(workers) == 2
+
+
+def _results(shell, hunt: str) -> list[dict]:
+    import sqlite3
+    from contextlib import closing
+
+    with closing(sqlite3.connect(shell.folder / hunt / "ledger.sqlite")) as database:
+        return [json.loads(text) for (text,) in database.execute("SELECT result FROM trials")]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "the key 'hunts' is missing"),
+        ("hunts = []", "there are no hunts"),
+        ("[[hunts]]\nid = 'a'\n[[hunts]]\nid = 'A'", "the id 'A' is there twice"),
+        ("[[hunts]]\nscenario = 'toy'", "hunts[0].id = ''"),
+        ("[[hunts]]\nid = '../a'", "'../a' is no name for a folder"),
+        ("[[hunts]]\nid = 'a'\nspeed = 3", "unknown key 'speed'"),
+        ("[[hunts]]\nid = 'a'\ntrials = 'many'", "trials = 'many'"),
+        ("[[hunts]]\nid = 'a'\nruns = 0", "hunts.a.runs = 0"),
+        ("[[hunts]]\nid = 'a'\nagent = 'x:Y'\nagents = { ego = 'x:Y' }", "both agent and agents"),
+        ("schema = 9\n[[hunts]]\nid = 'a'", "schema = 9"),
+        ("[[hunts", "not valid TOML"),
+    ],
+)
+def test_a_mistake_in_the_file_is_one_line(toy, text, says):
+    written(toy, text)
+    done = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
+    assert says in done.err
+    assert len(done.err.splitlines()) == 1
+    assert not (toy.folder / "out").exists()
+
+
+def test_a_suite_that_has_changed_is_refused(toy):
+    written(toy, SUITE)
+    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
+    written(toy, SUITE.replace("speed = 4", "speed = 5"))
+    refused = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
+    assert "the hunt 'slow' was planned there with other settings" in refused.err
+    assert "cannot be read" in toy.crashhunt("suite", "run", "nowhere.toml", "out", expect=2).err
+
+
+def test_the_default_suite_is_a_suite_of_everything(toy):
+    from crashhunt.scenario import shipped_scenarios
+    from crashhunt.suite import Suite
+
+    text = toy.crashhunt("suite", "defaults").out
+    written(toy, text)
+    suite = Suite.read(toy.folder / "suite.toml")
+    assert sorted(entry.scenario for entry in suite.entries) == sorted(shipped_scenarios())
+    # What is commented out is right as well.
+    written(toy, text.replace("# arguments", "arguments").replace("# scenario_arguments", "scenario_arguments"))
+    assert all(entry.scenario_arguments for entry in Suite.read(toy.folder / "suite.toml").entries)
