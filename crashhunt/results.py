@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from crashhunt.snapshot import Snapshot, latest_snapshot
 from crashhunt.status import HuntState, find_hunts, hunt_state
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["FACTS", "HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load", "row_of"]
+__all__ = ["FACTS", "HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load"]
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
@@ -77,11 +78,15 @@ class HuntResults:
 
     def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
         """Yield the trials in order of their numbers, all or those that ended in one of some ways."""
-        ledger = Ledger(self.directory / "ledger.sqlite")
-        try:
+        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
             yield from ledger.results(outcomes=tuple(outcomes))
-        finally:
-            ledger.close()
+
+    def rows(self, *, outcomes: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the trials as rows of the table that `trials` returns."""
+        names = columns_of(self.settings)
+        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
+            for data in ledger.plain_results(outcomes=tuple(outcomes)):
+                yield _row(data, names)
 
     def trial(self, number: int) -> TrialResult:
         """Return one trial.
@@ -89,11 +94,8 @@ class HuntResults:
         Raises:
             UsageError: it has not ended.
         """
-        ledger = Ledger(self.directory / "ledger.sqlite")
-        try:
+        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
             found = ledger.result(number)
-        finally:
-            ledger.close()
         if found is None:
             raise UsageError(f"trial {number} has not ended", fix=f"{self.state.trials_run} trials have")
         return found
@@ -106,8 +108,8 @@ class HuntResults:
         """
         names = columns_of(self.settings)
         columns: dict[str, list[Any]] = {name: [] for name in names}
-        for result in self.results():
-            for name, value in row_of(result, names).items():
+        for row in self.rows():
+            for name, value in row.items():
                 columns[name].append(value)
         arrays = {name: _column(values) for name, values in columns.items()}
         table = np.empty(len(columns["number"]), [(name, array.dtype) for name, array in arrays.items()])
@@ -190,21 +192,15 @@ def columns_of(settings: HuntSettings) -> tuple[str, ...]:
     return (*FACTS, *arguments, *(f"scenario.{name}" for name in sorted(settings.scenario_arguments)))
 
 
-def row_of(result: TrialResult, columns: Sequence[str]) -> dict[str, Any]:
-    """Return a trial as a row of the table; None where it has no such value."""
-    spec, closest = result.spec, result.closest.to_json()
-    values: dict[str, Any] = {
-        **{f"scenario.{name}": value for name, value in spec.scenario_arguments.items()},
-        **{f"{agent}.{name}": value for agent, given in spec.arguments.items() for name, value in given.items()},
-        **closest,
-        "number": spec.number,
-        "seed": spec.seed,
-        "outcome": str(result.outcome),
-        "steps": result.steps,
-        "sim_time_s": result.sim_time_s,
-        "wall_s": result.wall_s,
-        "digest": result.digest,
-    }
+def _row(data: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """A trial as a row of the table; None where it has no such value."""
+    spec = data["spec"]
+    values = {**data, **data["closest"], "number": spec["number"], "seed": spec["seed"]}
+    for agent, given in spec["arguments"].items():
+        for name, value in given.items():
+            values[f"{agent}.{name}"] = value
+    for name, value in spec["scenario_arguments"].items():
+        values[f"scenario.{name}"] = value
     return {name: values.get(name) for name in columns}
 
 

@@ -8,10 +8,10 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, TextIO
 
 from crashhunt.errors import UsageError
-from crashhunt.results import HuntResults, columns_of, row_of
+from crashhunt.results import HuntResults, columns_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
 __all__ = ["FORMATS", "write_parquet", "write_text"]
@@ -34,13 +34,13 @@ def write_text(hunt: HuntResults, out: TextIO, form: str, *, outcomes: Sequence[
     if form == "csv":
         writer = csv.writer(out)
         writer.writerow(names)
-        for row in _rows(hunt, names, outcomes):
+        for row in hunt.rows(outcomes=outcomes):
             writer.writerow([_cell(value) for value in row.values()])
             count += 1
         return count
     opening, between, closing = ("[\n", ",\n", "\n]\n") if form == "json" else ("", "\n", "\n")
     out.write(opening)
-    for row in _rows(hunt, names, outcomes):
+    for row in hunt.rows(outcomes=outcomes):
         out.write((between if count else "") + json.dumps(row))
         count += 1
     out.write(closing if count or form == "json" else "")
@@ -58,7 +58,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
         import polars as pl
     except ImportError:
         raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
-    kinds = _kinds(hunt, list(islice(_rows(hunt, columns_of(hunt.settings), outcomes), _LOOKED_AT)))
+    kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _LOOKED_AT)))
     temporary, table = path.with_name(f".{path.name}.part"), path.with_name(f".{path.name}.csv")
     try:
         with table.open("w", encoding="utf-8", newline="") as file:
@@ -70,11 +70,6 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
         temporary.unlink(missing_ok=True)
         table.unlink(missing_ok=True)
     return count
-
-
-def _rows(hunt: HuntResults, names: Sequence[str], outcomes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    for result in hunt.results(outcomes=outcomes):
-        yield row_of(result, names)
 
 
 def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:

@@ -6,12 +6,13 @@ import argparse
 import json
 import os
 import shutil
+import sqlite3
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -398,6 +399,51 @@ def bench_replay() -> Iterator[Figure]:
     yield Figure("replay_speed", found["hunt"] / found["replay"], "of the hunt's", "higher", 0.9, note)
 
 
+def _large_ledger(directory: Path, trials: int) -> None:
+    """Grow a hunt to so many trials, by copying those that it has."""
+    with closing(sqlite3.connect(directory / "ledger.sqlite")) as database:
+        names = [name for _, name, *_ in database.execute("PRAGMA table_info(trials)") if name != "number"]
+        columns = ", ".join(names)
+        (have,) = database.execute("SELECT count(*) FROM trials").fetchone()
+        while have < trials:
+            take = min(have, trials - have)
+            database.execute(
+                f"INSERT INTO trials (number, {columns}) "
+                f"SELECT number + {have}, {columns} FROM trials WHERE number < {take}"
+            )
+            have += take
+        database.execute(f"UPDATE hunt SET value = '{trials}' WHERE key = 'planned'")
+        database.commit()
+
+
+def bench_scale() -> Iterator[Figure]:
+    """Status, compare and trials over a million trials, against a tenth of them."""
+    spent: dict[str, list[tuple[float, float]]] = {}
+    for trials in (100_000, 1_000_000):
+        with folder() as place:
+            options = ("--scenario", str(_toy(place)), "--seed", "1", "--keep-going")
+            hunt(place / "a", 2, 500, 20, *options)
+            _large_ledger(place / "a", trials)
+            for name, words in (
+                ("status", ["status", "a"]),
+                ("compare", ["compare", "a", "a"]),
+                ("trials", ["trials", "a", "--out", "a.csv"]),
+            ):
+                began = time.perf_counter()
+                child = subprocess.Popen(
+                    [str(CRASHHUNT), *words], cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                )
+                _, status, used = os.wait4(child.pid, 0)
+                assert status == 0, words
+                child.returncode = 0
+                spent.setdefault(name, []).append((time.perf_counter() - began, used.ru_maxrss / 1024))
+    for name, limit in (("status", 5.0), ("compare", 10.0), ("trials", 60.0)):
+        (small, small_memory), (large, memory) = spent[name]
+        note = f"{small:.2f} s for 100,000; {memory:.0f} MiB against {small_memory:.0f}"
+        yield Figure(f"{name}_million_s", large, "s", "lower", limit, note)
+        yield Figure(f"{name}_growth", large / small / 10, "of linear", "lower", 1.2)
+
+
 def bench_panels() -> Iterator[Figure]:
     """The same two panels, drawn by us and by matplotlib."""
     import matplotlib as mpl
@@ -530,6 +576,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "stop": bench_stop,
     "replay": bench_replay,
     "panels": bench_panels,
+    "scale": bench_scale,
     "report": bench_report,
 }
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import html
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.results import FACTS, HuntResults, columns_of, row_of
+from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -148,14 +149,12 @@ def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]
     columns: dict[str, list[Any]] = {name: [] for name in names}
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
-    for count, result in enumerate(hunt.results()):
-        if count >= _MOST:
-            break
-        if result.outcome is Outcome.INVALID:
+    for row in islice(hunt.rows(), _MOST):
+        if row["outcome"] == Outcome.INVALID:
             continue
-        crashed.append(result.outcome in crash_on)
-        for name, value in row_of(result, names).items():
-            columns[name].append(value)
+        crashed.append(row["outcome"] in crash_on)
+        for name in names:
+            columns[name].append(row[name])
     hit = np.array(crashed, bool)
     return {name: (np.array(found), hit) for name, found in columns.items() if len({str(v) for v in found}) > 1}
 
