@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
     from crashhunt.status import HuntState
 
-__all__ = ["add_status", "show_states", "states_table"]
+__all__ = ["add_status", "show_states", "states_console", "states_table"]
 
+_WIDTH = 120
 _COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
 
@@ -36,13 +37,12 @@ def add_status(commands: Any) -> None:
 
 
 def _status(options: argparse.Namespace, _words: list[str]) -> int:
-    from rich.console import Console
     from rich.live import Live
 
     if options.json:
         print(json.dumps({"hunts": [state.to_json() for state in _states(options.directories)]}))
         return 0
-    console = Console(highlight=False)
+    console = states_console()
     states = _states(options.directories)
     if not options.watch:
         show_states(states, console)
@@ -61,6 +61,14 @@ def _states(directories: list[Path]) -> list[HuntState]:
     return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
 
 
+def states_console(*, stderr: bool = False) -> Console:
+    """Return where the table goes; where nobody says how wide that is, as wide as most logs."""
+    from rich.console import Console
+
+    console = Console(stderr=stderr, highlight=False)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_WIDTH)
+
+
 def states_table(states: list[HuntState]) -> Table:
     """Return hunts as a table for a terminal."""
     from rich import box
@@ -70,7 +78,7 @@ def states_table(states: list[HuntState]) -> Table:
     from crashhunt.report import format_seconds
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("hunt", overflow="fold")
+    table.add_column("hunt", no_wrap=True)
     table.add_column("state")
     for name in ("trials", "per s", "left", "crashes", "errors"):
         table.add_column(name, justify="right", no_wrap=True)

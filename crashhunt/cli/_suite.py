@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json, integer, pairs, say
-from crashhunt.cli._status import show_states, states_table
+from crashhunt.cli._status import show_states, states_console, states_table
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -124,10 +124,9 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
 
 def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:
     """What shows how it goes, and what ends the showing: a table on a terminal, a line per change elsewhere."""
-    from rich.console import Console
     from rich.live import Live
 
-    console = Console(stderr=as_json, highlight=False)
+    console = states_console(stderr=as_json)
     if console.is_terminal:
         live = Live(console=console, auto_refresh=False, transient=True)
         live.start()
@@ -144,12 +143,11 @@ def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Calla
 
 
 def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None) -> int:
-    from rich.console import Console
 
     if as_json:
         extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
         print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))
-    console = Console(stderr=as_json, highlight=False)
+    console = states_console(stderr=as_json)
     show_states(states, console)
     errors = [state for state in states if state.state == "error"]
     if errors:

@@ -38,6 +38,40 @@ def test_what_was_recorded_is_read_while_it_is_written(tmp_path):
     reader.close()
 
 
+def test_what_is_replaced_is_kept(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    for number in range(4):
+        ledger.record(result(number, Outcome.INVALID if number % 2 else Outcome.SURVIVED), snapshot="")
+    assert ledger.replace([1, 3, 99]) == 2
+    assert ledger.finished() == {0, 2}
+    assert ledger.replaced() == [result(1, Outcome.INVALID), result(3, Outcome.INVALID)]
+    ledger.record(result(1), snapshot="")
+    assert ledger.outcomes() == {"survived": 3}
+    ledger.close()
+
+
+def test_every_state_is_written_down(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    ledger.enter("running", owner={"pid": 1})
+    ledger.enter("error", "no disk")
+    assert [event[1:] for event in ledger.events()] == [("running", ""), ("error", "no disk")]
+    assert ledger.facts() == {"state": "error", "detail": "no disk", "owner": {"pid": 1}}
+    ledger.enter("running")
+    assert "detail" not in ledger.facts()
+    ledger.close()
+
+
+def test_a_ledger_of_another_version_is_refused(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    Ledger(path, writable=True).close()
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    for writable in (False, True):
+        with pytest.raises(HuntDirectoryError, match="a ledger of version 99"):
+            Ledger(path, writable=writable)
+
+
 def test_a_trial_that_ran_again_counts_once(tmp_path):
     ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
     ledger.record(result(1, Outcome.HANG), snapshot="")
