@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import BundleError, HuntDirectoryError
+from crashhunt.errors import BundleError
 from crashhunt.snapshot import Snapshot
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -75,30 +76,22 @@ def export_crash(bundle: Bundle, target: Path) -> int:
     files += [snapshot.path / name for name in snapshot.manifest["files"]]
     files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
     entries: dict[str, dict[str, Any]] = {}
-    temporary = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in files:
-                if path.is_file() and not path.is_symlink():
-                    name = path.relative_to(hunt).as_posix()
-                    data = path.read_bytes()
-                    entries[name] = {"size": len(data), "blake2b": _hash(data)}
-                    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
-            index = {
-                "schema": SCHEMA,
-                "crash": bundle.id,
-                "made_by": f"{getpass.getuser()}@{socket.gethostname()}",
-                "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
-                "files": entries,
-            }
-            index["signature"] = _signature(index)
-            archive.writestr(zipfile.ZipInfo(_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise HuntDirectoryError(
-            f"the archive cannot be written: {error.strerror}", fix="choose another file", where=str(target)
-        ) from error
+    with whole_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in files:
+            if path.is_file() and not path.is_symlink():
+                name = path.relative_to(hunt).as_posix()
+                data = path.read_bytes()
+                entries[name] = {"size": len(data), "blake2b": _hash(data)}
+                archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+        index = {
+            "schema": SCHEMA,
+            "crash": bundle.id,
+            "made_by": f"{getpass.getuser()}@{socket.gethostname()}",
+            "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
+            "files": entries,
+        }
+        index["signature"] = _signature(index)
+        archive.writestr(zipfile.ZipInfo(_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
     return target.stat().st_size
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import HuntDirectoryError
+from crashhunt.errors import BusyError, HuntDirectoryError
 from crashhunt.settings import HuntSettings, read_settings, write_settings
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class HuntDirectory:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 lock.seek(0)
-                raise HuntDirectoryError(
+                raise BusyError(
                     f"another hunt is running there (process {lock.read().strip() or '?'})",
                     fix="wait for it, stop it, or choose another directory",
                     where=str(self.path),

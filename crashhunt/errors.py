@@ -23,6 +23,7 @@ __all__ = [
     "ActionError",
     "ArgumentError",
     "BundleError",
+    "BusyError",
     "CrashhuntError",
     "EpisodeError",
     "HuntDirectoryError",
@@ -89,6 +90,10 @@ class PluginError(CrashhuntError):
 
 class HuntDirectoryError(CrashhuntError):
     """The directory of a hunt is busy, foreign, unwritable or full."""
+
+
+class BusyError(HuntDirectoryError):
+    """Another hunt is running in the directory."""
 
 
 class BundleError(CrashhuntError):

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.errors import BusyError, CrashhuntError, HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario
@@ -183,9 +183,10 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
             try:
                 report = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"]).run()
                 break
-            except HuntDirectoryError as error:
-                if "another hunt is running" not in error.message or time.monotonic() > deadline:
-                    raise
+            except BusyError as error:
+                if time.monotonic() > deadline:
+                    print(f"crashhunt: {error}", file=sys.stderr)  # whoever runs there writes down what comes of it
+                    return
                 time.sleep(0.5)
         print(describe_hunt(report), flush=True)
     except CrashhuntError as error:

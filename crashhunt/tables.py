@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TextIO
+from tempfile import NamedTemporaryFile
+from typing import IO, TYPE_CHECKING, Any
 
 from crashhunt.errors import UsageError
 from crashhunt.results import HuntResults, columns_of
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +22,7 @@ FORMATS = ("csv", "json", "jsonl", "parquet")
 _LOOKED_AT = 1000  # rows, to find out the type of an argument of which nobody says it
 
 
-def write_text(hunt: HuntResults, out: TextIO, form: str, *, outcomes: Sequence[str] = ()) -> int:
+def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:
     """Write the trials of a hunt as text; return how many.
 
     Args:
@@ -59,16 +61,14 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
     except ImportError:
         raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
     kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _LOOKED_AT)))
-    temporary, table = path.with_name(f".{path.name}.part"), path.with_name(f".{path.name}.csv")
-    try:
-        with table.open("w", encoding="utf-8", newline="") as file:
-            count = write_text(hunt, file, "csv", outcomes=outcomes)
-        schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
-        pl.scan_csv(table, schema=schema).sink_parquet(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-        table.unlink(missing_ok=True)
+    schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
+    with (
+        whole_file(path) as temporary,
+        NamedTemporaryFile("w", dir=path.parent, prefix=".", suffix=".csv", encoding="utf-8", newline="") as table,
+    ):
+        count = write_text(hunt, table, "csv", outcomes=outcomes)
+        table.flush()
+        pl.scan_csv(table.name, schema=schema).sink_parquet(temporary)
     return count
 
 

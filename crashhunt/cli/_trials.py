@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
     import argparse
@@ -40,6 +40,7 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.results import HuntResults
     from crashhunt.tables import write_parquet, write_text
     from crashhunt.trial import Outcome
+    from crashhunt.whole_file import whole_file
 
     outcomes = [name for name in options.outcome.split(",") if name]
     for name in outcomes:
@@ -51,20 +52,10 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
             raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")
         write_text(hunt, sys.stdout, options.format, outcomes=outcomes)
         return 0
-    try:
-        if options.format == "parquet":
-            count = write_parquet(hunt, options.out, outcomes=outcomes)
-        else:
-            temporary = options.out.with_name(f".{options.out.name}.part")
-            try:
-                with temporary.open("w", encoding="utf-8", newline="") as file:
-                    count = write_text(hunt, file, options.format, outcomes=outcomes)
-                temporary.replace(options.out)
-            finally:
-                temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise HuntDirectoryError(
-            f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(options.out)
-        ) from error
+    if options.format == "parquet":
+        count = write_parquet(hunt, options.out, outcomes=outcomes)
+    else:
+        with whole_file(options.out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+            count = write_text(hunt, file, options.format, outcomes=outcomes)
     print(f"{options.out} has {count} trials", file=sys.stderr)
     return 0

@@ -10,10 +10,11 @@ import numpy as np
 from PIL import Image
 
 from crashhunt.encounter import Encounter
-from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.errors import UsageError
 from crashhunt.oracles import approaches
 from crashhunt.render._panels import Action, Curve
 from crashhunt.render._scene import SceneView
+from crashhunt.whole_file import cannot_write, whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -201,28 +202,19 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
 
     import av
 
-    temporary = path.with_name(f".{path.stem}.part.mp4")
     count = 0
-    try:
-        with av.open(str(temporary), "w") as container:
-            stream: Any = None
-            for picture in frames(shots, options):
-                if stream is None:
-                    rate = Fraction(_frame_rate(shots, options)).limit_denominator(1000)
-                    stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
-                    stream.height, stream.width = picture.shape[:2]
-                    stream.pix_fmt = "yuv420p"
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-                count += 1
-            if stream is not None:
-                container.mux(stream.encode())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise _unwritable(path, error) from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with whole_file(path) as temporary, av.open(str(temporary), "w") as container:
+        stream: Any = None
+        for picture in frames(shots, options):
+            if stream is None:
+                rate = Fraction(_frame_rate(shots, options)).limit_denominator(1000)
+                stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            count += 1
+        if stream is not None:
+            container.mux(stream.encode())
     return count
 
 
@@ -233,8 +225,7 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
         HuntDirectoryError: the file cannot be written.
     """
     pictures = [Image.fromarray(picture).quantize(64) for picture in frames(shots, options)]
-    temporary = path.with_name(f".{path.stem}.part.gif")
-    try:
+    with whole_file(path) as temporary:
         pictures[0].save(
             temporary,
             save_all=True,
@@ -242,10 +233,6 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
             duration=max(20, round(1000 / _frame_rate(shots, options))),  # players slow down what is faster
             loop=0,
         )
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise _unwritable(path, error) from error
     return len(pictures)
 
 
@@ -262,7 +249,7 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions) -> i
             Image.fromarray(picture).save(folder / f"{count:06d}.png")
             count += 1
     except OSError as error:
-        raise _unwritable(folder, error) from error
+        raise cannot_write(folder, error) from error
     return count
 
 
@@ -319,9 +306,3 @@ def _steps(shot: Shot, options: FilmOptions) -> list[int]:
     count = math.floor((last - first) * dt * fps + 1e-6) + 1
     steps = [min(last, first + int(number / fps / dt + 1e-6)) for number in range(count)]
     return steps if steps[-1] == last else [*steps, last]
-
-
-def _unwritable(path: Path, error: OSError) -> HuntDirectoryError:
-    return HuntDirectoryError(
-        f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(path)
-    )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.errors import HuntDirectoryError
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.trial import Outcome
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,15 +92,8 @@ def comparison_page(found: Comparison, path: Path) -> None:
         f"<h2>Outcomes</h2>{_outcomes(found.hunts)}"
         f'<h2>Crash rate against each argument</h2><div class="plots">{plots}</div></body></html>\n'
     )
-    temporary = path.with_name(f".{path.name}.part")
-    try:
+    with whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise HuntDirectoryError(
-            f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(path)
-        ) from error
 
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import math
-import os
 import zlib
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -13,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt import __version__
-from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.oracles import approaches
 from crashhunt.recording import read_lanes
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._show import Story
 from crashhunt.settings import read_settings
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,15 +54,8 @@ def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, na
     page = resources.files("crashhunt.report").joinpath("page.html").read_text(encoding="utf-8")
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
-    temporary = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
+    with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise HuntDirectoryError(
-            f"the report cannot be written: {error.strerror}", fix="choose another file", where=str(target)
-        ) from error
     return target.stat().st_size
 
 

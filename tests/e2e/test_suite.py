@@ -157,6 +157,19 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     assert log.count("running") == 2
 
 
+def test_two_at_once_do_not_disturb_each_other(toy):
+    written(toy, SLOW)
+    first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
+    second = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
+    for process in (first, second):
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 0, err
+    assert set(states(toy).values()) == {"finished"}
+    for name in "abc":
+        assert numbers(toy, f"out/{name}/0") == list(range(120))
+        assert "error" not in toy.crashhunt("logs", "out", "--run", name, "--type", "state").out
+
+
 def digests(shell, hunt: str) -> dict[int, tuple[str, str]]:
     lines = shell.crashhunt("trials", hunt, "--format", "jsonl").out.splitlines()
     return {row["number"]: (row["digest"], row["wall_s"]) for row in map(json.loads, lines)}
