@@ -21,7 +21,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario
 from crashhunt.settings import RunSettings, read_settings
-from crashhunt.snapshot import latest_snapshot
+from crashhunt.snapshot import SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -45,10 +45,12 @@ class RunRequest:
     Args:
         request: of the hunt.
         folder: from where agents are imported.
+        snapshot_roots: what the snapshot takes in besides the agents' own projects.
     """
 
     request: Request
     folder: str
+    snapshot_roots: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, file: Path) -> RunRequest:
@@ -61,7 +63,11 @@ class RunRequest:
             data = json.loads(file.read_text(encoding="utf-8"))
             given = data["request"]
             run = RunSettings(**given.pop("run"))
-            return cls(Request(**{**given, "crash_on": tuple(given["crash_on"]), "run": run}), data["folder"])
+            return cls(
+                Request(**{**given, "crash_on": tuple(given["crash_on"]), "run": run}),
+                data["folder"],
+                tuple(data["snapshot_roots"]),
+            )
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite anew", where=str(file)) from None
 
@@ -177,11 +183,14 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
     from crashhunt.report import describe_hunt
 
     try:
-        scenario, settings = _planned(folder, parallel)
+        asked = RunRequest.read(folder / REQUEST)
+        scenario, settings = _planned(folder, asked.request, parallel)
+        snapshot = SnapshotOptions(roots=tuple(map(Path, asked.snapshot_roots)))
+        hunt = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"], snapshot=snapshot)
         deadline = time.monotonic() + _BUSY_S
         while True:
             try:
-                report = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"]).run()
+                report = hunt.run()
                 break
             except BusyError as error:
                 if time.monotonic() > deadline:
@@ -195,9 +204,8 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
         _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _planned(folder: Path, parallel: int) -> tuple[Scenario, HuntSettings]:
+def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, HuntSettings]:
     """What to run: what is there already, or what was asked for."""
-    request = RunRequest.read(folder / REQUEST).request
     if not (folder / "hunt.toml").exists():
         return plan(replace(request, run=replace(request.run, parallel=parallel)))
     settings = read_settings(folder / "hunt.toml")

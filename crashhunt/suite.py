@@ -53,6 +53,8 @@ class SuiteEntry:
         keep_going: collect all crashes instead of stopping at the first.
         deterministic: the same seed gives the same crash.
         timeout_s: wall-clock limit of a trial, in s.
+        keep_trials: keep the logs of every trial.
+        snapshot_roots: files and folders, from the folder of the file, that the snapshot takes in as well.
     """
 
     id: str = ""
@@ -72,6 +74,8 @@ class SuiteEntry:
     keep_going: bool = False
     deterministic: bool = False
     timeout_s: float = 60.0
+    keep_trials: bool = False
+    snapshot_roots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +201,8 @@ class Suite:
                 )
             return folder
         folder.mkdir(parents=True, exist_ok=True)
-        write_request(folder, RunRequest(request, str(self.folder)))
+        roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
+        write_request(folder, RunRequest(request, str(self.folder), roots))
         return folder
 
     def _request(self, entry: SuiteEntry, number: int) -> Request:
@@ -218,7 +223,12 @@ class Suite:
             points=entry.points,
             seed=int(drawn),
             crash_on=tuple(entry.crash_on),
-            run=RunSettings(keep_going=entry.keep_going, deterministic=entry.deterministic, timeout_s=entry.timeout_s),
+            run=RunSettings(
+                keep_going=entry.keep_going,
+                deterministic=entry.deterministic,
+                timeout_s=entry.timeout_s,
+                keep_trials=entry.keep_trials,
+            ),
         )
 
 

@@ -226,6 +226,15 @@ def test_a_mistake_in_the_file_is_one_line(toy, text, says):
     assert not (toy.folder / "out").exists()
 
 
+def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):
+    (toy.folder / "maps").mkdir()
+    (toy.folder / "maps" / "town.csv").write_text("1,2")
+    written(toy, "[[hunts]]\nid = 'a'\nscenario = 'toy'\ntrials = 1\nsnapshot_roots = ['maps']\nkeep_trials = true")
+    toy.crashhunt("suite", "run", "suite.toml", "out", "1")
+    assert [path.name for path in toy.folder.glob("out/a/0/snapshots/*/code/**/town.csv")] == ["town.csv"]
+    assert (toy.folder / "out/a/0/trials/000000/params.json").exists() or list(toy.folder.glob("out/a/0/crashes/*"))
+
+
 def test_a_suite_that_has_changed_is_refused(toy):
     written(toy, SUITE)
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
