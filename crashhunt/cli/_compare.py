@@ -35,7 +35,14 @@ def _compare(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import comparison_page, describe_comparison
     from crashhunt.status import find_hunts
 
-    found = compare(*(hunt for directory in options.directories for hunt in find_hunts(directory)))
+    hunts = []
+    for directory in options.directories:
+        for hunt in find_hunts(directory):
+            if hunt == directory or (hunt / "hunt.toml").exists():
+                hunts.append(hunt)
+            else:
+                say(f"{hunt} has not begun, and is left out", as_json=True)
+    found = compare(*hunts)
     if options.csv:
         found.write_csv(sys.stdout)
     else:

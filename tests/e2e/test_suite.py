@@ -113,6 +113,9 @@ def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
     for words in ("No module named 'nothing'", "'fast' is not a number", "no such luck", "nowhere"):
         assert words in logs
     assert "unimportable/0: error" in logs
+    compared = toy.crashhunt("compare", "out", "--json")
+    assert [hunt["dir"] for hunt in compared.json["hunts"]] == ["out/fast/0", "out/fast/1", "out/slow/0"]
+    assert "out/unimportable/0 has not begun, and is left out" in compared.err
     table = toy.crashhunt("status", "out").out
     assert "out/a-word/0: --arg speed: 'fast' is not a number" in " ".join(table.split())
 
