@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["Ledger"]
+__all__ = ["Ledger", "has_begun"]
 
 _VERSION = 1  # of the tables, as PRAGMA user_version
 _SCHEMA = """
@@ -39,6 +39,17 @@ CREATE TABLE IF NOT EXISTS replaced (number INTEGER, replaced_at REAL, result TE
 CREATE TABLE IF NOT EXISTS events (at REAL NOT NULL, state TEXT NOT NULL, detail TEXT NOT NULL) STRICT;
 CREATE TABLE IF NOT EXISTS hunt (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID;
 """
+
+
+def has_begun(path: Path) -> bool:
+    """Whether there is a ledger, and not only the file that is about to become one."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+            return database.execute("SELECT 1 FROM sqlite_schema").fetchone() is not None
+    except sqlite3.OperationalError:
+        return path.exists() and path.stat().st_size > 0
+    except sqlite3.DatabaseError:
+        return True  # something else is there, and whoever opens it is told
 
 
 class Ledger:

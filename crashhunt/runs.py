@@ -103,8 +103,12 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
                 while waiting and free > 0 and not asked:
                     # Towards the end there are fewer hunts than slots: then each gets several.
                     width = max(1, free // len(waiting))
-                    running[_start(waiting.popleft(), width)] = width
-                    free -= width
+                    folder = waiting.popleft()
+                    try:
+                        running[_start(folder, width)] = width
+                        free -= width
+                    except (CrashhuntError, OSError) as error:
+                        _fail(folder, str(error), "")
                 if asked:
                     waiting.clear()
                     for process in running:
@@ -217,8 +221,8 @@ def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, H
 def _fail(folder: Path, message: str, trace: str) -> None:
     """Write down why a hunt could not run."""
     print(f"crashhunt: {message}", file=sys.stderr, flush=True)
-    (folder / "error.log").write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
-    with suppress(CrashhuntError):
+    with suppress(CrashhuntError, OSError):
+        (folder / "error.log").write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
         ledger = Ledger(folder / "ledger.sqlite", writable=True)
         if ledger.facts().get("state") != "error":
             ledger.enter("error", message)

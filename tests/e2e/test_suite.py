@@ -160,6 +160,18 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     assert log.count("running") == 2
 
 
+def test_a_damaged_plan_leaves_the_others_untouched(toy):
+    from crashhunt.runs import run_all
+    from crashhunt.suite import Suite
+
+    written(toy, SUITE)
+    folders = Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")
+    (folders[0] / "request.json").write_text("{}")
+    run_all(folders, 2)
+    assert states(toy) == {"fast/0": "error", "fast/1": "crashed", "slow/0": "finished"}
+    assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
+
+
 def test_two_at_once_do_not_disturb_each_other(toy):
     written(toy, SLOW)
     first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import ClosestApproach, Outcome, TrialResult, TrialSpec
 
 
@@ -59,6 +59,19 @@ def test_every_state_is_written_down(tmp_path):
     ledger.enter("running")
     assert "detail" not in ledger.facts()
     ledger.close()
+
+
+def test_a_file_that_is_about_to_become_a_ledger_is_none_yet(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    assert not has_begun(path)
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+    database.close()
+    assert not has_begun(path)
+    Ledger(path, writable=True).close()
+    assert has_begun(path)
+    path.write_bytes(b"nonsense" * 1000)
+    assert has_begun(path)
 
 
 def test_a_ledger_of_another_version_is_refused(tmp_path):
