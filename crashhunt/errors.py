@@ -8,6 +8,7 @@
     ├── ScenarioError              a scenario file: which file, which key, which value
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
+    │   └── BusyError              another hunt is running in it
     ├── BundleError                a crash bundle or log that is damaged or incomplete
     ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
     ├── RecorderError              a trial could not be recorded: a full disk

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
 
-__all__ = ["Parser", "add_crash", "add_json", "integer", "opened_crash", "opened_hunt", "pairs", "say"]
+__all__ = ["Parser", "add_crash", "add_json", "chosen_runs", "integer", "opened_crash", "opened_hunt", "pairs", "say"]
 
 
 class Parser(argparse.ArgumentParser):
@@ -80,6 +80,26 @@ def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
     hunt = directory.resolve().parent.parent if (directory / "crash.json").is_file() else directory
     read_settings(hunt / "hunt.toml")  # refuses what is no hunt
     yield hunt, False
+
+
+def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
+    """Return the hunts of a directory, with their names in it.
+
+    Args:
+        directory: of a hunt or a suite.
+        runs: ``ID/N``, or ``ID`` for all runs of it; empty for every hunt.
+
+    Raises:
+        HuntDirectoryError: there is none.
+        UsageError: there is no such run.
+    """
+    from crashhunt.status import find_hunts
+
+    names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_hunts(directory)}
+    for run in runs:
+        if not any(run in (name, name.partition("/")[0]) for name in names.values()):
+            raise UsageError(f"--run: there is no run {run!r}", fix=f"give one of {', '.join(names.values())}")
+    return {hunt: name for hunt, name in names.items() if not runs or {name, name.partition("/")[0]} & set(runs)}
 
 
 def say(text: str, *, as_json: bool) -> None:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import integer
+from crashhunt.cli._common import chosen_runs, integer
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -36,16 +36,11 @@ def add_logs(commands: Any) -> None:
 
 def _logs(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.logs import LogKind, read_logs
-    from crashhunt.status import find_hunts, hunt_state
+    from crashhunt.status import hunt_state
 
     if options.errors_only and options.type not in (None, "error"):
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")
-    hunts = find_hunts(options.directory)
-    names = {hunt: hunt.relative_to(options.directory).as_posix() for hunt in hunts}
-    if options.run:
-        hunts = [hunt for hunt in hunts if options.run in (names[hunt], names[hunt].partition("/")[0])]
-        if not hunts:
-            raise UsageError(f"--run: there is no run {options.run!r}", fix=f"give one of {', '.join(names.values())}")
+    hunts = chosen_runs(options.directory, [options.run] if options.run else [])
     kinds: tuple[LogKind, ...] = ("run", "error", "state")
     if options.errors_only or options.type is not None:
         kinds = ("error",) if options.errors_only else (options.type,)
@@ -54,7 +49,7 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
     def fresh() -> Iterator[tuple[str, str]]:
         for hunt in hunts:
             for title, text in read_logs(hunt, kinds, trial=options.trial):
-                where = title if names[hunt] == "." else f"{names[hunt]}: {title}"
+                where = title if hunts[hunt] == "." else f"{hunts[hunt]}: {title}"
                 before = shown.get(where, 0)
                 if len(text) > before:
                     shown[where] = len(text)

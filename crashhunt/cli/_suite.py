@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import add_json, integer, pairs, say
+from crashhunt.cli._common import add_json, chosen_runs, integer, pairs, say
 from crashhunt.cli._status import show_states, states_console, states_table
-from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
     import argparse
@@ -73,6 +72,7 @@ def add_rerun(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.status import find_hunts, hunt_state
     from crashhunt.suite import Suite
 
     suite = Suite.read(options.file)
@@ -80,6 +80,8 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     try:
         states = suite.run(options.directory, options.parallel, watch=watch)
     except KeyboardInterrupt:
+        finish()
+        _tell([hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json)
         say("Interrupted; the same command goes on from here.", as_json=options.json)
         raise
     finally:
@@ -96,15 +98,8 @@ def _defaults(_options: argparse.Namespace, _words: list[str]) -> int:
 
 def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.reruns import rerun
-    from crashhunt.status import find_hunts
 
-    hunts = find_hunts(options.directory)
-    if options.run:
-        names = {hunt: hunt.relative_to(options.directory).as_posix() for hunt in hunts}
-        for run in options.run:
-            if not any(run in (name, name.partition("/")[0]) for name in names.values()):
-                raise UsageError(f"--run: there is no run {run!r}", fix=f"give one of {', '.join(names.values())}")
-        hunts = [hunt for hunt, name in names.items() if {name, name.partition("/")[0]} & set(options.run)]
+    hunts = list(chosen_runs(options.directory, options.run))
     watch, finish = _watcher(as_json=options.json)
     try:
         states, replaced = rerun(
@@ -143,7 +138,6 @@ def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Calla
 
 
 def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: list[Path] | None = None) -> int:
-
     if as_json:
         extra = {"replaced": [str(place) for place in replaced]} if replaced is not None else {}
         print(json.dumps({"hunts": [state.to_json() for state in states], **extra}))

@@ -195,8 +195,9 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     process = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
+    assert len(json.loads(out)["hunts"]) == 3
     assert "the same command goes on from here" in err
     found = states(toy)
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
