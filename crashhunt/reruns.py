@@ -20,7 +20,7 @@ from crashhunt.trial import Outcome
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["request_of", "rerun"]
+__all__ = ["rerun"]
 
 _NUMBERS = ("trials", "max_steps", "seed")  # what --set changes besides arguments
 
@@ -68,7 +68,9 @@ def rerun(
     for hunt in hunts:
         state = hunt_state(hunt)
         if everything or state.state == "error":
-            replaced.append(set_aside(hunt))
+            aside = set_aside(hunt)
+            requests[hunt] = _moved(requests[hunt], hunt, aside)
+            replaced.append(aside)
         elif not (state.failed or state.state == "queued" or _replace_invalid(hunt, state)):
             continue
         write_request(hunt, requests[hunt])
@@ -77,8 +79,8 @@ def rerun(
     return [hunt_state(hunt) for hunt in hunts], replaced
 
 
-def request_of(settings: HuntSettings) -> Request:
-    """Return what has to be asked for to get these settings."""
+def _request_of(settings: HuntSettings) -> Request:
+    """What has to be asked for to get these settings."""
     arguments = {
         f"{agent}.{name}": spec.spec
         for agent, chosen in settings.agents.items()
@@ -103,13 +105,22 @@ def _request(hunt: Path) -> RunRequest:
     if (hunt / REQUEST).exists():
         return RunRequest.read(hunt / REQUEST)
     settings = read_settings(hunt / "hunt.toml")
-    request = request_of(settings)
+    request = _request_of(settings)
     if settings.scenario not in shipped_scenarios():
         # Where the hunt was started from is not known; the scenario is in the snapshot.
         snapshot = latest_snapshot(hunt)
         scenario = Path(settings.scenario) if snapshot is None else snapshot.path / "scenario" / "scenario.toml"
         request = replace(request, scenario=str(scenario.resolve()))
     return RunRequest(request, str(Path.cwd()))
+
+
+def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
+    """The same, where the scenario is that of the snapshot, which has been set aside with everything else."""
+    scenario = Path(asked.request.scenario)
+    if not scenario.is_relative_to(hunt.resolve()):
+        return asked
+    moved = aside.resolve() / scenario.relative_to(hunt.resolve())
+    return replace(asked, request=replace(asked.request, scenario=str(moved)))
 
 
 def _changed(asked: RunRequest, changes: Mapping[str, str]) -> RunRequest:

@@ -177,6 +177,16 @@ def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
 
 
+def test_a_hunt_of_ones_own_scenario_begins_anew(toy):
+    toy.crashhunt("run", "h", "1", "9", "99", *KEEP)
+    before = [row["digest"] for row in rows(toy, "h")]
+    for number in range(2):  # the second time, the scenario is that of what was set aside the first time
+        done = toy.crashhunt("rerun", "h", "--all", "--json").json
+        assert done["replaced"] == [f"h.replaced-{number}"]
+        assert [row["digest"] for row in rows(toy, "h")] == before
+    assert toy.crashhunt("replay", "h.replaced-0", "--json").json["verdict"] == "reproduced"
+
+
 def rows(shell, hunt: str, *words: str) -> list[dict]:
     return json.loads(shell.crashhunt("trials", hunt, "--format", "json", *words).out)
 
