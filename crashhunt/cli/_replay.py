@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
+    from crashhunt.render.film import FilmOptions
     from crashhunt.replays import ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
@@ -102,6 +103,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     crashes = options.crash.split(",")
     if len(crashes) > 1 and film is None:
         raise UsageError(f"--crash {options.crash!r} names several", fix="give one, or make a film of them")
+    _refuse_what_would_be_ignored(options, film)
     answers, shots, good = [], [], True
     for crash in crashes:
         with opened_crash(options.directory, crash) as (bundle, archive):
@@ -125,6 +127,25 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         answer = answers[0] if len(answers) == 1 else {"crashes": answers}
         print(json.dumps(answer | ({"written": written} if film is not None else {})))
     return 0 if good else 1
+
+
+def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions | None) -> None:
+    """Refuse options that contradict each other rather than leave one of them out."""
+    look = {
+        "--gui": options.gui,
+        "--pdb": options.pdb,
+        "--until": options.until is not None,
+        "--before": options.before is not None,
+    }
+    if film is not None and options.from_log:
+        look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
+        for name in [name for name, given in look.items() if given]:
+            raise UsageError(f"{name}: a film --from-log simulates nothing", fix=f"leave {name} or --from-log out")
+    if options.times != 1:
+        if film is not None:
+            look |= {"a film": True}
+        for name in [name for name, given in look.items() if given]:
+            raise UsageError(f"--times {options.times}: {name} looks at one run", fix="leave one of the two out")
 
 
 def _replay_one(

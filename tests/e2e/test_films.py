@@ -27,6 +27,9 @@ class Showy:
             raise ValueError("no plan")
         return self.speed, 0
 
+    def close(self):
+        open("closed", "a").write("x")
+
     def panels(self):
         if self.broken and self.step > 20:
             raise KeyError("no picture")
@@ -59,6 +62,8 @@ def test_a_replay_is_filmed_with_the_agents_own_panels(crash):
     done = crash.crashhunt("replay", "h", *words, "--json").json
     assert done["verdict"] == "reproduced"
     assert done["written"] == {"out.mp4": 42, "out.gif": 42, "f": 42}
+    # In the hunt, in its confirmation, and in the film.
+    assert (crash.folder / "closed").read_text() == "xxx"
     video = pictures(crash.folder / "out.mp4")
     assert len(video) == 42
     # Four built-in panels and two of its own, in the step before the crash; there are none before the first step.
@@ -128,6 +133,10 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(shell, agent):
         (("--video", "a.mp4", "--size", "10x10"), "--size is 10"),
         (("--video", "a.mp4", "--fps", "-1"), "--fps is -1"),
         (("--video", "a.mp4", "--last-seconds", "nan"), "--last-seconds is nan"),
+        (("--video", "a.mp4", "--times", "3"), "--times 3: a film looks at one run"),
+        (("--until", "5", "--times", "3"), "--times 3: --until looks at one run"),
+        (("--video", "a.mp4", "--from-log", "--until", "5"), "--until: a film --from-log simulates nothing"),
+        (("--gif", "a.gif", "--from-log", "--set", "speed=3"), "--set: a film --from-log simulates nothing"),
     ],
 )
 def test_bad_options_are_told_before_anything_is_run(crash, words, message):
