@@ -22,7 +22,7 @@ from crashhunt.render import explanation, labelled, save_panels, scope
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from crashhunt.agents import Agent
     from crashhunt.replays import Rerun
@@ -106,7 +106,32 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / BLACK_BOX))
 
 
-class _Watched:
+class _Accompanied:
+    """An agent, and which step it is in.
+
+    Args:
+        agent: who drives.
+        name: of the vehicle.
+    """
+
+    def __init__(self, agent: Agent, name: str) -> None:
+        self._agent = agent
+        self._name = name
+        self._step = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._agent, name)  # whatever else it has, such as close()
+
+    def reset(self, seed: int) -> None:
+        self._step = 0
+        self._agent.reset(seed)
+
+    def act(self, observation: Any) -> Any:
+        self._step += 1
+        return self._agent.act(observation)
+
+
+class _Watched(_Accompanied):
     """An agent that is looked into at one step.
 
     Args:
@@ -117,20 +142,14 @@ class _Watched:
     """
 
     def __init__(self, agent: Agent, name: str, step: int, simulator: Simulator) -> None:
-        self._agent = agent
-        self._name = name
+        super().__init__(agent, name)
         self._stop_at = step
         self._simulator = simulator
-        self._step = 0
-
-    def reset(self, seed: int) -> None:
-        self._step = 0
-        self._agent.reset(seed)
 
     def act(self, observation: Any) -> Any:
+        if self._step + 1 != self._stop_at:
+            return super().act(observation)
         self._step += 1
-        if self._step != self._stop_at:
-            return self._agent.act(observation)
         # At hand in the debugger, whatever the agent calls its own.
         for name, value in (
             ("agent", self._agent), ("observation", observation), ("scene", self._simulator.scene()),
@@ -141,36 +160,27 @@ class _Watched:
         return _Debugger().runcall(self._agent.act, observation)
 
 
-class _Drawn:
+class _Drawn(_Accompanied):
     """An agent whose panels are drawn after every step.
 
     Args:
-        agent: who drives.
+        agent: who drives; it has panels.
         name: of the vehicle.
-        panels: gives them.
         first: the first step to draw.
         folder: for the pictures.
     """
 
-    def __init__(self, agent: Agent, name: str, panels: Callable[[], Any], first: int, folder: Path) -> None:
-        self._agent = agent
-        self._name = name
+    def __init__(self, agent: Agent, name: str, first: int, folder: Path) -> None:
+        super().__init__(agent, name)
         self._first = first
         self._folder = folder
-        self._panels = panels
-        self._step = 0
-
-    def reset(self, seed: int) -> None:
-        self._step = 0
-        self._agent.reset(seed)
 
     def act(self, observation: Any) -> Any:
-        self._step += 1
-        action = self._agent.act(observation)
+        action = super().act(observation)
         if self._step >= self._first:
             with scope(self._name):
                 try:
-                    panels = labelled(self._panels())
+                    panels = labelled(self.panels())
                 except Exception as error:  # a picture that fails is no crash of the agent
                     panels = labelled({"panels": explanation(error)})
             save_panels(self._folder, self._step, panels)
@@ -242,11 +252,10 @@ def _main(folder: Path) -> None:
 
         def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
             made = parts.agent(name, simulator, arguments)
-            shown = getattr(made, "panels", None)
             if name == job["agent"]:
                 made = _Watched(made, name, job["stop_at"], simulator)
-            if job["panels"] is not None and callable(shown):
-                made = _Drawn(made, name, shown, job["panels"][0], Path(job["panels"][1]))
+            if job["panels"] is not None and callable(getattr(made, "panels", None)):
+                made = _Drawn(made, name, job["panels"][0], Path(job["panels"][1]))
             return made
 
         simulator: Any = parts.simulator()

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.debugger import Look, debug
 from crashhunt.edits import edited_spec
 from crashhunt.environment import environment_changes
 from crashhunt.errors import BundleError, CrashhuntError, UsageError
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.bundle import Bundle
+    from crashhunt.debugger import Look
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
@@ -248,6 +248,8 @@ def _run(rerun: Rerun) -> ReplayReport:
 
 def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
     """Run the first steps with the terminal at hand, and compare them with those of the log."""
+    from crashhunt.debugger import debug
+
     result, replayed = debug(rerun, look)
     if result.outcome is Outcome.INVALID:
         raise _not_set_up(rerun, result.failure.message if result.failure else "it left no recording")

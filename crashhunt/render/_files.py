@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["explanation", "load_panels", "save_panels"]
 
+_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
 _LINE = 34  # characters that fit
 
 
@@ -37,6 +38,8 @@ def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) ->
             name = f"{step:06d}-{index.tell()}-{number}.png"
             try:
                 picture = panel.draw(label=label)
+                if picture.shape != _SHAPE or picture.dtype != np.uint8:
+                    raise ValueError(f"{picture.dtype}, shape {picture.shape}, not uint8, shape {_SHAPE}")
             except Exception as error:  # an agent may put anything into its panels
                 picture = explanation(error).draw(label=label)
             Image.fromarray(picture).save(folder / name, compress_level=1)

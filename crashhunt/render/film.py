@@ -178,8 +178,9 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
         last: tuple[int, NDArray[np.uint8]] | None = None
         for step in _steps(shot, options):
             if last is None or last[0] != step:
-                drawn = dict(shot.panels.get(step, {})) if builtin is not None else {}
+                drawn: dict[str, NDArray[np.uint8]] = {}
                 if builtin is not None:
+                    drawn |= shot.panels.get(step, {})
                     drawn |= {label: panel.draw(*_PANEL, label) for label, panel in builtin.panels(step)}
                 last = step, layout.compose(view.draw(step), drawn)
             yield last[1]
