@@ -2,55 +2,80 @@
 
 from __future__ import annotations
 
+import os
 import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = ["LogKind", "read_logs"]
+__all__ = ["LogKind", "LogReader"]
 
 LogKind = Literal["run", "error", "state"]
 
-_MOST = 1_000_000  # characters of one log, from its end
+_MOST = 1_000_000  # bytes of one file, from its end
 
 
-def read_logs(hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> Iterator[tuple[str, str]]:
-    """Yield title and text of the logs of a hunt and its trials; empty ones are left out.
+class LogReader:
+    """Reads the logs of a hunt and its trials, each time what is new.
 
     Args:
         hunt: its directory.
         kinds: what of it.
         trial: only of this one.
     """
-    if trial is None:
-        if "state" in kinds and (hunt / "ledger.sqlite").exists():
-            with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
-                lines = [
-                    f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
-                    for at, state, why in ledger.events()
-                ]
-            if lines:
-                yield "state", "\n".join(lines)
-        yield from _texts(hunt, "", kinds)
-    folders = [*(hunt / "crashes").glob("[!.]*"), *(hunt / "trials").glob("[!.]*")]
-    for folder in sorted(folders, key=lambda folder: folder.name):
-        number = folder.name.partition("-")[0]
-        if number.isdecimal() and trial in (None, int(number)):
-            yield from _texts(folder, f"trial {int(number)}, ", kinds)
 
+    def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
+        self._hunt = hunt
+        self._kinds = kinds
+        self._trial = trial
+        self._read: dict[Path, int] = {}
+        self._told = 0
 
-def _texts(folder: Path, title: str, kinds: tuple[LogKind, ...]) -> Iterator[tuple[str, str]]:
-    for kind in ("run", "error"):
-        if kind not in kinds:
-            continue
-        try:
-            text = (folder / f"{kind}.log").read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            continue
-        if text.strip():
-            yield f"{title}{kind}", text[-_MOST:]
+    def fresh(self) -> Iterator[tuple[str, str]]:
+        """Yield title and text of what has come since the last time."""
+        if self._trial is None:
+            if "state" in self._kinds:
+                yield from self._states()
+            yield from self._texts(self._hunt, "")
+        folders = [*(self._hunt / "crashes").glob("[!.]*"), *(self._hunt / "trials").glob("[!.]*")]
+        for folder in sorted(folders, key=lambda folder: folder.name):
+            number = folder.name.partition("-")[0]
+            if number.isdecimal() and self._trial in (None, int(number)):
+                yield from self._texts(folder, f"trial {int(number)}, ")
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        if not has_begun(self._hunt / "ledger.sqlite"):
+            return
+        with closing(Ledger(self._hunt / "ledger.sqlite")) as ledger:
+            events = ledger.events()[self._told :]
+        self._told += len(events)
+        lines = [
+            f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
+            for at, state, why in events
+        ]
+        if lines:
+            yield "state", "\n".join(lines)
+
+    def _texts(self, folder: Path, title: str) -> Iterator[tuple[str, str]]:
+        for kind in ("run", "error"):
+            path = folder / f"{kind}.log"
+            if kind not in self._kinds:
+                continue
+            try:
+                with path.open("rb") as file:
+                    size = file.seek(0, os.SEEK_END)
+                    begin = self._read.get(path, max(0, size - _MOST))
+                    if size <= begin:
+                        continue
+                    file.seek(begin)
+                    text = file.read(size - begin).decode("utf-8", "replace")
+            except OSError:
+                continue
+            self._read[path] = size
+            if text.strip():
+                yield f"{title}{kind}", text

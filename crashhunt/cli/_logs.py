@@ -12,7 +12,6 @@ from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator
 
 __all__ = ["add_logs"]
 
@@ -35,7 +34,7 @@ def add_logs(commands: Any) -> None:
 
 
 def _logs(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.logs import LogKind, read_logs
+    from crashhunt.logs import LogKind, LogReader
     from crashhunt.status import hunt_state
 
     if options.errors_only and options.type not in (None, "error"):
@@ -44,23 +43,15 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
     kinds: tuple[LogKind, ...] = ("run", "error", "state")
     if options.errors_only or options.type is not None:
         kinds = ("error",) if options.errors_only else (options.type,)
-    shown: dict[str, int] = {}
-
-    def fresh() -> Iterator[tuple[str, str]]:
-        for hunt in hunts:
-            for title, text in read_logs(hunt, kinds, trial=options.trial):
-                where = title if hunts[hunt] == "." else f"{hunts[hunt]}: {title}"
-                before = shown.get(where, 0)
-                if len(text) > before:
-                    shown[where] = len(text)
-                    yield where, text[before:]
-
+    readers = {name: LogReader(hunt, kinds, trial=options.trial) for hunt, name in hunts.items()}
     found = False
     while True:
         running = options.follow and any(hunt_state(hunt).state in ("running", "queued") for hunt in hunts)
-        for where, text in fresh():
-            found = True
-            print(f"==> {where} <==\n{text.rstrip()}\n", flush=True)
+        for name, reader in readers.items():
+            for title, text in reader.fresh():
+                found = True
+                where = title if name == "." else f"{name}: {title}"
+                print(f"==> {where} <==\n{text.rstrip()}\n", flush=True)
         if not running:
             break
         time.sleep(0.5)
