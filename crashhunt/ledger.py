@@ -135,7 +135,7 @@ class Ledger:
 
     def events(self) -> list[tuple[float, str, str]]:
         """Return when the hunt got into which state, and why."""
-        return self._database.execute("SELECT at, state, detail FROM events ORDER BY rowid").fetchall()
+        return list(self._select("SELECT at, state, detail FROM events ORDER BY rowid"))
 
     def replace(self, numbers: Iterable[int]) -> int:
         """Move trials out of the way so that they run again; return how many there were."""
@@ -153,24 +153,24 @@ class Ledger:
 
     def replaced(self) -> list[TrialResult]:
         """Return the trials that ran again, as they were."""
-        rows = self._database.execute("SELECT result FROM replaced ORDER BY rowid")
+        rows = self._select("SELECT result FROM replaced ORDER BY rowid")
         return [TrialResult.from_json(json.loads(text)) for (text,) in rows]
 
     def facts(self) -> dict[str, Any]:
         """Return the facts about the hunt itself."""
-        return {key: json.loads(value) for key, value in self._database.execute("SELECT key, value FROM hunt")}
+        return {key: json.loads(value) for key, value in self._select("SELECT key, value FROM hunt")}
 
     def finished(self) -> set[int]:
         """Return the numbers of the trials that have ended."""
-        return {number for (number,) in self._database.execute("SELECT number FROM trials")}
+        return {number for (number,) in self._select("SELECT number FROM trials")}
 
     def outcomes(self) -> dict[str, int]:
         """Return how many trials ended how."""
-        return dict(self._database.execute("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+        return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
 
     def steps_total(self) -> int:
         """Return how many steps were run in all."""
-        return int(self._database.execute("SELECT coalesce(sum(steps), 0) FROM trials").fetchone()[0])
+        return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
 
     def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
         """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
@@ -179,17 +179,17 @@ class Ledger:
     def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
         """Yield the same as plain data, which takes a third of the time."""
         where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
-        for (text,) in self._database.execute(f"SELECT result FROM trials {where} ORDER BY number", outcomes):
+        for (text,) in self._select(f"SELECT result FROM trials {where} ORDER BY number", outcomes):
             yield json.loads(text)
 
     def result(self, number: int) -> TrialResult | None:
         """Return one trial, or None where it has not ended."""
-        row = self._database.execute("SELECT result FROM trials WHERE number = ?", (number,)).fetchone()
+        row = next(self._select("SELECT result FROM trials WHERE number = ?", (number,)), None)
         return TrialResult.from_json(json.loads(row[0])) if row else None
 
     def snapshot_of(self, number: int) -> str:
         """Return the digest of the snapshot that a trial ran from."""
-        row = self._database.execute("SELECT snapshot FROM trials WHERE number = ?", (number,)).fetchone()
+        row = next(self._select("SELECT snapshot FROM trials WHERE number = ?", (number,)), None)
         return str(row[0]) if row else ""
 
     def nearest_miss(self) -> TrialResult | None:
@@ -197,7 +197,7 @@ class Ledger:
         least = [
             row
             for outcome in ("survived", "finished")
-            for row in self._database.execute(
+            for row in self._select(
                 "SELECT time_to_collision_s, number FROM trials WHERE outcome = ? AND time_to_collision_s IS NOT NULL "
                 "ORDER BY time_to_collision_s, number LIMIT 1",
                 (outcome,),
@@ -207,14 +207,20 @@ class Ledger:
 
     def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
         """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order."""
-        yield from self._database.execute(
+        yield from self._select(
             "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome"
         )
 
     def last_ended_at(self) -> float | None:
         """Return when the last trial ended, in s since the epoch; None where none has."""
-        row = self._database.execute("SELECT ended_at FROM trials ORDER BY number DESC LIMIT 1").fetchone()
+        row = next(self._select("SELECT ended_at FROM trials ORDER BY number DESC LIMIT 1"), None)
         return float(row[0]) if row else None
+
+    def _select(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        try:
+            yield from self._database.execute(query, values)
+        except sqlite3.Error as error:  # also in the middle of a file that is damaged
+            raise self._explained(error) from error
 
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])

@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import time
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import Outcome
 
-__all__ = ["HuntState", "State", "find_hunts", "hunt_state", "this_process"]
+__all__ = ["HuntState", "State", "find_hunts", "hunt_state", "is_hunt", "this_process"]
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
@@ -68,6 +69,11 @@ class HuntState:
         return asdict(self)
 
 
+def is_hunt(directory: Path) -> bool:
+    """Whether a directory is that of a hunt, or of one that is planned."""
+    return any((directory / name).exists() for name in _SIGNS)
+
+
 def find_hunts(directory: Path) -> list[Path]:
     """Return the directories of hunts: this one, or those below it.
 
@@ -76,7 +82,7 @@ def find_hunts(directory: Path) -> list[Path]:
     """
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt or a suite")
-    if any((directory / name).exists() for name in _SIGNS):
+    if is_hunt(directory):
         return [directory]
     found: set[Path] = set()
     for depth in range(1, _DEPTH + 1):
@@ -98,21 +104,17 @@ def hunt_state(directory: Path) -> HuntState:
     Raises:
         HuntDirectoryError: it is not the directory of a hunt.
     """
-    if not has_begun(directory / "ledger.sqlite") and any((directory / name).exists() for name in _SIGNS):
+    if not has_begun(directory / "ledger.sqlite") and is_hunt(directory):
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / "request.json"))
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")
     try:
-        ledger = Ledger(directory / "ledger.sqlite")
+        with closing(Ledger(directory / "ledger.sqlite")) as ledger:
+            facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
     except HuntDirectoryError as error:
         if not (directory / "ledger.sqlite").exists():
             raise
         return HuntState(str(directory), "error", error.message)  # one that cannot be read hides no other
-    try:
-        facts, outcomes = ledger.facts(), ledger.outcomes()
-        last = ledger.last_ended_at()
-    finally:
-        ledger.close()
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))

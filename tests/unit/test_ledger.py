@@ -74,6 +74,22 @@ def test_a_file_that_is_about_to_become_a_ledger_is_none_yet(tmp_path):
     assert has_begun(path)
 
 
+def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    ledger = Ledger(path, writable=True)
+    for number in range(300):
+        ledger.record(result(number), snapshot="")
+    ledger.close()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 :] = b"\x55" * (len(data) - len(data) // 2)
+    path.write_bytes(data)
+    found = Ledger(path)
+    for read in (found.outcomes, found.finished, found.nearest_miss, lambda: list(found.results()), found.table):
+        with pytest.raises(HuntDirectoryError, match=r"malformed|not a ledger"):
+            list(read() or [])
+    found.close()
+
+
 def test_a_ledger_of_another_version_is_refused(tmp_path):
     path = tmp_path / "ledger.sqlite"
     Ledger(path, writable=True).close()
