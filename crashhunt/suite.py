@@ -18,7 +18,7 @@ from crashhunt.plan import Request
 from crashhunt.runs import REQUEST, RunRequest, run_all, write_request
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.settings import RunSettings
-from crashhunt.status import HuntState, hunt_state
+from crashhunt.status import HuntState, hunt_state, is_hunt
 from crashhunt.trial import CRASHES
 
 if TYPE_CHECKING:
@@ -153,13 +153,20 @@ class Suite:
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
         """
         place = Path(directory)
+        if is_hunt(place):
+            raise HuntDirectoryError("a hunt is there, not a suite", fix="give another directory", where=str(place))
+        planned: dict[Path, RunRequest] = {}
+        for entry in self.entries:
+            for number in range(entry.runs):
+                folder = place / entry.id / str(number)
+                planned[folder] = self._planned(entry, number, folder)
         try:
             place.mkdir(exist_ok=True)
-            return [
-                self._plan_run(entry, number, place / entry.id / str(number))
-                for entry in self.entries
-                for number in range(entry.runs)
-            ]
+            for folder, request in planned.items():
+                if not (folder / REQUEST).exists():
+                    folder.mkdir(parents=True, exist_ok=True)
+                    write_request(folder, request)
+            return list(planned)
         except OSError as error:
             raise HuntDirectoryError(
                 f"cannot be made: {error.strerror}", fix="choose another directory", where=str(error.filename or place)
@@ -187,23 +194,21 @@ class Suite:
         run_all(waiting, parallel, watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]))
         return [hunt_state(folder) for folder in folders]
 
-    def _plan_run(self, entry: SuiteEntry, number: int, folder: Path) -> Path:
-        request = self._request(entry, number)
-        file = folder / REQUEST
-        if file.exists():
-            before = RunRequest.read(file)
-            given = request if entry.seed is not None else replace(request, seed=before.request.seed)
-            if before.request != given:
-                raise HuntDirectoryError(
-                    f"the hunt {entry.id!r} was planned there with other settings",
-                    fix="give another directory, or run it again with crashhunt rerun",
-                    where=str(folder),
-                )
-            return folder
-        folder.mkdir(parents=True, exist_ok=True)
+    def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
         roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
-        write_request(folder, RunRequest(request, str(self.folder), roots))
-        return folder
+        wanted = RunRequest(self._request(entry, number), str(self.folder), roots)
+        if not (folder / REQUEST).exists():
+            return wanted
+        before = RunRequest.read(folder / REQUEST)
+        if entry.seed is None:
+            wanted = replace(wanted, request=replace(wanted.request, seed=before.request.seed))
+        if before != replace(wanted, folder=before.folder):
+            raise HuntDirectoryError(
+                f"the hunt {entry.id!r} was planned there with other settings",
+                fix="give another directory, or run it again with crashhunt rerun",
+                where=str(folder),
+            )
+        return before
 
     def _request(self, entry: SuiteEntry, number: int) -> Request:
         scenario = entry.scenario

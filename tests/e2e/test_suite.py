@@ -257,6 +257,13 @@ def test_a_suite_that_has_changed_is_refused(toy):
     written(toy, SUITE.replace("speed = 4", "speed = 5"))
     refused = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert "the hunt 'slow' was planned there with other settings" in refused.err
+    # What cannot be planned leaves nothing behind.
+    written(toy, SUITE.replace("speed = 4", "speed = 5").replace("runs = 2", "runs = 3"))
+    toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
+    assert not (toy.folder / "out/fast/2").exists()
+    assert "a hunt is there" in toy.crashhunt("suite", "run", "suite.toml", "out/fast/0", expect=2).err
+    written(toy, SUITE.replace("seed = 3", "seed = 3\nsnapshot_roots = ['toy']"))
+    assert "other settings" in toy.crashhunt("suite", "run", "suite.toml", "out", expect=2).err
     assert "cannot be read" in toy.crashhunt("suite", "run", "nowhere.toml", "out", expect=2).err
 
 
