@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -11,7 +12,7 @@ import numpy as np
 from crashhunt.errors import UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, finite
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,8 +112,8 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``compare --json`` prints; what is no finite number is null."""
         return {
-            "hunts": [_finite(asdict(hunt)) for hunt in self.hunts],
-            "pairs": [{**_finite(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
+            "hunts": [finite(asdict(hunt)) for hunt in self.hunts],
+            "pairs": [{**finite(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
         }
 
     def write_csv(self, out: TextIO) -> None:
@@ -150,19 +151,14 @@ def compare(*directories: Path | str) -> Comparison:
 
 def _table(hunt: HuntResults) -> NDArray[Any]:
     """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers."""
-    kinds = {str(kind): kind for kind in Outcome}
     crash_on = hunt.settings.crash_on
-    ledger = Ledger(hunt.directory / "ledger.sqlite")
     fields = [("number", "i8"), ("seed", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
-    try:
+    with closing(Ledger(hunt.directory / "ledger.sqlite")) as ledger:
         rows = (
-            (number, seed, steps, np.inf if ttc is None else ttc, kind is not Outcome.INVALID, kind in crash_on)
+            (number, seed, steps, np.inf if ttc is None else ttc, name != Outcome.INVALID, name in crash_on)
             for number, seed, name, steps, ttc in ledger.table()
-            for kind in (kinds[name],)
         )
         table = np.fromiter(rows, fields)
-    finally:
-        ledger.close()
     return np.sort(table, order="number")
 
 
@@ -235,9 +231,3 @@ def _caution(first: HuntResults, second: HuntResults) -> str:
     if not (one.run.keep_going and other.run.keep_going):
         return "one that stops at its first crash runs fewer trials; use --keep-going"
     return ""
-
-
-def _finite(data: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: None if isinstance(value, float) and not np.isfinite(value) else value for name, value in data.items()
-    }

@@ -205,6 +205,8 @@ def _row(data: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
+    if not values:
+        return np.empty(0)
     if all(isinstance(value, bool) for value in values):
         return np.array(values, bool)
     if all(isinstance(value, int) for value in values):

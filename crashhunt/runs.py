@@ -11,7 +11,7 @@ import sys
 import time
 import traceback
 from collections import deque
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,7 @@ from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario
 from crashhunt.settings import RunSettings, read_settings
 from crashhunt.snapshot import SnapshotOptions, latest_snapshot
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -74,9 +75,8 @@ class RunRequest:
 
 def write_request(folder: Path, request: RunRequest) -> None:
     """Write ``request.json``, all of it or nothing."""
-    temporary = folder / f".{REQUEST}.{os.getpid()}"
-    temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
-    temporary.replace(folder / REQUEST)
+    with whole_file(folder / REQUEST) as temporary:
+        temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
 
 
 def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], None] | None = None) -> None:
@@ -220,13 +220,11 @@ def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, H
 
 def _fail(folder: Path, message: str, trace: str) -> None:
     """Write down why a hunt could not run."""
-    print(f"crashhunt: {message}", file=sys.stderr, flush=True)
     with suppress(CrashhuntError, OSError):
         (folder / "error.log").write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
-        ledger = Ledger(folder / "ledger.sqlite", writable=True)
-        if ledger.facts().get("state") != "error":
-            ledger.enter("error", message)
-        ledger.close()
+        with closing(Ledger(folder / "ledger.sqlite", writable=True)) as ledger:
+            if ledger.facts().get("state") != "error":
+                ledger.enter("error", message)
 
 
 if __name__ == "__main__":

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-__all__ = ["FORMATS", "write_parquet", "write_text"]
+__all__ = ["write_parquet", "write_text"]
 
-FORMATS = ("csv", "json", "jsonl", "parquet")
 _LOOKED_AT = 1000  # rows, to find out the type of an argument of which nobody says it
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.space import Value
 
-__all__ = ["CRASHES", "ClosestApproach", "Collision", "Failure", "Outcome", "TrialResult", "TrialSpec"]
+__all__ = ["CRASHES", "ClosestApproach", "Collision", "Failure", "Outcome", "TrialResult", "TrialSpec", "finite"]
 
 
 class Outcome(StrEnum):
@@ -209,7 +209,7 @@ class TrialResult:
             "outcome": str(self.outcome),
             "spec": self.spec.to_json(),
             "closest": self.closest.to_json(),
-            "collision": _finite(asdict(self.collision)) if self.collision else None,
+            "collision": finite(asdict(self.collision)) if self.collision else None,
             "failure": asdict(self.failure) if self.failure else None,
         }
 
@@ -246,7 +246,8 @@ class TrialResult:
 _PLAIN = ("steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept")
 
 
-def _finite(data: dict[str, Any]) -> dict[str, Any]:
+def finite(data: dict[str, Any]) -> dict[str, Any]:
+    """Return plain data for JSON, which has no infinity and no NaN: null instead."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in data.items()
     }
