@@ -1,16 +1,16 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
-``crashhunt.run``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does.
+``crashhunt.run``, ``prepare``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does.
 """
 
 import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from crashhunt.api import Hunt, Suite, compare, load, replay, run
+    from crashhunt.api import Hunt, Suite, compare, load, prepare, replay, run
 
 __version__ = "0.1.0"
-__all__ = ["Hunt", "Suite", "__version__", "compare", "load", "replay", "run"]
+__all__ = ["Hunt", "Suite", "__version__", "compare", "load", "prepare", "replay", "run"]
 
 
 def __getattr__(name: str) -> Any:

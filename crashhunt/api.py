@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from crashhunt.replays import Code
     from crashhunt.snapshot import SnapshotOptions
 
-__all__ = ["Hunt", "Suite", "compare", "load", "replay", "run"]
+__all__ = ["Hunt", "Suite", "compare", "load", "prepare", "replay", "run"]
 
 Spec = str | int | float | bool
 
 
-def run(
+def prepare(
     directory: Path | str,
     parallel: int,
     trials: int,
@@ -53,9 +53,9 @@ def run(
     recycle_after: int = 1000,
     snapshot: SnapshotOptions | None = None,
     overwrite: bool = False,
-    watch: Callable[[HuntStatus], None] | None = None,
-) -> HuntReport:
-    """Hunt for a crash, as ``crashhunt run`` does.
+    command: Sequence[str] | None = None,
+) -> Hunt:
+    """Return a hunt that is ready to run.
 
     Args:
         directory: where everything is kept; made where it does not exist. The same hunt there goes on.
@@ -80,10 +80,7 @@ def run(
         recycle_after: trials after which a worker is replaced; 0 for never.
         snapshot: what the snapshot of the code takes in.
         overwrite: begin anew, whatever hunt is there.
-        watch: called about ten times a second.
-
-    Returns:
-        What came of it.
+        command: the command line, as a comment in ``hunt.toml``.
 
     Raises:
         CrashhuntError: with what is wrong.
@@ -113,8 +110,43 @@ def run(
         ),
     )
     found, settings = plan(request)
-    hunt = Hunt(Path(directory), found, settings, overwrite=overwrite, seed_given=seed is not None, snapshot=snapshot)
-    return hunt.run(watch)
+    return Hunt(
+        Path(directory),
+        found,
+        settings,
+        command=list(command) if command is not None else None,
+        overwrite=overwrite,
+        seed_given=seed is not None,
+        snapshot=snapshot,
+    )
+
+
+def run(
+    directory: Path | str,
+    parallel: int,
+    trials: int,
+    max_steps: int,
+    *,
+    watch: Callable[[HuntStatus], None] | None = None,
+    **options: Any,
+) -> HuntReport:
+    """Hunt for a crash, as ``crashhunt run`` does.
+
+    Args:
+        directory: where everything is kept; made where it does not exist. The same hunt there goes on.
+        parallel: trials at a time; 0 for one per core.
+        trials: how many at most.
+        max_steps: the bound on each, in steps.
+        watch: called about ten times a second.
+        options: those of `prepare`, such as ``scenario``, ``agent``, ``arguments``, ``seed`` and ``keep_going``.
+
+    Returns:
+        What came of it.
+
+    Raises:
+        CrashhuntError: with what is wrong.
+    """
+    return prepare(directory, parallel, trials, max_steps, **options).run(watch)
 
 
 def replay(

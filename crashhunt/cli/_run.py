@@ -97,17 +97,16 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from rich.console import Console
 
-    from crashhunt.hunt import Hunt
-    from crashhunt.plan import Request, plan
+    from crashhunt.api import prepare
     from crashhunt.report import Watcher, describe_hunt
-    from crashhunt.settings import RunSettings
     from crashhunt.snapshot import SnapshotOptions
     from crashhunt.trial import CRASHES
 
-    parallel = options.parallel or len(os.sched_getaffinity(0))
-    request = Request(
-        trials=options.trials,
-        max_steps=options.max_steps,
+    hunt = prepare(
+        options.directory,
+        options.parallel,
+        options.trials,
+        options.max_steps,
         scenario=options.scenario,
         ego=options.ego,
         agents=pairs(options.agent, "--agent", named=False),
@@ -117,32 +116,22 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         points=options.points,
         seed=options.seed,
         crash_on=CRASHES if options.crash_on is None else [name for name in options.crash_on.split(",") if name],
-        run=RunSettings(
-            parallel=parallel,
-            keep_going=options.keep_going,
-            deterministic=options.deterministic,
-            keep_trials=options.keep_trials,
-            timeout_s=options.timeout,
-            recycle_after=options.recycle_after,
-        ),
-    )
-    scenario, settings = plan(request)
-    console = Console(stderr=options.json, highlight=False)
-    for note in scenario.notes:
-        console.print(note, markup=False, soft_wrap=True)
-    hunt = Hunt(
-        options.directory,
-        scenario,
-        settings,
-        command=["crashhunt", *words],
-        overwrite=options.overwrite,
-        seed_given=options.seed is not None,
+        keep_going=options.keep_going,
+        deterministic=options.deterministic,
+        keep_trials=options.keep_trials,
+        timeout_s=options.timeout,
+        recycle_after=options.recycle_after,
         snapshot=SnapshotOptions(
             code=not options.no_snapshot, roots=tuple(options.snapshot_root), limit_mb=options.snapshot_limit
         ),
+        overwrite=options.overwrite,
+        command=["crashhunt", *words],
     )
-    agents = ", ".join(setup.agent for setup in settings.agents.values())
-    with Watcher(console, f"crashhunt: {scenario.name}, {agents}") as watcher:
+    console = Console(stderr=options.json, highlight=False)
+    for note in hunt.scenario.notes:
+        console.print(note, markup=False, soft_wrap=True)
+    agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
+    with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}") as watcher:
         report = hunt.run(watcher)
     console.print(describe_hunt(report), markup=False, soft_wrap=True)
     if options.json:

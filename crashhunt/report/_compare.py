@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.report._table import aligned
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.trial import Outcome
 from crashhunt.whole_file import whole_file
@@ -56,11 +57,7 @@ def describe_comparison(found: Comparison) -> str:
         )
         for hunt in found.hunts
     ]
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]).rstrip()
-        for row in [header, *rows]
-    ]
+    lines = aligned([header, *rows], left=1)
     lines += [f"{hunt.dir}: no interval, for {hunt.why_not}" for hunt in found.hunts if hunt.why_not]
     for pair in found.pairs:
         lines += ["", pair.verdict]

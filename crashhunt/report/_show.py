@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.encounter import Encounter, last_escape
 from crashhunt.report._screen import format_arguments
+from crashhunt.report._table import aligned
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -127,13 +128,7 @@ class Story:
                 )
             mark = "" if step.step != self.escape else f"<- the last step from which braking at {self._braking:g} helps"
             rows.append([*cells, mark])
-        widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-        return [
-            "  ".join(
-                [*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), *row[len(header) :]]
-            ).rstrip()
-            for row in [header, *rows]
-        ]
+        return aligned([header, *rows])
 
     def _about_encounter(self, encounter: Encounter) -> list[str]:
         moments = encounter.moments

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
-__all__ = ["format_table", "steps_table"]
+__all__ = ["aligned", "format_table", "steps_table"]
 
 _SCENE = ("x", "y", "heading", "speed")
 _MEASURED = ("time_to_collision_s", "gap_m", "required_deceleration")
@@ -72,9 +72,26 @@ def format_table(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return rows as aligned lines under a heading."""
     if not rows:
         return []
-    cells = [list(rows[0])] + [[_format(value) for value in row.values()] for row in rows]
-    widths = [max(len(row[column]) for row in cells) for column in range(len(cells[0]))]
-    return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in cells]
+    return aligned([list(rows[0])] + [[_format(value) for value in row.values()] for row in rows])
+
+
+def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
+    """Return rows as lines of columns.
+
+    Args:
+        rows: the heading first; what a row has beyond it follows as it is.
+        left: how many columns are aligned to the left; the others are to the right.
+    """
+    count = len(rows[0])
+    widths = [max(len(row[column]) for row in rows) for column in range(count)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if column < left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=False))
+        ]
+        lines.append("  ".join([*cells, *row[count:]]).rstrip())
+    return lines
 
 
 def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
