@@ -188,6 +188,7 @@ class _Run:
         """Step until something ends the episode."""
         simulator, box, scribe, names = self.simulator, self.box, self.scribe, self.names
         forms = [simulator.actions[name].encode for name in names]
+        structures = getattr(simulator, "shown_spaces", {})
         observations = self.observations
         everybody = tuple(range(len(names)))
         active = everybody
@@ -198,6 +199,8 @@ class _Run:
                 observation = observations[name]
                 box.observation(number, observation)
                 try:
+                    if name in structures:
+                        observation = _structured(structures[name], observation)
                     action = forms[number](agents[name].act(observation))
                 except BaseException as error:
                     return self._result(Outcome.AGENT_ERROR, failure=_failure(error, name))
@@ -240,6 +243,13 @@ class _Run:
 def _agent_seed(seed: int, number: int) -> int:
     """A seed of each agent's own, which differs from the simulator's."""
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
+
+
+def _structured(space: Any, flat: Any) -> Any:
+    """A Dict or Tuple observation, of which the flattened array is recorded."""
+    from gymnasium.spaces import unflatten
+
+    return unflatten(space, flat)
 
 
 def _any_action(space: Any) -> Any:

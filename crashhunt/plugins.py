@@ -19,7 +19,7 @@ from crashhunt.space import Argument, Kind, kind_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-__all__ = ["Group", "Signature", "locate", "registered", "signature_of"]
+__all__ = ["Group", "Signature", "import_module", "load_object", "locate", "registered", "signature_of"]
 
 Group = Literal["agents", "executors", "oracles", "samplers", "simulators"]
 
@@ -49,19 +49,22 @@ def locate(group: Group, name: str) -> Any:
             f"{name!r} is not a registered name of {group}",
             fix=f"{hint}give one of {', '.join(points) or '(none)'}, or module:attribute",
         )
-    if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
-        sys.path.insert(0, os.getcwd())  # noqa: PTH109
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise PluginError(
-            f"{name!r} cannot be imported: {type(error).__name__}: {error}",
-            fix="run from the folder that holds the module, install it, or mend the name",
-        ) from error
-    except Exception as error:
-        raise PluginError(
-            f"importing {name!r} raised {type(error).__name__}: {error}", fix="mend the module"
-        ) from error
+    return load_object(target, shown=name)
+
+
+def load_object(target: str, *, shown: str = "") -> Any:
+    """Import what a ``module:attribute`` stands for.
+
+    Args:
+        target: the module and what in it can be called.
+        shown: how errors name it.
+
+    Raises:
+        PluginError: there is no such thing, or importing it failed.
+    """
+    name = shown or target
+    module_name, _, attribute = target.partition(":")
+    module = import_module(module_name, shown=name)
     found: Any = module
     for part in attribute.split("."):
         if not hasattr(found, part):
@@ -79,6 +82,31 @@ def locate(group: Group, name: str) -> Any:
     return found
 
 
+def import_module(name: str, *, shown: str = "") -> types.ModuleType:
+    """Import a module, which may lie in the current directory.
+
+    Args:
+        name: of the module.
+        shown: how errors name what is asked for.
+
+    Raises:
+        PluginError: importing it failed.
+    """
+    if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
+        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise PluginError(
+            f"{shown or name!r} cannot be imported: {type(error).__name__}: {error}",
+            fix="run from the folder that holds the module, install it, or mend the name",
+        ) from error
+    except Exception as error:
+        raise PluginError(
+            f"importing {shown or name!r} raised {type(error).__name__}: {error}", fix="mend the module"
+        ) from error
+
+
 @dataclass(frozen=True, slots=True)
 class Signature:
     """What a factory takes.
@@ -86,12 +114,12 @@ class Signature:
     Args:
         arguments: by name, in order.
         open: whether it takes any other keyword as well (``**kwargs``).
-        spaces: which of ``observation_space`` and ``action_space`` it asks for.
+        given: which of ``observation_space``, ``action_space`` and ``step_length_s`` it asks for.
     """
 
     arguments: dict[str, Argument]
     open: bool
-    spaces: tuple[str, ...]
+    given: tuple[str, ...]
 
     def check(self, names: Iterable[str], *, where: str) -> None:
         """Refuse arguments that it does not take.
@@ -111,27 +139,28 @@ def signature_of(factory: Callable[..., Any]) -> Signature:
     """Read the arguments of a factory off its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
-    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle.
+    ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle. Nor is
+    ``step_length_s``, which receives that of the simulation.
     """
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
-        return Signature({}, open=True, spaces=())
+        return Signature({}, open=True, given=())
     target = factory.__init__ if isinstance(factory, type) else factory  # type: ignore[misc]
     names = getattr(target, "__globals__", {})
     arguments: dict[str, Argument] = {}
-    spaces: list[str] = []
+    given: list[str] = []
     is_open = False
     for parameter in parameters:
         if parameter.kind is parameter.VAR_KEYWORD:
             is_open = True
         elif parameter.kind in (parameter.VAR_POSITIONAL, parameter.POSITIONAL_ONLY):
             continue
-        elif parameter.name in ("observation_space", "action_space"):
-            spaces.append(parameter.name)
+        elif parameter.name in ("observation_space", "action_space", "step_length_s"):
+            given.append(parameter.name)
         else:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
-    return Signature(arguments, is_open, tuple(spaces))
+    return Signature(arguments, is_open, tuple(given))
 
 
 def _annotation(parameter: inspect.Parameter, names: dict[str, Any]) -> Any:

@@ -31,7 +31,8 @@ __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 Code = Literal["snapshot", "current", "log"]
 
-_SIMULATORS = {"sumo": ("libsumo",)}  # on whose version everything depends that a simulator computes
+# On whose version everything depends that a simulator computes.
+_SIMULATORS = {"sumo": ("libsumo",), "highway": ("highway-env", "numpy"), "gym": ("gymnasium",)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,23 +9,21 @@ import difflib
 import os
 import string
 import tomllib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from crashhunt.errors import ArgumentError, ScenarioError
+from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_files import RESERVED
-from crashhunt.space import Argument, Kind, Value, kind_of, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.space import Argument, Value
+
 __all__ = [
-    "AgentSetup",
-    "ArgumentSetup",
-    "ObservationSetup",
     "Scenario",
-    "SumoSetup",
     "argument_values",
     "asked_for",
     "load_scenario",
@@ -35,108 +33,7 @@ __all__ = [
     "with_action",
 ]
 
-DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArgumentSetup:
-    """``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]``.
-
-    Args:
-        range: what a hunt tries, as a specification such as ``5:40``; empty where it stays at the default.
-        default: the value when nobody asks for another.
-        unit: for people.
-        help: for people.
-        option: of a scenario argument, the SUMO option that it sets, such as ``scale``.
-            Where there is none, it fills ``${NAME}`` in the scenario's route and additional files.
-    """
-
-    range: str = ""
-    default: bool | int | float | str | None = None
-    unit: str = ""
-    help: str = ""
-    option: str = ""
-
-    def argument(self, name: str, where: str) -> Argument:
-        """Return what this says about the argument ``name``."""
-        kind: Kind | None = kind_of(self.default) if self.default is not None else None
-        distribution = parse_spec(self.range, kind, where=f"{where}.{name}.range") if self.range else None
-        return Argument(name, kind, self.default, distribution, self.unit, self.help)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AgentSetup:
-    """``[agents.ID]``: one controlled vehicle and who drives it.
-
-    Args:
-        agent: ``module:attribute``, or the name of a registered agent.
-        existing: take over the vehicle ID of the traffic; otherwise one with that id is added.
-        type: the vehicle type of the added one.
-        route: the route of the added one, by its id.
-        edges: or the edges that it drives along (two: the way between them is looked up).
-        depart_s: when it enters, in s of simulation time; the end of the warm-up by default.
-        depart_lane: as SUMO's departLane.
-        depart_pos: as SUMO's departPos.
-        depart_speed: as SUMO's departSpeed.
-        action: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's DiscreteMetaAction.
-        target_speeds: the speeds that FASTER and SLOWER of ``meta`` step through, in m/s.
-        speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
-        arguments: what is known about the agent's arguments here.
-    """
-
-    agent: str = DEFAULT_AGENT
-    existing: bool = False
-    type: str = "DEFAULT_VEHTYPE"
-    route: str = ""
-    edges: tuple[str, ...] = ()
-    depart_s: float | None = None
-    depart_lane: str = "best"
-    depart_pos: str = "base"
-    depart_speed: str = "max"
-    action: Literal["continuous", "meta"] = "continuous"
-    target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
-    speed_mode: int = 6
-    arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObservationSetup:
-    """``[observation]``: what an agent is shown; the layout is highway-env's Kinematics.
-
-    Args:
-        vehicles: rows: the controlled vehicle and its nearest actors.
-        features: columns.
-        normalize: scale to [-1, 1] by highway-env's ranges.
-    """
-
-    vehicles: int = 8
-    features: tuple[Literal["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"], ...] = (
-        "presence",
-        "x",
-        "y",
-        "vx",
-        "vy",
-        "cos_h",
-        "sin_h",
-    )
-    normalize: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class SumoSetup:
-    """``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
-
-    Args:
-        net: the network.
-        routes: route files.
-        additional: additional files.
-        options: further options of SUMO without their dashes, such as ``lateral-resolution``.
-    """
-
-    net: str
-    routes: tuple[str, ...] = ()
-    additional: tuple[str, ...] = ()
-    options: dict[str, bool | int | float | str] = field(default_factory=dict)
+_STEP_LENGTH_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,13 +43,15 @@ class Scenario:
     Args:
         title: one line, for people.
         simulator: the name of a registered simulator, or ``module:attribute``.
-        step_length_s: the control step, in s.
+        step_length_s: the control step, in s; highway-env's is the inverse of its policy_frequency.
         warmup_s: simulation time before the controlled vehicles enter, in s.
         insertion_timeout_s: how much later they may enter before the episode is invalid, in s.
-        observation: what agents are shown.
+        observation: what agents are shown; None for what the simulator shows of itself, which on SUMO is the default.
         arguments: the arguments that shape the traffic.
         agents: agent id to controlled vehicle.
         sumo: files and options, where the simulator is SUMO.
+        highway: the environment, where it is highway-env.
+        gym: the environment, where it is another one of Gymnasium.
         schema: of the file format.
         name: what people call it; the folder's name by default.
         folder: where its files are; not part of the file.
@@ -161,13 +60,15 @@ class Scenario:
 
     title: str = ""
     simulator: str = "sumo"
-    step_length_s: float = 0.1
+    step_length_s: float = _STEP_LENGTH_S
     warmup_s: float = 0.0
     insertion_timeout_s: float = 30.0
-    observation: ObservationSetup = field(default_factory=ObservationSetup)
+    observation: ObservationSetup | None = None
     arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
     agents: dict[str, AgentSetup] = field(default_factory=lambda: {"ego": AgentSetup()})
     sumo: SumoSetup | None = None
+    highway: HighwaySetup | None = None
+    gym: GymSetup | None = None
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()
@@ -184,6 +85,15 @@ class Scenario:
             yield self.sumo.net
             yield from self.sumo.routes
             yield from self.sumo.additional
+
+    def modules(self) -> Iterator[str]:
+        """Yield the modules that the simulator imports besides the agents': those of environments and crash rules."""
+        locators = [self.simulator]
+        if self.highway is not None:
+            locators.append(self.highway.id)
+        if self.gym is not None:
+            locators += [self.gym.id, self.gym.crash.function]
+        yield from (locator.partition(":")[0] for locator in locators if ":" in locator)
 
     def scenario_arguments(self) -> dict[str, Argument]:
         """The arguments that shape the traffic."""
@@ -266,6 +176,8 @@ def _load_toml(path: Path) -> Scenario:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent)
+    agents = {agent: _beside(setup, scenario.folder) for agent, setup in scenario.agents.items()}
+    scenario = replace(scenario, agents=agents)
     _check(scenario, str(path))
     return scenario
 
@@ -282,49 +194,97 @@ def scenario_from_dict(data: dict[str, Any], *, where: str, folder: Path) -> Sce
     return replace(scenario, folder=folder, name=scenario.name or folder.name)
 
 
-def _check(scenario: Scenario, where: str) -> None:
-    def refuse(key: str, value: object, message: str, fix: str) -> None:
-        raise ScenarioError(f"{key} = {value!r} {message}", fix=fix, where=where)
+def _beside(setup: AgentSetup, folder: Path) -> AgentSetup:
+    """The agent's arguments, where a default that names a file beside the ``scenario.toml`` is its path."""
+    found = {}
+    for name, argument in setup.arguments.items():
+        default = argument.default
+        if isinstance(default, str) and default and (folder / default).is_file():
+            argument = replace(argument, default=str(folder / default))
+        found[name] = argument
+    return replace(setup, arguments=found)
 
+
+def _refuse(where: str, key: str, value: object, message: str, fix: str) -> NoReturn:
+    raise ScenarioError(f"{key} = {value!r} {message}", fix=fix, where=where)
+
+
+def _check(scenario: Scenario, where: str) -> None:
     if not scenario.agents:
-        refuse("agents", {}, "names no controlled vehicle", "add a table [agents.ego]")
+        _refuse(where, "agents", {}, "names no controlled vehicle", "add a table [agents.ego]")
     for key in ("step_length_s", "insertion_timeout_s"):
         value = getattr(scenario, key)
         if not 0 < value < float("inf"):
-            refuse(key, value, "is not a time above 0", "give seconds, such as 0.1")
+            _refuse(where, key, value, "is not a time above 0", "give seconds, such as 0.1")
     if not 0 <= scenario.warmup_s < float("inf"):
-        refuse("warmup_s", scenario.warmup_s, "is not a time", "give seconds, such as 20.0")
-    if scenario.observation.vehicles < 1:
-        refuse("observation.vehicles", scenario.observation.vehicles, "is below 1", "give at least 1")
-    if scenario.simulator == "sumo" and scenario.sumo is None:
-        refuse("sumo", None, "is missing", "add a table [sumo] with net and routes")
-    for option in scenario.sumo.options if scenario.sumo else ():
-        if option in RESERVED:
-            refuse("sumo.options", option, "is an option that crashhunt sets itself", "remove it")
-    for file in scenario.files():
-        path = Path(os.path.normpath(scenario.folder / file))
-        if not path.is_file():
-            refuse("sumo", file, "does not exist", f"give a path relative to {scenario.folder}")
-        if not path.is_relative_to(scenario.folder):
-            refuse("sumo", file, "lies outside the scenario's folder", "move it inside, so that it can be archived")
-    for file in (*scenario.sumo.routes, *scenario.sumo.additional) if scenario.sumo else ():
-        for name in asked_for((scenario.folder / file).read_bytes()):
-            if name not in scenario.arguments:
-                refuse("arguments", sorted(scenario.arguments), f"has no {name!r}, which {file} asks for", "declare it")
-    for agent, setup in scenario.agents.items():
-        named = [key for key in ("existing", "route", "edges") if getattr(setup, key)]
-        if scenario.sumo is not None and len(named) != 1:
-            refuse(f"agents.{agent}", named, "must have one of existing, route, edges", "give exactly one of them")
-        if not setup.target_speeds or list(setup.target_speeds) != sorted(set(setup.target_speeds)):
-            refuse(
-                f"agents.{agent}.target_speeds", setup.target_speeds, "does not rise", "list speeds from low to high"
-            )
+        _refuse(where, "warmup_s", scenario.warmup_s, "is not a time", "give seconds, such as 20.0")
+    if scenario.observation is not None and scenario.observation.vehicles < 1:
+        _refuse(where, "observation.vehicles", scenario.observation.vehicles, "is below 1", "give at least 1")
+    for simulator, example in _TABLES.items():
+        if scenario.simulator == simulator and getattr(scenario, simulator) is None:
+            _refuse(where, simulator, None, "is missing", f"add a table [{simulator}] with {example}")
+    for simulator in _TABLES:
+        table = getattr(scenario, simulator)
+        if scenario.simulator in _TABLES and scenario.simulator != simulator and table is not None:
+            _refuse(where, "simulator", scenario.simulator, f"has no use for the table [{simulator}]", "remove it")
+    if scenario.sumo is not None:
+        _check_sumo(scenario, scenario.sumo, where)
+    elif scenario.simulator in _TABLES:
+        _check_environment(scenario, where)
     try:
         scenario.scenario_arguments()
         for agent in scenario.agents:
             scenario.agent_arguments(agent)
     except ArgumentError as error:
         raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
+
+
+_TABLES = {"sumo": "net and routes", "highway": "the id of the environment", "gym": "the id of the environment"}
+
+
+def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:
+    for option in sumo.options:
+        if option in RESERVED:
+            _refuse(where, "sumo.options", option, "is an option that crashhunt sets itself", "remove it")
+    for file in scenario.files():
+        path = Path(os.path.normpath(scenario.folder / file))
+        if not path.is_file():
+            _refuse(where, "sumo", file, "does not exist", f"give a path relative to {scenario.folder}")
+        if not path.is_relative_to(scenario.folder):
+            fix = "move it inside, so that it can be archived"
+            _refuse(where, "sumo", file, "lies outside the scenario's folder", fix)
+    for file in (*sumo.routes, *sumo.additional):
+        for name in asked_for((scenario.folder / file).read_bytes()):
+            if name not in scenario.arguments:
+                message = f"has no {name!r}, which {file} asks for"
+                _refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
+    for agent, setup in scenario.agents.items():
+        named = [key for key in ("existing", "route", "edges") if getattr(setup, key)]
+        if len(named) != 1:
+            message = "must have one of existing, route, edges"
+            _refuse(where, f"agents.{agent}", named, message, "give exactly one of them")
+        speeds = setup.target_speeds
+        if not speeds or list(speeds) != sorted(set(speeds)):
+            _refuse(where, f"agents.{agent}.target_speeds", speeds, "does not rise", "list speeds from low to high")
+
+
+def _check_environment(scenario: Scenario, where: str) -> None:
+    """What only SUMO would heed is refused, not passed over."""
+    plain = AgentSetup()
+    for agent, setup in scenario.agents.items():
+        for item in fields(AgentSetup):
+            value = getattr(setup, item.name)
+            if item.name not in ("agent", "arguments") and value != getattr(plain, item.name):
+                _refuse(where, f"agents.{agent}.{item.name}", value, "is for SUMO", "remove it")
+    if scenario.highway is not None and scenario.step_length_s != _STEP_LENGTH_S:
+        fix = "set policy_frequency in highway.config"
+        _refuse(where, "step_length_s", scenario.step_length_s, "is not for highway-env", fix)
+    if scenario.gym is not None and len(scenario.agents) != 1:
+        _refuse(
+            where, "agents", sorted(scenario.agents), "are several, and a Gymnasium environment has one", "keep one"
+        )
+    if scenario.gym is not None and scenario.observation is not None:
+        _refuse(where, "observation", "", "is not for Gymnasium environments, which show what they show", "remove it")
 
 
 def asked_for(content: bytes) -> list[str]:

@@ -175,7 +175,7 @@ def take_snapshot(
     found = Sources(paths=[])
     if options.code:
         locators = [setup.agent for setup in scenario.agents.values()]
-        found = find_sources(locators, roots=options.roots, without=snapshots.parent)
+        found = find_sources(locators, scenario.modules(), roots=options.roots, without=snapshots.parent)
     argument_files = _argument_files(settings) if options.code else {}
     files = found.files | {argument_files[value]: Path(value) for value in argument_files}
     _check_size(files, options.limit_mb)

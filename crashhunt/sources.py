@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.errors import SnapshotError
-from crashhunt.plugins import locate
+from crashhunt.plugins import import_module, locate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -38,7 +38,13 @@ class Sources:
     left_out: list[str] = field(default_factory=list)
 
 
-def find_sources(locators: Iterable[str], *, roots: Sequence[Path] = (), without: Path | None = None) -> Sources:
+def find_sources(
+    locators: Iterable[str],
+    modules: Iterable[str] = (),
+    *,
+    roots: Sequence[Path] = (),
+    without: Path | None = None,
+) -> Sources:
     """Find crashhunt itself, the whole project of each agent, and whatever else they imported that is not installed.
 
     A project is the git work tree that holds a module: what is tracked, as it is now, and what is untracked and not
@@ -47,6 +53,7 @@ def find_sources(locators: Iterable[str], *, roots: Sequence[Path] = (), without
 
     Args:
         locators: of the agents.
+        modules: further modules that are part of it.
         roots: further files and folders.
         without: a folder to leave out.
 
@@ -55,6 +62,9 @@ def find_sources(locators: Iterable[str], *, roots: Sequence[Path] = (), without
     """
     found = Sources()
     names = {locate("agents", locator).__module__.partition(".")[0] for locator in locators}
+    for module in modules:
+        import_module(module)
+        names.add(module.partition(".")[0])
     names |= {name for name in _top_level_modules() if not _is_installed(_place_of(name))}
     _take_module("crashhunt", found)
     for name in sorted(names - {"crashhunt"}):

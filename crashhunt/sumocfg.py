@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crashhunt.errors import ScenarioError
-from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario, SumoSetup
+from crashhunt.scenario import Scenario
+from crashhunt.setups import AgentSetup, ArgumentSetup, SumoSetup
 from crashhunt.simulators._sumo_files import RESERVED
 
 __all__ = ["load_sumocfg"]

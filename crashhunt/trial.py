@@ -232,8 +232,11 @@ class TrialResult:
         if self.collision is not None:
             hit = self.collision
             other = hit.victim if hit.role == "collider" else hit.collider
-            verb = {"collider": "drove into", "victim": "was hit by"}.get(hit.role, "left the road")
-            return f"{hit.agent} {verb}{f' {other}' if hit.role != 'alone' else ''} at step {self.steps}"
+            if hit.role == "alone":
+                what = "left the road" if self.outcome is Outcome.OFF_ROAD else f"crashed ({hit.kind})"
+                return f"{hit.agent} {what} at step {self.steps}"
+            verb = "drove into" if hit.role == "collider" else "was hit by"
+            return f"{hit.agent} {verb} {other} at step {self.steps}"
         if self.failure is not None:
             failure = self.failure
             if failure.traceback and failure.exit_code is None and failure.kind != "timeout":

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gzip
 import xml.etree.ElementTree as ET
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import UsageError
 from crashhunt.plugins import registered
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from crashhunt.plugins import Group
@@ -32,6 +33,14 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings) -> None:
     for group, name in names:
         if name not in registered(group):
             raise _refusal(f"it would import {name!r}")
+    for module in scenario.modules():
+        raise _refusal(f"it would import {module!r}")
+    if scenario.gym is not None and (scenario.gym.kwargs or scenario.arguments):
+        raise _refusal("it gives its environment arguments")
+    asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
+    for text in _texts([scenario.highway.config, asked] if scenario.highway else []):
+        if "." in text and not text.startswith("highway_env."):  # the class of a vehicle
+            raise _refusal(f"its configuration names {text!r}")
     if scenario.sumo is None:
         return
     for option in scenario.sumo.options:
@@ -41,6 +50,14 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings) -> None:
         for tag, attribute in _attributes(scenario.folder / name):
             if attribute == "file" or "output" in attribute:
                 raise _refusal(f"{name} has <{tag} {attribute}=…>, with which SUMO writes a file")
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
 
 
 def _attributes(path: Path) -> list[tuple[str, str]]:

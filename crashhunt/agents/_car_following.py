@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
+from crashhunt.agents._forms import meta_actions, wanted_meta_action
 from crashhunt.space import Argument, Range
 
 if TYPE_CHECKING:
@@ -180,6 +181,7 @@ class CarFollowing:
         desired_speed: with a free road, in m/s.
         step_length_s: of the simulation, in s; turns the delay into steps.
         observation_space: of the vehicle.
+        action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
 
     Raises:
         ValueError: an argument makes no sense, or the observation has other columns than the default ones.
@@ -197,14 +199,16 @@ class CarFollowing:
             float, Argument("max_brake", distribution=Range(3.0, 8.0), unit="m/s²", help="hardest braking")
         ] = 6.0,
         desired_speed: Annotated[float, Argument("desired_speed", unit="m/s", help="on a free road")] = 25.0,
-        step_length_s: Annotated[float, Argument("step_length_s", unit="s", help="of the simulation")] = 0.1,
+        step_length_s: float = 0.1,
         observation_space: Space[Any] | None = None,
+        action_space: Space[Any] | None = None,
     ) -> None:
         if not delay_s >= 0:
             raise ValueError(f"delay_s must be at least 0, not {delay_s}")
         if not step_length_s > 0:
             raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
         check_layout(observation_space)
+        self._meta = meta_actions(action_space)
         self.headway_s = headway_s
         self.max_brake = max_brake
         self.desired_speed = desired_speed
@@ -217,8 +221,8 @@ class CarFollowing:
         self._seen.clear()
         self._curvature.reset()
 
-    def act(self, observation: NDArray[np.float32]) -> tuple[float, int]:
-        """Return (target speed, 0)."""
+    def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
+        """Return (target speed, 0), or the meta-action for it."""
         self._seen.append(observation)
         seen = self._seen[0]
         leader = find_leader(seen, curvature=self._curvature.update(seen))
@@ -226,4 +230,6 @@ class CarFollowing:
             float(seen[0, VX]), leader, desired_speed=self.desired_speed, headway_s=self.headway_s
         )
         acceleration = max(-self.max_brake, min(2.0, wanted))
+        if self._meta is not None:
+            return self._meta[wanted_meta_action(acceleration)]
         return max(0.0, float(observation[0, VX]) + acceleration * self.step_length_s), 0

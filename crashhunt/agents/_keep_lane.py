@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
+from crashhunt.agents._forms import meta_actions
 from crashhunt.space import Argument, Range
 
 if TYPE_CHECKING:
@@ -18,6 +19,9 @@ class KeepLaneWithSpeed:
     Args:
         speed: in m/s.
         action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+
+    Raises:
+        ValueError: it has other actions.
     """
 
     def __init__(
@@ -28,14 +32,14 @@ class KeepLaneWithSpeed:
         action_space: Space[Any] | None = None,
     ) -> None:
         self.speed = speed
-        self._discrete = getattr(action_space, "n", None) is not None
+        self._meta = meta_actions(action_space)
 
     def reset(self, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Any) -> Any:
         """Return (speed, 0), or the meta-action that brings the speed nearer."""
-        if not self._discrete:
+        if self._meta is None:
             return self.speed, 0
         error = self.speed - float(observation[0, 3])
-        return 3 if error > 2.5 else 4 if error < -2.5 else 1
+        return self._meta["FASTER" if error > 2.5 else "SLOWER" if error < -2.5 else "IDLE"]

@@ -17,6 +17,7 @@ from crashhunt.agents._car_following import (
     idm_acceleration,
     off_path,
 )
+from crashhunt.agents._forms import meta_actions, wanted_meta_action
 from crashhunt.space import Argument, Range
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class LaneChanger:
         desired_speed: in m/s.
         step_length_s: of the simulation, in s.
         observation_space: of the vehicle.
+        action_space: of the vehicle; (target speed, lane change), or discrete meta-actions.
 
     Raises:
         ValueError: an argument makes no sense, or the observation has other columns than the default ones.
@@ -63,12 +65,14 @@ class LaneChanger:
         desired_speed: Annotated[
             float, Argument("desired_speed", distribution=Range(15.0, 30.0), unit="m/s", help="on a free road")
         ] = 22.0,
-        step_length_s: Annotated[float, Argument("step_length_s", unit="s", help="of the simulation")] = 0.1,
+        step_length_s: float = 0.1,
         observation_space: Space[Any] | None = None,
+        action_space: Space[Any] | None = None,
     ) -> None:
         if not step_length_s > 0:
             raise ValueError(f"step_length_s must be above 0, not {step_length_s}")
         check_layout(observation_space)
+        self._meta = meta_actions(action_space)
         self.blind_spot_m = blind_spot_m
         self.patience_s = patience_s
         self.desired_speed = desired_speed
@@ -83,8 +87,8 @@ class LaneChanger:
         self._from_left = 0.0
         self._rightmost = 0.0
 
-    def act(self, observation: NDArray[np.float32]) -> tuple[float, int]:
-        """Return (target speed, lane change)."""
+    def act(self, observation: NDArray[np.float32]) -> tuple[float, int] | int:
+        """Return (target speed, lane change), or the meta-action for it."""
         curvature = self._path.update(observation)
         self._look_for_lanes(observation, curvature)
         speed = float(observation[0, VX])
@@ -97,6 +101,8 @@ class LaneChanger:
         if change:
             self._waited_s = 0.0
             self._from_left -= change * LANE_WIDTH_M
+        if self._meta is not None:
+            return self._meta[wanted_meta_action(acceleration, change)]
         return target, change
 
     def _choose(self, observation: NDArray[np.float32], curvature: float) -> int:

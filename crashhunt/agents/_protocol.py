@@ -12,9 +12,10 @@ class Agent(Protocol):
     """Drives one vehicle.
 
     An agent is written as ``package.module:attribute`` and called with its arguments as keywords, once per trial and
-    vehicle; a parameter named ``observation_space`` or ``action_space`` receives the Gymnasium space. Two further
-    methods are optional: ``panels()`` returns pictures of what it thinks and is called only when somebody renders,
-    and ``close()`` is called at the end of the trial.
+    vehicle; a parameter named ``observation_space`` or ``action_space`` receives the Gymnasium space, and one named
+    ``step_length_s`` the time from one step to the next, in s. Two further methods are optional: ``panels()`` returns
+    pictures of what it thinks and is called only when somebody renders, and ``close()`` is called at the end of the
+    trial.
     """
 
     def reset(self, seed: int) -> None:

@@ -54,18 +54,21 @@ class Parts:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)
-            found = self._factories[agent] = factory, signature_of(factory).spaces
+            found = self._factories[agent] = factory, signature_of(factory).given
         factory, wanted = found
-        spaces: dict[str, Any] = {}
+        given: dict[str, Any] = {}
         if "observation_space" in wanted:
-            spaces["observation_space"] = simulator.observation_spaces[agent]
+            shown = getattr(simulator, "shown_spaces", {})
+            given["observation_space"] = shown.get(agent) or simulator.observation_spaces[agent]
         if "action_space" in wanted:
-            spaces["action_space"] = simulator.actions[agent].space
+            given["action_space"] = simulator.actions[agent].space
+        if "step_length_s" in wanted:
+            given["step_length_s"] = simulator.step_length_s
         files = self._settings.argument_files
         values = {
             name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
         }
-        made: Agent = factory(**values, **spaces)
+        made: Agent = factory(**{**given, **values})
         return made
 
 

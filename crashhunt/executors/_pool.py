@@ -20,6 +20,7 @@ from pebble import ProcessExpired, ProcessPool
 
 from crashhunt.executors._remains import died, hung, where_it_is
 from crashhunt.executors._worker import run_trial, start_worker, worker_environment
+from crashhunt.plugins import registered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -131,11 +132,12 @@ class PoolExecutor:
 
     def _open(self) -> ProcessPool:
         if self._pool is None or not self._pool.active:
-            # The fork server has libsumo loaded, so that a new worker is there in milliseconds, not in seconds.
+            # The fork server has the simulator loaded, so that a new worker is there in milliseconds, not in seconds.
             context = _Context()
             preload = [start_worker.__module__]
-            if self._settings.scenario.simulator == "sumo":
-                preload.append("crashhunt.simulators.sumo")
+            simulator = registered("simulators").get(self._settings.scenario.simulator)
+            if simulator is not None:
+                preload.append(simulator.module)
             context.set_forkserver_preload(preload)
             with _environment(worker_environment()):
                 self._pool = ProcessPool(

@@ -31,7 +31,7 @@ class ReportedCollision:
                     x, y, lane = _where(scene, agent)
                     collision = Collision(
                         agent,
-                        "collider" if agent == contact.collider else "victim",
+                        "alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
                         contact.collider,
                         contact.victim,
                         (self.name,),

@@ -109,7 +109,7 @@ def time_to_contact(
             begin = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(first, last))
             end = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(first, last))
             enter, leave = np.maximum(enter, begin), np.minimum(leave, end)
-    return np.where(enter < leave, enter, np.inf)
+    return np.where(enter < leave, enter + 0.0, np.inf)  # no minus zero
 
 
 def _outside(x: NDArray[np.float64], y: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -135,7 +135,7 @@ class SceneView:
         return _AGENT if name in self._agents else _OTHER
 
     def _label(self, draw: ImageDraw.ImageDraw, scene: Scene, step: int, row: int | None) -> None:
-        speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone"
+        speed = f"{scene.speeds[row]:.1f} m/s" if row is not None else "gone" if self._recording.actors else ""
         draw.text((12, 10), f"{scene.time_s:.1f} s   step {step}   {self._agent} {speed}", INK, font(15))
         names = [(self._agent, _EGO), (self._other, _CRASH)]
         names += [(name, _AGENT) for name in sorted(self._agents - {self._agent, self._other})]
@@ -145,6 +145,10 @@ class SceneView:
             draw.text((32, top), name, INK, font(13))
         if step == self._crash_step:
             draw.text((self.width / 2, 14), "CRASH", _CRASH, font(26), anchor="ma")
+        if not self._recording.actors:
+            middle = self.width / 2, self.height / 2
+            draw.text(middle, "this simulator shows no scene", FAINT, font(15), anchor="mm")
+            return
         meters = next((length for length in (5, 10, 20, 50, 100) if length * self._scale > 60), 200)
         bottom = self.height - 12
         draw.line((14, bottom, 14 + meters * self._scale, bottom), FAINT, 2)

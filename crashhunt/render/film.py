@@ -31,6 +31,7 @@ _PANEL = (240, 160)
 _PAPER = 255
 _SHOWN_S = 10.0  # of the built-in curves
 _BUILTIN = ("time to collision s", "gap m", "speed m/s", "action")
+_WITHOUT_SCENE = ("reward", "action")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +156,8 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
     """Yield the pictures of a film, all of the same size."""
     labels: dict[str, None] = {}
     if options.panels:
-        labels |= dict.fromkeys(_BUILTIN)
+        for shot in shots:
+            labels |= dict.fromkeys(_BUILTIN if shot.recording.actors else _WITHOUT_SCENE)
         for shot in shots:
             for panels in shot.panels.values():
                 labels |= dict.fromkeys(panels)
@@ -269,6 +271,7 @@ class _Builtin:
         self._speeds = np.array(
             [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
         )
+        self._rewards = np.array([step.rewards.get(agent, 0.0) for step in recording.all_steps if step.whole])
         self._seconds = np.array([scene.time_s for scene in scenes])
         self._shot = shot
         channel = next((found for found in recording.prologue.agents if found.id == agent), None)
@@ -289,6 +292,8 @@ class _Builtin:
             (_BUILTIN[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
             (_BUILTIN[2], Curve(self._speeds[part], x, low=0.0)),
         ]
+        if not self._shot.recording.actors:
+            found = [(_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
         action = self._shot.recording.all_steps[step].actions.get(self._shot.agent)
         if action is not None:
             value = action.reshape(-1)

@@ -80,7 +80,8 @@ class Story:
         """Return what happened, a sentence each."""
         result, recording = self.bundle.result, self.recording
         end = recording.steps
-        sentences = [f"{result.summary}, {end * recording.prologue.step_length_s:.1f} s after it had entered the road."]
+        began = "it had entered the road" if recording.actors else "the beginning"
+        sentences = [f"{result.summary}, {end * recording.prologue.step_length_s:.1f} s after {began}."]
         if self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
         hit = result.collision

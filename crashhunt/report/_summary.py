@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from typing import TYPE_CHECKING
 
@@ -138,7 +139,8 @@ def _evidence(result: TrialResult) -> list[str]:
         speeds = f"{hit.collider} at {hit.collider_speed:.1f} m/s"
         if hit.victim:
             speeds += f", {hit.victim} at {hit.victim_speed:.1f} m/s"
-        lines.append(f"{where}; {speeds}")
+        if math.isfinite(hit.x):  # an environment without a scene has no places
+            lines.append(f"{where}; {speeds}")
         if hit.victim:
             lines.append(_WITNESSES.get(hit.seen_by, f"seen by {', '.join(hit.seen_by)}"))
     if failure is not None:

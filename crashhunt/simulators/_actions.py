@@ -59,7 +59,8 @@ class SpaceAction:
         try:
             given = np.asarray(action)
             # 1.7 is no discrete action, but 1.0 of a float64 policy is one of a float32 space.
-            array = given.astype(self._dtype) if np.can_cast(given.dtype, self._dtype, "same_kind") else given
+            with np.errstate(over="ignore"):  # what becomes infinite is not inside
+                array = given.astype(self._dtype) if np.can_cast(given.dtype, self._dtype, "same_kind") else given
             inside = array.dtype == self._dtype and self.space.contains(array if self.space.shape else array[()])
         except (TypeError, ValueError, OverflowError):
             inside = False
@@ -69,15 +70,22 @@ class SpaceAction:
 
 
 class MetaAction(SpaceAction):
-    """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER."""
+    """highway-env's DiscreteMetaAction: 0 LANE_LEFT, 1 IDLE, 2 LANE_RIGHT, 3 FASTER, 4 SLOWER; or fewer of them.
+
+    Args:
+        meanings: what the numbers from 0 stand for; the space has them as ``meanings`` too, for agents to look up.
+    """
 
     names = ("meta_action",)
 
-    def __init__(self) -> None:
+    def __init__(self, meanings: tuple[str, ...] = META_ACTIONS) -> None:
         from gymnasium import spaces
 
-        super().__init__(spaces.Discrete(len(META_ACTIONS)))
+        super().__init__(spaces.Discrete(len(meanings)))
+        self.space.meanings = meanings  # type: ignore[attr-defined]
 
     def encode(self, action: Any) -> NDArray[np.generic]:
         """Return int64, shape (1,)."""
-        return super().encode(np.reshape(action, ()) if isinstance(action, np.ndarray) else action).reshape(1)
+        if isinstance(action, np.ndarray) and action.size == 1:
+            action = action.reshape(())
+        return super().encode(action).reshape(1)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import ObservationSetup
     from crashhunt.scene import Scene
+    from crashhunt.setups import ObservationSetup
 
 __all__ = ["Kinematics"]
 

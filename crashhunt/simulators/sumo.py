@@ -14,6 +14,7 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.setups import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._sumo_files import StagedFiles
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.scenario import Scenario
+    from crashhunt.setups import AgentSetup
     from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
 
 __all__ = ["SumoSimulator"]
@@ -58,7 +60,7 @@ class SumoSimulator:
         self.step_length_s = scenario.step_length_s
         self._scenario = scenario
         self._files = StagedFiles(scenario, stage)
-        self._kinematics = Kinematics(scenario.observation)
+        self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
         self.actions: dict[str, ActionForm] = {

@@ -15,6 +15,7 @@ import numpy as np
 
 from crashhunt.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.setups import ObservationSetup
 from crashhunt.simulators._actions import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 
@@ -49,7 +50,7 @@ class ToySimulator:
     def __init__(self, scenario: Scenario, stage: Path) -> None:
         self.step_length_s = scenario.step_length_s
         self._setups = scenario.agents
-        self._kinematics = Kinematics(scenario.observation)
+        self._kinematics = Kinematics(scenario.observation or ObservationSetup())
         self.observation_names = self._kinematics.features
         self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
         self.actions: dict[str, ActionForm] = {

@@ -15,7 +15,8 @@ from crashhunt.agents import CarFollowing, KeepLaneWithSpeed, LaneChanger, Rando
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
-from crashhunt.scenario import AgentSetup, Scenario, with_action
+from crashhunt.scenario import Scenario, with_action
+from crashhunt.setups import AgentSetup
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Constant, Range

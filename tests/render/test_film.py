@@ -41,7 +41,7 @@ def shot(steps: int = 20, *, crash: bool = True, other: str = "other", panels=No
         for n in range(steps + 1)
     ]
     recording = SimpleNamespace(
-        all_steps=records, prologue=Prologue((), 0.1), steps=steps, agents=["ego"],
+        all_steps=records, prologue=Prologue((), 0.1), steps=steps, agents=["ego"], actors=list(ROSTER.actors),
         scenes=lambda: [record.scene for record in records], scene=lambda n: records[n].scene,
     )  # fmt: skip
     x = np.linspace(-50, 150, 30)

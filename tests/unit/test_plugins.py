@@ -32,7 +32,7 @@ def test_a_signature_tells_names_types_ranges_and_spaces():
     assert (headway.kind, headway.default, headway.unit, str(headway.distribution)) == ("float", 1.0, "s", "0.3:2.0")
     assert signature.arguments["mode"].kind == "str"
     assert (signature.arguments["count"].kind, signature.arguments["count"].default) == ("int", None)
-    assert signature.spaces == ("action_space",)
+    assert signature.given == ("action_space",)
     assert not signature.open
 
 

@@ -1,0 +1,90 @@
+"""Observations and actions of any Gymnasium space as arrays of one shape, which is what is recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+from crashhunt.errors import ActionError, ScenarioError
+from crashhunt.simulators._actions import SpaceAction
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+    from crashhunt.simulators._protocol import ActionForm
+
+__all__ = ["FlatAction", "ObservationForm", "action_form", "native"]
+
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+
+class ObservationForm:
+    """Turns what an environment shows into arrays, and back into what its agent is shown.
+
+    Args:
+        space: of the environment. Arrays and numbers stay as they are; a Dict or Tuple is flattened.
+
+    Raises:
+        ScenarioError: the space has no fixed size.
+    """
+
+    def __init__(self, space: Space[Any]) -> None:
+        self.original = space
+        self.flattened = not isinstance(space, _ARRAYS)
+        if self.flattened and not space.is_np_flattenable:
+            raise ScenarioError(
+                f"observations of the space {space} have no fixed size", fix="wrap the environment so that they have"
+            )
+        self.space: Space[Any] = spaces.flatten_space(space) if self.flattened else space
+        self._dtype = np.dtype(self.space.dtype)
+
+    def encode(self, observation: Any) -> NDArray[Any]:
+        """Return an array of its own, of the type and shape of `space`."""
+        if self.flattened:
+            observation = spaces.flatten(self.original, observation)
+        return np.array(observation, self._dtype).reshape(self.space.shape or ())
+
+
+class FlatAction:
+    """A Dict or Tuple action, recorded flattened.
+
+    Args:
+        space: of the environment.
+    """
+
+    names: tuple[str, ...] = ()
+
+    def __init__(self, space: Space[Any]) -> None:
+        if not space.is_np_flattenable:
+            raise ScenarioError(f"actions of the space {space} have no fixed size", fix="wrap the environment")
+        self.space = space
+        self._flat = spaces.flatten_space(space)
+
+    def encode(self, action: Any) -> NDArray[np.generic]:
+        """Return the flattened action; one that is flattened already stays as it is."""
+        try:
+            if isinstance(action, np.ndarray) and action.shape == self._flat.shape:
+                array, inside = action, self.space.contains(spaces.unflatten(self.space, action))
+            else:
+                inside = self.space.contains(action)
+                array = np.asarray(spaces.flatten(self.space, action)) if inside else np.empty(0)
+        except (TypeError, ValueError, OverflowError, IndexError):
+            inside = False
+        if not inside:
+            raise ActionError(f"the action {action!r} is not in {self.space}", fix="return one that is")
+        return array
+
+
+def action_form(space: Space[Any]) -> ActionForm:
+    """Return how the actions of a space are written."""
+    return SpaceAction(space) if isinstance(space, _ARRAYS) else FlatAction(space)
+
+
+def native(form: ActionForm, action: NDArray[np.generic]) -> Any:
+    """Return an encoded action as the environment takes it: a number, an array or a structure."""
+    if isinstance(form, FlatAction):
+        return spaces.unflatten(form.space, action)
+    return action.item() if isinstance(form.space, spaces.Discrete) else np.array(action)

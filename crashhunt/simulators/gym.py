@@ -1,0 +1,146 @@
+"""Any environment of Gymnasium as a simulator. There is no scene: what is recorded is what the agent saw and did."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.plugins import load_object
+from crashhunt.scene import Contact, Roster, Scene
+from crashhunt.simulators._spaces import ObservationForm, action_form, native
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.setups import CrashRule
+    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+
+__all__ = ["GymSimulator"]
+
+_NOBODY = Roster(())
+
+
+class GymSimulator:
+    """Runs the episodes of a scenario in an environment of Gymnasium, each in one of its own.
+
+    Scenario arguments are keywords of the environment. A step that the crash rule calls a crash is a collision with
+    nobody; an episode that ends without one has finished. The environment's own limit on steps does not count.
+
+    Args:
+        scenario: what to run.
+        stage: not used.
+
+    Raises:
+        ScenarioError: there is no such environment or crash rule.
+    """
+
+    def __init__(self, scenario: Scenario, stage: Path) -> None:
+        if scenario.gym is None:
+            raise ScenarioError("the scenario has no [gym] table", fix="add it", where=scenario.origin)
+        self._scenario = scenario
+        self._setup = scenario.gym
+        (self._agent,) = scenario.agents
+        self.step_length_s = scenario.step_length_s
+        self._factory = self._find()
+        self._rule = _Rule(self._setup.crash, scenario.origin)
+        self.agents: list[str] = []
+        self._adopt(self._make({name: setup.default for name, setup in scenario.arguments.items()}))
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Make the environment and reset it."""
+        self._env.close()
+        try:
+            self._adopt(self._make((options or {}).get("arguments", {})))
+            observation, info = self._env.reset(seed=seed)
+        except CrashhuntError:
+            raise
+        except Exception as error:
+            message = f"the environment could not be set up: {type(error).__name__}: {error}"
+            raise InvalidEpisodeError(message) from error
+        self.agents = [self._agent]
+        self._steps = 0
+        self._crashed = False
+        self._look("")
+        return {self._agent: self._form.encode(observation)}, {self._agent: info}
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Step the environment."""
+        action = native(self.actions[self._agent], actions[self._agent])
+        observation, reward, terminated, truncated, info = self._env.step(action)
+        self._steps += 1
+        self._look(self._rule(observation, float(reward), bool(terminated), bool(truncated), info))
+        over = bool(terminated or truncated) or self._crashed
+        if over:
+            self.agents = []
+        agent, shown = self._agent, self._form.encode(observation)
+        return {agent: shown}, {agent: float(reward)}, {agent: over}, {agent: False}, {agent: info}
+
+    def scene(self) -> Scene:
+        """Return the time, and whether it has crashed; there are no actors."""
+        return self._scene
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
+
+    def _find(self) -> Callable[..., Any]:
+        name = self._setup.id
+        if name.partition(":")[2].isidentifier():
+            factory: Callable[..., Any] = load_object(name)
+            return factory
+        # The bound on steps is the trial's.
+        return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
+
+    def _make(self, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+        setups = self._scenario.arguments
+        options = {setups[name].option or name if name in setups else name: value for name, value in arguments.items()}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
+                made = self._factory(**{**self._setup.kwargs, **options})
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
+            message = " ".join(str(error).split())
+            raise ScenarioError(f"gym.id = {self._setup.id!r}: {message}", where=self._scenario.origin) from None
+        found: gymnasium.Env[Any, Any] = made
+        return found
+
+    def _adopt(self, env: gymnasium.Env[Any, Any]) -> None:
+        self._env = env
+        self._form = ObservationForm(env.observation_space)
+        self.observation_spaces = {self._agent: self._form.space}
+        self.shown_spaces = {self._agent: self._form.original} if self._form.flattened else {}
+        self.actions: dict[str, ActionForm] = {self._agent: action_form(env.action_space)}
+
+    def _look(self, what: str) -> None:
+        contacts: tuple[Contact, ...] = ()
+        if what and not self._crashed:
+            self._crashed = True
+            contacts = (Contact(self._agent, "", what, "", float("nan"), float("nan")),)
+        self._scene = Scene(self._steps * self.step_length_s, _NOBODY, [], [], [], contacts)
+
+
+class _Rule:
+    def __init__(self, rule: CrashRule, where: str) -> None:
+        self._rule = rule
+        self._function = load_object(rule.function) if rule.function else None
+
+    def __call__(self, observation: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]) -> str:
+        """Say what happened; nothing where it is no crash."""
+        rule = self._rule
+        if rule.info and info.get(rule.info):
+            return rule.info
+        if rule.reward_below is not None and reward < rule.reward_below:
+            return f"reward {reward:g}"
+        if self._function is not None:
+            found = self._function(observation, reward, terminated, truncated, info)
+            if found:
+                return found if isinstance(found, str) else self._rule.function
+        return "terminated" if rule.termination and terminated else ""

@@ -1,0 +1,170 @@
+"""Environments of Gymnasium as simulators: one of its own, one registered here, one made by a factory."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.oracles import ReportedCollision
+from crashhunt.scenario import Scenario
+from crashhunt.setups import AgentSetup, ArgumentSetup, CrashRule, GymSetup
+from crashhunt.simulators.gym import GymSimulator
+from crashhunt.testing import SimulatorContract
+
+
+class Tray(gymnasium.Env):
+    """A ball on a tray: structured observations and actions, and a crash in the info."""
+
+    observation_space = spaces.Dict(
+        {
+            "ball": spaces.Box(-10, 10, (2,), np.float64),
+            "side": spaces.Discrete(2),
+            "step": spaces.Box(0, 255, (1,), np.uint8),
+        }
+    )
+    action_space = spaces.Dict({"tilt": spaces.Box(-1, 1, (2,), np.float32), "kick": spaces.Discrete(2)})
+
+    def __init__(self, *, size=2.0, fails_at=0):
+        self.size, self.fails_at = size, fails_at
+
+    def _look(self):
+        return {"ball": self.ball, "side": int(self.ball[0] > 0), "step": np.array([self.steps], np.uint8)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.size < 0:
+            raise ValueError("a tray has a size")
+        self.ball, self.steps = self.np_random.normal(size=2) * 0.1, 0
+        return self._look(), {}
+
+    def step(self, action):
+        assert isinstance(action, dict)
+        self.steps += 1
+        self.ball += 0.2 * action["tilt"] + 0.1 * action["kick"]  # the same array as before, as careless ones do
+        return (
+            self._look(),
+            float(-abs(self.ball).max()),
+            self.steps >= 40,
+            False,
+            {"fell": abs(self.ball).max() > self.size},
+        )
+
+
+gymnasium.register("Tray-v0", entry_point=Tray, max_episode_steps=10)
+
+
+def fell_hard(observation, reward, terminated, truncated, info):
+    return f"fell at {observation['step'][0]}" if info["fell"] else ""
+
+
+def scenario_of(name, *, crash=None, arguments=None, **kwargs):
+    setup = GymSetup(id=name, kwargs=kwargs, crash=CrashRule(**(crash or {})))
+    return Scenario(simulator="gym", gym=setup, agents={"ball": AgentSetup()}, arguments=arguments or {})
+
+
+def simulator_of(tmp_path, *words, **options):
+    return GymSimulator(scenario_of(*words, **options), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["CartPole-v1", "MountainCarContinuous-v0", "FrozenLake-v1", "Blackjack-v1", "Tray-v0", "tests_tray:make_tray"],
+)
+class TestGym(SimulatorContract):
+    @pytest.fixture
+    def make(self, tmp_path, name, monkeypatch):
+        (tmp_path / "tests_tray.py").write_text(
+            "import gymnasium\ndef make_tray():\n    return gymnasium.make('Tray-v0', disable_env_checker=True)\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        return lambda: GymSimulator(scenario_of(name), tmp_path)
+
+    def test_an_episode_depends_on_its_seed_alone(self, make, name):
+        if name == "FrozenLake-v1":  # it always begins in the same place, and the lake is slippery by chance
+            self.steps = 3
+        super().test_an_episode_depends_on_its_seed_alone(make)
+
+
+FALL = {"tilt": np.array([1.0, 0.0], np.float32), "kick": 0}
+
+
+def fall(simulator, steps=100):
+    simulator.reset(seed=1, options={"arguments": {}})
+    for step in range(1, steps + 1):
+        _, _, terminations, _, _ = simulator.step({"ball": simulator.actions["ball"].encode(FALL)})
+        if terminations["ball"]:
+            return step
+    return None
+
+
+@pytest.mark.parametrize(
+    ("crash", "says"),
+    [
+        ({"info": "fell"}, "fell"),
+        ({"reward_below": -2.0}, "reward -2."),
+        ({"function": f"{__name__}:fell_hard"}, "fell at "),
+        ({"termination": True}, "terminated"),
+    ],
+)
+def test_the_crash_rule_says_when_and_why(tmp_path, crash, says):
+    simulator = simulator_of(tmp_path, "Tray-v0", crash=crash)
+    step = fall(simulator)
+    (contact,) = simulator.scene().contacts
+    assert contact.kind.startswith(says)
+    assert step == 40 if says == "terminated" else 8 <= step <= 13
+    (finding,) = ReportedCollision().check(simulator.scene(), ("ball",))
+    assert (finding.collision.role, finding.collision.kind) == ("alone", contact.kind)
+
+
+def test_without_a_rule_it_finishes_and_its_own_bound_on_steps_does_not_count(tmp_path):
+    simulator = simulator_of(tmp_path, "Tray-v0")
+    assert fall(simulator) == 40
+    assert simulator.scene().contacts == ()
+    assert simulator.agents == []
+
+
+def test_observations_are_recorded_flat_and_shown_as_they_are(tmp_path):
+    simulator = simulator_of(tmp_path, "Tray-v0")
+    observations, _ = simulator.reset(seed=4)
+    flat, space = observations["ball"], simulator.shown_spaces["ball"]
+    assert flat.shape == (2 + 2 + 1,)
+    shown = spaces.unflatten(space, flat)
+    assert space.contains(shown)
+    assert np.array_equal(shown["ball"], simulator._env.unwrapped.ball)
+
+
+def test_scenario_arguments_are_keywords(tmp_path):
+    arguments = {"wide": ArgumentSetup(default=3.0, option="size")}
+    simulator = simulator_of(tmp_path, "Tray-v0", crash={"info": "fell"}, arguments=arguments)
+    assert simulator._env.unwrapped.size == 3.0
+    simulator.reset(seed=1, options={"arguments": {"wide": 0.5}})
+    assert simulator._env.unwrapped.size == 0.5
+    with pytest.raises(InvalidEpisodeError, match="a tray has a size"):
+        simulator.reset(seed=1, options={"arguments": {"wide": -1.0}})
+
+
+class Endless(Tray):
+    observation_space = spaces.Sequence(spaces.Discrete(3))
+
+
+gymnasium.register("Endless-v0", entry_point=Endless)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "says"),
+    [
+        ("Carpole-v1", {}, "Carpole"),
+        ("Tray-v0", {"colour": "red"}, "colour"),
+        ("Endless-v0", {}, "no fixed size"),
+        ("no_such_module:make", {}, "no_such_module"),
+        ("CartPole-v1", {"crash": {"function": "math:cosine"}}, "cosine"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path, name, options, says):
+    with pytest.raises((ScenarioError, CrashhuntError)) as caught:
+        simulator_of(tmp_path, name, **options)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
