@@ -49,6 +49,7 @@ def prepare(
     keep_going: bool = False,
     deterministic: bool = False,
     keep_trials: bool = False,
+    accelerate: bool = True,
     timeout_s: float = 60.0,
     recycle_after: int = 1000,
     snapshot: SnapshotOptions | None = None,
@@ -76,6 +77,7 @@ def prepare(
         keep_going: collect all crashes instead of stopping at the first.
         deterministic: the same seed gives the same crash, whatever the timing.
         keep_trials: keep the logs of every trial.
+        accelerate: speed simulators up where that changes no bit.
         timeout_s: wall-clock limit of a trial, in s.
         recycle_after: trials after which a worker is replaced; 0 for never.
         snapshot: what the snapshot of the code takes in.
@@ -105,6 +107,7 @@ def prepare(
             keep_going=keep_going,
             deterministic=deterministic,
             keep_trials=keep_trials,
+            accelerate=accelerate,
             timeout_s=timeout_s,
             recycle_after=recycle_after,
         ),

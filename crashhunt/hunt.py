@@ -173,6 +173,7 @@ class Hunt:
             argument_files=snapshot.argument_files,
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
+            accelerate=run.accelerate,
         )
         waiting = iter(number for number in range(settings.trials) if number not in finished)
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.plugins import locate, signature_of
 from crashhunt.scenario import Scenario, load_scenario
 from crashhunt.settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.simulators._versions import ACCELERATED
 from crashhunt.snapshot import scenario_digest
 from crashhunt.space import Argument, Constant, parse_spec
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
@@ -84,8 +86,21 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
         run=request.run,
     )
+    scenario = _noted(scenario, request.run)
     sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
     return scenario, settings
+
+
+def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
+    """Tell whoever hunts in an unknown version of highway-env that it will not be fast."""
+    if scenario.highway is None or not (run.accelerate and scenario.highway.accelerate):
+        return scenario
+    version = metadata.version("highway-env")
+    if version in ACCELERATED:
+        return scenario
+    known = ", ".join(ACCELERATED)
+    note = f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
+    return replace(scenario, notes=(*scenario.notes, note))
 
 
 def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:

@@ -14,6 +14,7 @@ from crashhunt.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, FreshProcessExecutor, WorkerSettings, scratch_of
 from crashhunt.plan import with_settings
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box, values_around
+from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.settings import read_settings
 from crashhunt.snapshot import Snapshot
 from crashhunt.trial import Outcome
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
+    from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
@@ -44,6 +46,8 @@ class ReplayOptions:
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
         force: replay even from a snapshot that is damaged.
         times: how often.
+        scenario: the name or path of another scenario to drive in; empty for that of the crash.
+        accelerate: whether simulators are sped up where that changes no bit.
         trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
             but simulate.
         look: what to look at, in a process that has this one's terminal; without it, it runs in one of its own.
@@ -53,6 +57,8 @@ class ReplayOptions:
     changes: Mapping[str, str] = field(default_factory=dict)
     force: bool = False
     times: int = 1
+    scenario: str = ""
+    accelerate: bool = True
     trusted: bool = True
     look: Look | None = None
 
@@ -70,6 +76,7 @@ class Rerun:
         snapshot: of the bundle.
         edits: what is not as it was recorded, in words.
         warnings: what may make a difference, in words.
+        elsewhere: whether it is in another scenario, so that steps cannot be compared.
     """
 
     bundle: Bundle
@@ -80,6 +87,7 @@ class Rerun:
     snapshot: Snapshot
     edits: tuple[str, ...]
     warnings: tuple[str, ...]
+    elsewhere: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +220,12 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         acted = max((len(recorded.actions(agent)) for agent in recorded.agents), default=0)
         arguments = {agent: {"log": log, "agent": agent} for agent in scenario.agents}
         spec = replace(spec, arguments=arguments, max_steps=max(1, min(spec.max_steps, acted)))
+    if options.scenario:
+        if code == "log":
+            message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
+            raise UsageError(message, fix="leave --scenario or --from-log out")
+        scenario, spec = _elsewhere(options.scenario, scenario, spec)
+        edits.append(f"the scenario was {settings.scenario} and is {options.scenario}")
     worker = WorkerSettings(
         scenario=scenario,
         oracles=settings.oracles,
@@ -221,8 +235,27 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         argument_files=snapshot.argument_files if code == "snapshot" else {},
         timeout_s=settings.run.timeout_s,
         keep_trials=True,
+        accelerate=settings.run.accelerate and options.accelerate,
     )
-    return Rerun(bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings))
+    elsewhere = bool(options.scenario)
+    return Rerun(bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere)
+
+
+def _elsewhere(name: str, scenario: Scenario, spec: TrialSpec) -> tuple[Scenario, TrialSpec]:
+    """The same agents, arguments and seed in another scenario; its traffic is its own but for what both have."""
+    other = load_scenario(name)
+    if len(other.agents) != len(scenario.agents):
+        there, here = len(other.agents), len(scenario.agents)
+        message = f"--scenario {name!r} has {there} controlled vehicles, and the crash has {here}"
+        raise UsageError(message, fix="give one with as many")
+    ids = dict(zip(scenario.agents, other.agents, strict=True))
+    drivers = {ids[agent]: setup.agent for agent, setup in scenario.agents.items()}
+    shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
+    return other.with_agents(drivers), replace(
+        spec,
+        arguments={ids[agent]: values for agent, values in spec.arguments.items()},
+        scenario_arguments=argument_values(other) | shared,
+    )
 
 
 def _run(rerun: Rerun) -> ReplayReport:
@@ -264,6 +297,9 @@ def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
 def _report(
     rerun: Rerun, recorded: Recording, replayed: Recording, result: TrialResult, *, whole: bool = True
 ) -> ReplayReport:
+    if rerun.elsewhere:
+        crashed = result.outcome in rerun.worker.crash_on
+        return ReplayReport(rerun, "changed" if crashed else "fixed", result, replayed)
     divergence = first_divergence(recorded, replayed)
     if divergence is None and rerun.code != "log" and whole:
         divergence = _outcome_divergence(rerun.bundle.result, result)

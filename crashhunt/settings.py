@@ -56,6 +56,7 @@ class RunSettings:
         keep_trials: keep the logs of every trial.
         timeout_s: wall-clock limit of a trial, in s.
         recycle_after: trials after which a worker is replaced by a fresh one.
+        accelerate: whether simulators are sped up where that changes no bit.
     """
 
     parallel: int = 1
@@ -64,6 +65,7 @@ class RunSettings:
     keep_trials: bool = False
     timeout_s: float = 60.0
     recycle_after: int = 1000
+    accelerate: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -131,7 +131,7 @@ class HighwaySetup:
         config: what differs from the environment's own configuration; tables are merged, but one with another
             ``type`` replaces.
         off_road: whether leaving the lanes is a crash; by default everywhere but in car parks, where they are bays.
-        accelerate: whether the accelerator may be used; it changes no bit.
+        accelerate: whether the accelerator is used; it changes no bit.
     """
 
     id: str

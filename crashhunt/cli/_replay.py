@@ -55,6 +55,14 @@ def add_replay(commands: Any) -> None:
         "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
         help="another value for an argument of the agent (ID.NAME for one of several) or of the scenario",
     )  # fmt: skip
+    replay.add_argument(
+        "--scenario", metavar="NAME|PATH", default="",
+        help="have the same agents, arguments and seed drive in another scenario, which may be another simulator's, to "
+        "see whether they crash there as well",
+    )  # fmt: skip
+    replay.add_argument(
+        "--no-accelerate", action="store_true", help="run highway-env as it is, without the accelerator"
+    )
     replay.add_argument("--times", metavar="N", type=integer, default=1, help="repeat, and say how many runs agreed")
     replay.add_argument(
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
@@ -98,6 +106,8 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
         changes=pairs(options.sets, "--set"),
         force=options.force,
         times=options.times,
+        scenario=options.scenario,
+        accelerate=not options.no_accelerate,
     )
     film = film_options(options)
     crashes = options.crash.split(",")

@@ -74,6 +74,10 @@ def add_run(commands: Any) -> None:
     )
     how.add_argument("--keep-trials", action="store_true", help="keep the logs of every trial, not of crashes only")
     how.add_argument(
+        "--no-accelerate", action="store_true",
+        help="run highway-env as it is; the accelerator changes no bit, and only the time it takes",
+    )  # fmt: skip
+    how.add_argument(
         "--recycle-after", metavar="N", type=integer, default=1000,
         help="replace a worker after so many trials; 0: never; default: 1000",
     )  # fmt: skip
@@ -119,6 +123,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         keep_going=options.keep_going,
         deterministic=options.deterministic,
         keep_trials=options.keep_trials,
+        accelerate=not options.no_accelerate,
         timeout_s=options.timeout,
         recycle_after=options.recycle_after,
         snapshot=SnapshotOptions(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,10 @@ class Parts:
         """Make a simulator, with a folder for files of its own."""
         stage = self._settings.scratch / f"stage-{os.getpid()}"
         stage.mkdir(exist_ok=True)
-        made: Simulator = locate("simulators", self._settings.scenario.simulator)(self._settings.scenario, stage)
+        scenario = self._settings.scenario
+        if scenario.highway is not None and not self._settings.accelerate:
+            scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
+        made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
         return made
 
     def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:

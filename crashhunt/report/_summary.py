@@ -84,6 +84,9 @@ def _verdict(report: ReplayReport) -> list[str]:
         if report.rerun.code == "log":
             what = "every observation and scene that the recorded actions lead to is the same to the bit"
         return [f"reproduced: {count}", f"  {what}"]
+    if report.rerun.elsewhere:
+        verb = "it crashes there as well" if report.verdict == "changed" else "no crash there"
+        return [f"{report.verdict}: {verb}; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "fixed":
         return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "changed":

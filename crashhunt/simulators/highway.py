@@ -6,6 +6,7 @@ Its y axis points down and its headings grow clockwise; a scene has both mirrore
 from __future__ import annotations
 
 import difflib
+import logging
 import math
 import os
 import warnings
@@ -29,6 +30,7 @@ from crashhunt.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import rectangle_gap
 from crashhunt.scenario import argument_values
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.simulators._accelerator import accelerate, decelerate
 from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
@@ -72,6 +74,10 @@ class HighwaySimulator:
         self._setup = scenario.highway
         self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
         self._possible = tuple(scenario.agents)
+        if not self._setup.accelerate:
+            decelerate()
+        elif reason := accelerate():
+            logging.getLogger(__name__).warning("the accelerator steps aside: %s", reason)
         self.agents: list[str] = []
         self._lane_names: dict[tuple[str, str, int], str] = {}
         self.reset(seed=0, options={"arguments": argument_values(scenario)})  # which says what the spaces are

@@ -1,0 +1,346 @@
+"""The accelerator of highway-env: every bit the same, and hands off whatever it does not know."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+
+import gymnasium
+import highway_env
+import numpy as np
+import pytest
+from highway_env.road.lane import CircularLane, SineLane, StraightLane
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import ControlledVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crashhunt.simulators import _accelerator as accelerator
+from crashhunt.simulators._accelerator import _known, accelerate, decelerate
+from crashhunt.simulators._accelerator._known import kind_of, reason_against
+from crashhunt.simulators.highway import _restore_classes
+
+IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
+BEHAVIOR = "highway_env.vehicle.behavior"
+FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"]
+CONFIGS = {
+    "default": {},
+    "linear": {"other_vehicles_type": f"{BEHAVIOR}.AggressiveVehicle", "simulation_frequency": 10},
+    "seen": {
+        "neighbour_vehicles_connected_lanes": True,
+        "action": {"type": "ContinuousAction"},
+        "observation": {"type": "Kinematics", "features": FEATURES, "vehicles_count": 9, "see_behind": True,
+                        "normalize": False, "order": "shuffled", "absolute": True},
+    },
+    "grid": {"observation": {"type": "OccupancyGrid", "align_to_vehicle_axes": True}},
+}  # fmt: skip
+STEPS = {"highway-v0": 4, "lane-keeping-v0": 40}
+
+
+@pytest.fixture(autouse=True)
+def as_it_was():
+    """Whatever a test does, highway-env is as it was afterwards."""
+    decelerate()
+    _restore_classes()
+    yield
+    decelerate()
+    _restore_classes()
+
+
+def plain(value):
+    """Anything as something whose equality means that all bits are equal."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, float | np.floating):
+        return float(value).hex()
+    return str(value) if not isinstance(value, int | np.integer) else int(value)
+
+
+def state(env):
+    """Everything that a simulation may change about the vehicles and the generator."""
+    names = "position heading speed action crashed hit impact lane_index target_lane_index target_speed timer route"
+    names += " speed_index is_yielding yield_timer lateral_speed yaw_rate"
+    things = [*env.road.vehicles, *env.road.objects]
+    vehicles = [
+        (type(thing).__name__, [plain(getattr(thing, name, None)) for name in names.split()]) for thing in things
+    ]
+    return vehicles, plain(env.np_random.bit_generator.state)
+
+
+def episode(name, config, seed, steps, *, idm):
+    """The whole state after every sub-step, and what every step returns."""
+    _restore_classes()
+    env = gymnasium.make(name, disable_env_checker=True).unwrapped
+    trace = [plain(env.reset(seed=seed, options={"config": config})[0]), state(env)]
+    if idm:
+        driver = IDMVehicle.create_from(env.vehicle) if isinstance(env.vehicle, ControlledVehicle) else None
+        if driver is not None:
+            env.road.vehicles[env.road.vehicles.index(env.vehicle)] = driver
+            env.controlled_vehicles[0] = driver
+            env.action_type.controlled_vehicle = driver
+            env.observation_type.observer_vehicle = driver
+    advance = env.road.step
+
+    def step(dt):
+        advance(dt)
+        trace.append(state(env))
+
+    env.road.step = step
+    env.action_space.seed(seed)
+    try:
+        for _ in range(steps):
+            shown, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            trace.append(plain([shown, reward, terminated, truncated, info]))
+            if np.any(terminated):
+                break
+    except Exception as error:  # some rewards cannot do with some actions; that is to be the same as well
+        trace.append(repr(error))
+    env.close()
+    return trace
+
+
+def both(*words, **options):
+    decelerate()
+    slow = episode(*words, **options)
+    assert accelerate() == ""
+    fast = episode(*words, **options)
+    decelerate()
+    return slow, fast
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:.*invalid value:RuntimeWarning")
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("name", IDS)
+def test_every_bit_is_the_same_after_every_sub_step(name, config):
+    if config == "seen" and ("multi" in name or name == "lane-keeping-v0" or "parking" in name):
+        pytest.skip("its types of action and observation are its own")
+    chosen = dict(CONFIGS[config])
+    if name.startswith(("merge", "roundabout", "two-way")):
+        chosen.pop("action", None)  # their rewards ask for the number of a meta-action
+    for seed in range(2 if config == "default" else 1):
+        for idm in (False, True) if "multi" not in name else (False,):
+            slow, fast = both(name, chosen, seed, STEPS.get(name, 8), idm=idm)
+            assert len(slow) == len(fast) > 4
+            for number, (one, two) in enumerate(zip(slow, fast, strict=True)):
+                assert one == two, f"{name} {config} seed {seed}: entry {number}"
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_neighbours_and_lanes_are_those_of_highway_env_wherever_vehicles_are(data):
+    """Straight, slanted, bent and winding lanes; ties, crowds, and vehicles far from every lane."""
+    network = RoadNetwork()
+    network.add_lane("a", "b", StraightLane([0, 0], [60, 0]))
+    network.add_lane("a", "b", StraightLane([0, 4], [60, 4]))
+    network.add_lane("b", "c", StraightLane([60, 0], [100, 30]))
+    network.add_lane("b", "d", SineLane([60, 4], [120, 4], 3.0, 0.1, 0.5))
+    network.add_lane("d", "a", CircularLane([60, 40], 36.0, np.deg2rad(-90), np.deg2rad(120)))
+    road = Road(network, neighbour_vehicles_connected_lanes=data.draw(st.booleans()))
+    near = st.sampled_from([0.0, 4.0, 2.0, 60.0, 30.0])
+    place = st.tuples(near | st.floats(-50, 200), near | st.floats(-50, 120))
+    poses = data.draw(st.lists(st.tuples(place, st.floats(-4, 4), st.floats(-5, 40)), min_size=2, max_size=9))
+    for position, heading, speed in poses:
+        road.vehicles.append(IDMVehicle(road, position, heading, speed))
+    keys = [None, *network.lanes_dict()]
+    asked = [(vehicle, key) for vehicle in road.vehicles for key in keys]
+    close = [(vehicle, count, data.draw(st.booleans())) for vehicle in road.vehicles for count in (None, 3)]
+
+    def answers():
+        found = [road.neighbour_vehicles(vehicle, key) for vehicle, key in asked]
+        found += [road.close_objects_to(vehicle, 60, count, behind) for vehicle, count, behind in close]
+        return [[id(thing) for thing in things] for things in found]
+
+    def played():
+        trace = []
+        before = [(v.position.copy(), v.heading, v.speed, dict(vars(v))) for v in road.vehicles]
+        for _ in range(3):
+            road.act()
+            road.step(0.2)
+            trace.append(
+                plain([[v.position, v.heading, v.speed, v.lane_index, v.action, v.impact] for v in road.vehicles])
+            )
+        for vehicle, (position, _, _, attributes) in zip(road.vehicles, before, strict=True):
+            vars(vehicle).clear()
+            vars(vehicle).update(attributes, position=position, action={"steering": 0, "acceleration": 0})
+        return trace
+
+    decelerate()
+    expected, run = answers(), played()
+    assert accelerate() == ""
+    assert answers() == expected
+    assert played() == run
+    decelerate()
+
+
+def small_road(*classes):
+    road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+    for number, kind in enumerate(classes):
+        road.vehicles.append(kind(road, [30.0 * number, 0.0], 0.0, 20.0))
+    return road
+
+
+class Hurried(IDMVehicle):
+    TIME_WANTED = 0.5
+
+
+class Timid(IDMVehicle):
+    asked = 0
+
+    def acceleration(self, ego_vehicle, front_vehicle=None, rear_vehicle=None):
+        type(self).asked += 1
+        return super().acceleration(ego_vehicle, front_vehicle, rear_vehicle) - 1.0
+
+
+class Ghost(IDMVehicle):
+    def handle_collisions(self, other, dt=0):
+        self.met = [*getattr(self, "met", []), other]
+
+
+class Slippery(IDMVehicle):
+    def step(self, dt):
+        super().step(dt)
+        self.position[1] += 0.01
+
+
+@pytest.mark.parametrize("kind", [Hurried, Timid, Ghost, Slippery])
+def test_a_subclass_is_as_its_author_wrote_it(kind):
+    """Other numbers are heeded, and other methods called."""
+
+    def played():
+        road = small_road(IDMVehicle, kind, IDMVehicle)
+        for _ in range(20):
+            road.act()
+            road.step(0.1)
+        return plain([[v.position, v.heading, v.speed, v.action, len(getattr(v, "met", []))] for v in road.vehicles])
+
+    slow = played()
+    assert accelerate() == ""
+    Timid.asked = 0
+    assert played() == slow
+    assert (Timid.asked > 0) == (kind is Timid)
+    assert (kind_of(kind).drives == "idm") == (kind in (Hurried, Slippery))
+    assert kind_of(kind).moves == (kind in (Hurried, Timid))
+
+
+def test_a_method_of_one_vehicle_is_called():
+    assert accelerate() == ""
+    road = small_road(IDMVehicle, IDMVehicle)
+    called = []
+    road.vehicles[1].act = lambda: called.append("act")
+    road.act()
+    road.step(0.1)
+    assert called == ["act"]
+
+
+def test_a_road_of_another_class_keeps_its_own_methods():
+    class Looking(Road):
+        asked = 0
+
+        def neighbour_vehicles(self, vehicle, lane_index=None):
+            self.asked += 1
+            return super().neighbour_vehicles(vehicle, lane_index)
+
+    assert accelerate() == ""
+    road = Looking(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
+    road.vehicles += [IDMVehicle(road, [30.0 * number, 0.0], 0.0, 20.0) for number in range(3)]
+    road.act()
+    assert road.asked >= 3
+
+
+def test_somebody_who_moves_somebody_is_noticed():
+    """Coordinates that were computed are not used where a vehicle is no longer there."""
+    assert accelerate() == ""
+    road = small_road(IDMVehicle, IDMVehicle, IDMVehicle)
+    first, second, third = road.vehicles
+    assert road.neighbour_vehicles(first)[0] is second
+    second.position[0] = 200.0
+    assert road.neighbour_vehicles(first)[0] is third
+    road.vehicles.remove(third)
+    assert road.neighbour_vehicles(first)[0] is second
+    road.network.add_lane("0", "1", StraightLane([0, 8], [10000, 8]))
+    second.position[:] = 40.0, 8.0
+    assert road.neighbour_vehicles(first, ("0", "1", 2))[0] is second
+
+
+def test_it_says_whom_it_leaves_alone(caplog):
+    class Odd(IDMVehicle):
+        def mobil(self, lane_index):
+            return False
+
+    with caplog.at_level(logging.INFO, "crashhunt"):
+        assert kind_of(Odd).drives == ""
+        assert kind_of(Odd).moves
+    assert "Odd has its own mobil" in caplog.text
+
+
+def test_it_steps_aside_for_another_version(monkeypatch):
+    monkeypatch.setattr(highway_env, "__version__", "9.9")
+    assert "highway-env 9.9 is not known" in accelerate()
+    assert Road.act.__module__ == "highway_env.road.road"
+
+
+def test_it_steps_aside_for_a_changed_installation(monkeypatch):
+    monkeypatch.setattr(_known, "ACCELERATED", {highway_env.__version__: "0123"})
+    assert "not the published one" in reason_against()
+
+
+def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
+    monkeypatch.setattr(_known, "_arrays_equal_scalars", lambda: False)
+    assert "on this processor" in accelerate()
+
+
+PATCHED = """
+from highway_env.vehicle.kinematics import Vehicle
+def clip_actions(self): ...
+Vehicle.clip_actions = clip_actions
+from crashhunt.simulators._accelerator import accelerate
+print(accelerate())
+"""
+
+
+def test_it_steps_aside_where_somebody_else_has_replaced_a_method(tmp_path):
+    (tmp_path / "patched.py").write_text(PATCHED)
+    done = subprocess.run([sys.executable, "patched.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "Vehicle.clip_actions has been replaced by" in done.stdout
+
+
+def test_it_is_undone():
+    before = {(owner, name): getattr(owner, name) for owner, name, _ in accelerator._REPLACED}
+    assert accelerate() == accelerate() == ""
+    assert all(getattr(owner, name) is not before[owner, name] for owner, name in before)
+    decelerate()
+    decelerate()
+    assert all(getattr(owner, name) is before[owner, name] for owner, name in before)
+    assert Vehicle.act.__module__ == "highway_env.vehicle.kinematics"
+
+
+PLUGIN = """
+from crashhunt.simulators._accelerator import accelerate
+
+def pytest_configure(config):
+    reason = accelerate()
+    assert not reason, reason
+"""
+
+
+def test_highway_envs_own_tests_pass_with_it(tmp_path):
+    """Its published archives do not have them: give a checkout of its repository."""
+    source = os.environ.get("CRASHHUNT_HIGHWAY_ENV_SOURCE")
+    if not source:
+        pytest.skip("set CRASHHUNT_HIGHWAY_ENV_SOURCE to a checkout of highway-env")
+    (tmp_path / "accelerated.py").write_text(PLUGIN)
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-c", "pytest.ini", "--rootdir", source, "-p", "accelerated",
+               "-p", "no:randomly", "-p", "no:xdist", "-p", "no:cacheprovider", f"{source}/tests"]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{source}", "SDL_VIDEODRIVER": "dummy"}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert "165 passed" in done.stdout
