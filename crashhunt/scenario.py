@@ -43,7 +43,7 @@ class Scenario:
     Args:
         title: one line, for people.
         simulator: the name of a registered simulator, or ``module:attribute``.
-        step_length_s: the control step, in s; highway-env's is the inverse of its policy_frequency.
+        step_length_s: the control step, in s; highway-env's follows from its policy_frequency.
         warmup_s: simulation time before the controlled vehicles enter, in s.
         insertion_timeout_s: how much later they may enter before the episode is invalid, in s.
         observation: what agents are shown; None for what the simulator shows of itself, which on SUMO is the default.

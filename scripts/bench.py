@@ -487,6 +487,66 @@ def bench_panels() -> Iterator[Figure]:
     yield Figure("panels_vs_matplotlib", ratio, "x", "higher", 20.0, note)
 
 
+def child_accelerator(name: str, vehicles: str, rounds: str) -> dict[str, float]:
+    """Steps a second on highway-env without and with the accelerator, in turns; IDLE or random actions."""
+    import warnings
+
+    import gymnasium
+    import highway_env
+
+    from crashhunt.simulators._accelerator import accelerate, decelerate
+
+    warnings.simplefilter("ignore")
+    assert highway_env
+    config = {"duration": float("inf")} | ({"vehicles_count": int(vehicles)} if int(vehicles) else {})
+
+    def rate(seed: int) -> float:
+        env = gymnasium.make(name, disable_env_checker=True).unwrapped
+        env.reset(seed=seed, options={"config": config})
+        env.action_space.seed(seed)
+        spent, steps = 0.0, 0
+        while spent < 0.6 or steps < 2:
+            action = 1 if hasattr(env.action_space, "n") else env.action_space.sample()
+            began = time.perf_counter()
+            _, _, terminated, _, _ = env.step(action)
+            spent, steps = spent + time.perf_counter() - began, steps + 1
+            if terminated:
+                seed += 1
+                env.reset(seed=seed)
+        return steps / spent
+
+    slow, fast = [], []
+    for number in range(int(rounds)):
+        decelerate()
+        slow.append(rate(100 * number))
+        reason = accelerate()
+        assert not reason, reason
+        fast.append(rate(100 * number))
+    ratio = statistics.median(two / one for one, two in zip(slow, fast, strict=True))
+    return {"ratio": ratio, "slow": statistics.median(slow), "fast": statistics.median(fast)}
+
+
+def bench_accelerator() -> Iterator[Figure]:
+    """highway-env with the accelerator against highway-env as it is, in turns within one process."""
+    import gymnasium
+    import highway_env
+
+    assert highway_env
+    for name, target in (("highway-v0", 8.0), ("highway-fast-v0", 4.0)):
+        found = in_child("child_accelerator", name, "0", "5")
+        note = f"{found['slow']:.1f} steps a second become {found['fast']:.0f}"
+        yield Figure(f"accelerated_{name}", found["ratio"], "x", "higher", target, note)
+    names = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env")]
+    ratios = {name: in_child("child_accelerator", name, "0", "3")["ratio"] for name in sorted(names)}
+    worst = min(ratios, key=ratios.__getitem__)
+    note = f"{worst}; the median of {len(ratios)} environments is {statistics.median(ratios.values()):.1f}"
+    yield Figure("accelerated_least", ratios[worst], "x", "higher", 1.0, note)
+    counts = {count: in_child("child_accelerator", "highway-v0", str(count), "3") for count in (20, 200)}
+    growth = {which: counts[20][which] / counts[200][which] for which in ("slow", "fast")}
+    note = f"without it {growth['slow']:.0f}; at 200 vehicles it is {counts[200]['ratio']:.0f} times as fast"
+    yield Figure("accelerated_time_of_10_times_the_vehicles", growth["fast"], "x", "lower", None, note)
+
+
 def bench_report() -> Iterator[Figure]:
     """How long the page takes to draw a step, with 200 actors and 3,000 steps, in a real browser."""
     program, driver = shutil.which("chromium"), shutil.which("chromedriver")
@@ -578,6 +638,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "panels": bench_panels,
     "scale": bench_scale,
     "report": bench_report,
+    "accelerator": bench_accelerator,
 }
 
 

@@ -5,13 +5,11 @@ Its y axis points down and its headings grow clockwise; a scene has both mirrore
 
 from __future__ import annotations
 
-import difflib
 import logging
 import math
 import os
 import warnings
 from collections import Counter
-from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # an observation may be a picture; nobody wants a window
@@ -32,6 +30,7 @@ from crashhunt.scenario import argument_values
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
 from crashhunt.simulators._accelerator import accelerate, decelerate
 from crashhunt.simulators._actions import MetaAction
+from crashhunt.simulators._highway_config import configured, mistake, restore_classes
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
 
@@ -162,59 +161,28 @@ class HighwaySimulator:
 
     def _make(self, arguments: Mapping[str, Any]) -> AbstractEnv:
         """Make the environment with its configuration, which the next reset applies."""
-        _restore_classes()
+        restore_classes()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
                 made = gymnasium.make(self._setup.id, disable_env_checker=True)
         except (gymnasium.error.Error, ImportError) as error:
             message = " ".join(str(error).split())
-            raise self._mistake("id", self._setup.id, message, "give an id such as 'highway-fast-v0'") from None
+            raise mistake(
+                self._scenario, "id", self._setup.id, message, "give an id such as 'highway-fast-v0'"
+            ) from None
         env = made.unwrapped
         if not isinstance(env, AbstractEnv):
-            raise self._mistake("id", self._setup.id, "is no environment of highway-env", 'write simulator = "gym"')
-        config = deepcopy(env.config)
-        self._check_keys(config, self._setup.config)
-        _merge(config, deepcopy(self._setup.config))
-        for name, value in arguments.items():
-            option = self._scenario.arguments[name].option or name if name in self._scenario.arguments else name
-            table: dict[str, Any] = {}
-            *path, last = option.split(".")
-            inner = table
-            for part in path:
-                inner = inner.setdefault(part, {})
-            inner[last] = value
-            self._check_keys(config, table)
-            _merge(config, table)
-        if "duration" in config and "duration" not in self._setup.config and "duration" not in arguments:
-            config["duration"] = math.inf
-        count = len(self._possible)
-        if "controlled_vehicles" in config:
-            config["controlled_vehicles"] = count
-        elif count > 1:
-            raise self._mistake("id", self._setup.id, f"has one controlled vehicle, not {count}", "name one agent")
-        if count > 1:
-            for key in ("action", "observation"):
-                if not config[key]["type"].startswith("MultiAgent"):
-                    config[key] = {"type": f"MultiAgent{key.capitalize()}", f"{key}_config": config[key]}
-        _use_tuples(config["observation"])
-        env.config = config
+            fix = 'write simulator = "gym"'
+            raise mistake(self._scenario, "id", self._setup.id, "is no environment of highway-env", fix)
+        env.config = configured(env.config, self._scenario, arguments)
         return env
-
-    def _check_keys(self, config: Mapping[str, Any], table: Mapping[str, Any]) -> None:
-        for key in table:
-            if key not in config and not key.endswith("_reward"):  # which is 0 where it is not there
-                close = difflib.get_close_matches(key, config, 1)
-                fix = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(config)}"
-                raise self._mistake("config", key, f"is no entry of the configuration of {self._setup.id}", fix)
-
-    def _mistake(self, key: str, value: object, message: str, fix: str) -> ScenarioError:
-        return ScenarioError(f"highway.{key} = {value!r} {message}", fix=fix, where=self._scenario.origin)
 
     def _adopt(self, env: AbstractEnv) -> None:
         """Take an environment over: its vehicles, and how its observations and actions are written."""
         self._env = env
-        self.step_length_s = 1 / env.config["policy_frequency"]
+        rate = env.config["simulation_frequency"]
+        self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # as long as it simulates
         chosen = self._setup.off_road
         self._lanes_are_road = chosen if chosen is not None else not isinstance(env, ParkingEnv)
         self._many_act = isinstance(env.action_type, MultiAgentAction)
@@ -361,39 +329,3 @@ def _gap(one: RoadObject, two: RoadObject) -> float:
     halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
     turn = np.array([two.heading - one.heading])
     return float(rectangle_gap(np.array([[x * c + y * s, y * c - x * s]]), turn, *halves)[0])
-
-
-def _merge(config: dict[str, Any], table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        old = config.get(key)
-        if isinstance(old, dict) and isinstance(value, dict) and value.get("type", old.get("type")) == old.get("type"):
-            _merge(old, value)
-        else:
-            config[key] = value
-
-
-def _use_tuples(table: Any) -> None:
-    """Make the shapes in the configuration of an observation tuples, which TOML does not have."""
-    for inner in table.values() if isinstance(table, dict) else table:
-        if isinstance(inner, dict | list):
-            _use_tuples(inner)
-    if isinstance(table, dict) and "observation_shape" in table:
-        table["observation_shape"] = tuple(table["observation_shape"])
-
-
-_pristine: dict[type, dict[str, Any]] = {}
-
-
-def _restore_classes() -> None:
-    """Undo what environments change in classes, such as the jam distance of all drivers, for the next episode."""
-    waiting = [RoadObject]
-    while waiting:
-        kind = waiting.pop()
-        waiting += kind.__subclasses__()
-        plain = {name: value for name, value in vars(kind).items() if isinstance(value, int | float | str)}
-        was = _pristine.setdefault(kind, plain)
-        if plain != was:
-            for name in plain.keys() - was.keys():
-                delattr(kind, name)
-            for name, value in was.items():
-                setattr(kind, name, value)

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
-from crashhunt.agents import CarFollowing, KeepLaneWithSpeed, LaneChanger, RandomAgent, Recorded
+from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed, LaneChanger, RandomAgent, Recorded
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
@@ -179,6 +180,42 @@ class TestLaneChanger(_Agents):
         return lambda: LaneChanger(patience_s=1.0)
 
 
+class TestLaneChangerMeta(TestLaneChanger):
+    @pytest.fixture
+    def form(self):
+        return MetaAction()
+
+    @pytest.fixture
+    def make(self, form):
+        return lambda: LaneChanger(patience_s=1.0, action_space=form.space)
+
+
+class TestCarFollowingBySpeedAlone(_Agents):
+    @pytest.fixture
+    def form(self):
+        return MetaAction(("SLOWER", "IDLE", "FASTER"))
+
+    @pytest.fixture
+    def make(self, form):
+        return lambda: CarFollowing(delay_s=0.4, action_space=form.space)
+
+
+class TestIntelligentDriver(_Agents):
+    @pytest.fixture
+    def make(self):
+        return lambda: IntelligentDriver(politeness=0.5)
+
+
+class TestIntelligentDriverMeta(_Agents):
+    @pytest.fixture
+    def form(self):
+        return MetaAction()
+
+    @pytest.fixture
+    def make(self, form):
+        return lambda: IntelligentDriver(politeness=0.5, action_space=form.space)
+
+
 class TestRandomAgent(_Agents):
     @pytest.fixture
     def make(self, form):
@@ -254,3 +291,44 @@ def test_meta_actions_are_in_the_order_of_highway_env():
     assert dict(enumerate(META_ACTIONS)) == DiscreteMetaAction.ACTIONS_ALL
     assert replace(TOY, name="x")
     assert with_action(TOY, "ego", "meta").agents["ego"].action == "meta"
+
+
+@pytest.mark.parametrize("kind", [KeepLaneWithSpeed, CarFollowing, LaneChanger, IntelligentDriver])
+@pytest.mark.parametrize("space", [spaces.Discrete(2), spaces.Discrete(9), spaces.Box(-1.0, 1.0, (2,))])
+def test_agents_of_ours_refuse_actions_that_they_do_not_know(kind, space):
+    with pytest.raises(ValueError, match="meta-actions, not by"):
+        kind(action_space=space)
+
+
+ROAD = [[1, 0, 4, 25, 0, 1, 0], [1, 25, 0, -10, 0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("others", "change"),
+    [
+        ([], 1),  # nobody there: overtakes on the left
+        ([[1, -3, -4, 0, 0, 1, 0]], 0),  # somebody beside it
+        ([[1, -12, -4, 12, 0, 1, 0]], 0),  # somebody comes fast from behind
+        ([[1, 20, -4, -12, 0, 1, 0]], 0),  # even slower ahead over there
+    ],
+)
+def test_the_idm_driver_changes_lanes_for_a_gain_and_not_into_danger(others, change):
+    observation = np.zeros((8, 7), np.float32)
+    rows = ROAD + others
+    observation[: len(rows)] = rows
+    driver = IntelligentDriver(step_length_s=1.0)
+    driver.reset(0)
+    target, chosen = driver.act(observation)
+    assert chosen == change
+    assert target < 25
+
+
+def test_meta_actions_that_a_space_does_not_have_are_idle():
+    driver = CarFollowing(action_space=MetaAction(("SLOWER", "IDLE", "FASTER")).space)
+    brake, free = np.zeros((2, 7), np.float32), np.zeros((2, 7), np.float32)
+    brake[:], free[0] = ([1, 0, 0, 20, 0, 1, 0], [1, 9, 0, -15, 0, 1, 0]), [1, 0, 0, 5, 0, 1, 0]
+    answers = []
+    for shown in (brake, free):
+        driver.reset(0)
+        answers.append(driver.act(shown))
+    assert answers == [0, 2]

@@ -67,7 +67,7 @@ def test_every_command_does_what_it_says(shown):
 
 
 def test_the_shown_scenario_is_valid(shown):
-    (toml,) = (block for kind, block in BLOCKS if kind == "toml" and "simulator" in block)
+    (toml,) = (block for kind, block in BLOCKS if kind == "toml" and 'simulator = "sumo"' in block)
     folder = shown.folder / "mine"
     shutil.copytree(ROOT / "scenarios/loop", folder)
     (folder / "scenario.toml").write_text(toml, encoding="utf-8")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import pytest
 
 from crashhunt.scenario import shipped_scenarios
@@ -124,3 +127,58 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     done = shell.crashhunt("run", "h", "1", "1", "5", "--scenario", ".", expect=2)
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
+
+
+def test_the_accelerator_changes_nothing_but_the_time(shell):
+    words = ("2", "6", "60", "--scenario", "highway", "--seed", "1", "--keep-going")
+    shell.crashhunt("run", "fast", *words)
+    shell.crashhunt("run", "slow", *words, "--no-accelerate")
+    fast, slow = (
+        [
+            (row["seed"], row["outcome"], row["digest"])
+            for row in shell.crashhunt("trials", name, "--format", "json").json
+        ]
+        for name in ("fast", "slow")
+    )
+    assert fast == slow
+    assert len({digest for _, _, digest in fast}) == 6
+    assert "accelerate = false" in (shell.folder / "slow/hunt.toml").read_text()
+    if any(outcome == "collision" for _, outcome, _ in fast):
+        assert shell.crashhunt("replay", "fast", "--no-accelerate", "--json").json["verdict"] == "reproduced"
+
+
+def test_a_crash_in_one_simulator_is_tried_in_another(shell):
+    words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
+    shell.crashhunt("run", "h", "2", "20", "150", *words)
+    done = shell.crashhunt("replay", "h", "--scenario", "motorway", expect=None)
+    assert "the scenario was highway and is motorway" in done.out
+    assert "it crashes there as well" in done.out or "no crash there" in done.out
+    told = shell.crashhunt("replay", "h", "--scenario", "motorway", "--json", expect=None).json
+    assert told["verdict"] in ("changed", "fixed")
+    assert told["divergence"] is None
+    for more, says in (("--from-log", "recorded actions belong"), ("--scenario=loop-two-agents", "2 controlled")):
+        refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
+        assert says in refused.err
+
+
+STRANGE = [
+    ('simulator = "gym"\n[gym]\nid = "evil:make"', "evil"),
+    (
+        'simulator = "highway"\n[highway]\nid = "highway-fast-v0"\nconfig = { other_vehicles_type = "evil.Car" }',
+        "evil.Car",
+    ),
+]
+
+
+@pytest.mark.parametrize(("table", "says"), STRANGE)
+def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
+    from crashhunt.errors import UsageError
+    from crashhunt.plan import Request, plan
+    from crashhunt.scenario import Scenario, scenario_from_dict
+    from crashhunt.trust import refuse_side_effects
+
+    _, settings = plan(Request(trials=1, max_steps=1, scenario="highway", seed=1))
+    scenario = scenario_from_dict(tomllib.loads(table), where="x", folder=Path())
+    assert isinstance(scenario, Scenario)
+    with pytest.raises(UsageError, match=says):
+        refuse_side_effects(scenario, settings)

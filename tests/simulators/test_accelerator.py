@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from crashhunt.simulators import _accelerator as accelerator
 from crashhunt.simulators._accelerator import _known, accelerate, decelerate
 from crashhunt.simulators._accelerator._known import kind_of, reason_against
-from crashhunt.simulators.highway import _restore_classes
+from crashhunt.simulators._highway_config import restore_classes
 
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
 BEHAVIOR = "highway_env.vehicle.behavior"
@@ -45,10 +45,10 @@ STEPS = {"highway-v0": 4, "lane-keeping-v0": 40}
 def as_it_was():
     """Whatever a test does, highway-env is as it was afterwards."""
     decelerate()
-    _restore_classes()
+    restore_classes()
     yield
     decelerate()
-    _restore_classes()
+    restore_classes()
 
 
 def plain(value):
@@ -77,7 +77,7 @@ def state(env):
 
 def episode(name, config, seed, steps, *, idm):
     """The whole state after every sub-step, and what every step returns."""
-    _restore_classes()
+    restore_classes()
     env = gymnasium.make(name, disable_env_checker=True).unwrapped
     trace = [plain(env.reset(seed=seed, options={"config": config})[0]), state(env)]
     if idm:

@@ -269,6 +269,7 @@ MISTAKES = [
     ({"name": "highway-fast-v0", "config": {"vehicle_count": 3}}, "did you mean 'vehicles_count'"),
     ({"name": "merge-v0", "agents": 2}, "one controlled vehicle, not 2"),
     ({"name": "no.such.module:env-v0"}, "no.such"),
+    ({"name": "highway-fast-v0", "config": {"policy_frequency": 6}}, "at most simulation_frequency, 5"),
 ]
 
 
@@ -278,6 +279,18 @@ def test_a_mistake_is_one_line(tmp_path, options, says):
         simulator_of(tmp_path, options.pop("name"), **options)
     assert says in str(caught.value) + caught.value.fix
     assert "\n" not in str(caught.value)
+
+
+def test_a_step_is_as_long_as_it_simulates(tmp_path):
+    for policy, step in ((1, 1.0), (2, 0.4), (5, 0.2)):
+        quiet = {"vehicles_count": 0, "policy_frequency": policy}
+        simulator = simulator_of(tmp_path, "highway-fast-v0", config=quiet)
+        simulator.reset(seed=1)
+        first = simulator.scene()
+        list(drive(simulator, "IDLE", 3))
+        assert simulator.scene().time_s == pytest.approx(3 * step)
+        driven = simulator.scene().points[0][0] - first.points[0][0]
+        assert driven == pytest.approx(25.0 * 3 * step, rel=0.01)
 
 
 def test_a_configuration_that_cannot_be_set_up_is_an_invalid_episode(tmp_path):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import tomllib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import tomli_w
@@ -12,9 +12,6 @@ from hypothesis import strategies as st
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import load_scenario, scenario_from_dict, shipped_folder, shipped_scenarios
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LOOP = shipped_folder() / "loop"
 
@@ -46,9 +43,12 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
     for arguments in (scenario.scenario_arguments(), *(scenario.agent_arguments(agent) for agent in scenario.agents)):
         for argument in arguments.values():
             assert argument.default is not None
+            assert argument.help
+            if argument.kind == "str":  # a file beside it
+                assert Path(argument.default).is_file()
+                continue
             assert argument.distribution is not None
             assert argument.distribution.contains(argument.default), argument
-            assert argument.help
 
 
 @pytest.mark.parametrize(

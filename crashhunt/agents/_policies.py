@@ -1,0 +1,172 @@
+"""Policies of other libraries: Stable-Baselines3, PyTorch, ONNX. Each library is imported where it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from crashhunt.space import Argument
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+__all__ = ["OnnxPolicy", "StableBaselines3", "TorchPolicy"]
+
+_ALGORITHMS = ("PPO", "DQN", "A2C", "SAC", "TD3", "DDPG")
+
+
+class StableBaselines3:
+    """Drives by a model that Stable-Baselines3 has saved.
+
+    Such a file holds pickles: load your own only. The environment must show what the model was trained on.
+
+    Args:
+        path: what ``model.save`` wrote, with its ``.zip``.
+        algorithm: the class of the model, or ``module:Class`` such as ``sb3_contrib:TQC``.
+        deterministic: take the most probable action; otherwise draw one.
+        observation_space: of the vehicle.
+
+    Raises:
+        ValueError: there is no such file or algorithm, or the model was trained on other observations.
+    """
+
+    def __init__(
+        self,
+        path: Annotated[str, Argument("path", help="of the saved model, a .zip file")],
+        algorithm: Annotated[str, Argument("algorithm", help=f"its class: {', '.join(_ALGORITHMS)}")] = "PPO",
+        deterministic: Annotated[bool, Argument("deterministic", help="the most probable action")] = True,
+        observation_space: Space[Any] | None = None,
+    ) -> None:
+        module, _, name = algorithm.rpartition(":")
+        if not module and name not in _ALGORITHMS:
+            raise ValueError(f"algorithm {algorithm!r} is none of {', '.join(_ALGORITHMS)}, and not module:Class")
+        kind = getattr(_library(module or "stable_baselines3", "sb3"), name)
+        self._model = kind.load(_existing(path), device="cpu")
+        self._deterministic = deterministic
+        trained = self._model.observation_space
+        if observation_space is not None and _shape(trained) != _shape(observation_space):
+            raise ValueError(f"the model was trained on {trained}, and the vehicle is shown {observation_space}")
+
+    def reset(self, seed: int) -> None:
+        """Forget the hidden state, and seed the model."""
+        self._model.set_random_seed(seed)
+        self._state: Any = None
+        self._first = True
+
+    def act(self, observation: Any) -> Any:
+        """Return what the model predicts."""
+        action, self._state = self._model.predict(
+            observation, state=self._state, episode_start=np.array([self._first]), deterministic=self._deterministic
+        )
+        self._first = False
+        return action
+
+
+class TorchPolicy:
+    """Drives by a PyTorch module, saved by ``torch.export.save`` (``.pt2``) or ``torch.jit.save``.
+
+    It is called with a batch of one observation, float32. Of a discrete action it returns a value each, of which the
+    greatest is taken; of a continuous one the action, which is clipped to the space.
+
+    Args:
+        path: of the module.
+        flatten: whether it expects observations as one row of numbers.
+        action_space: of the vehicle.
+
+    Raises:
+        ValueError: there is no such file.
+    """
+
+    def __init__(
+        self,
+        path: Annotated[str, Argument("path", help="of the module, a .pt2 or .pt file")],
+        flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
+        action_space: Space[Any] | None = None,
+    ) -> None:
+        self._torch = _library("torch", "torch")
+        file = _existing(path)
+        if file.suffix == ".pt2":
+            self._module = self._torch.export.load(file).module()
+        else:
+            self._module = self._torch.jit.load(str(file), map_location="cpu").eval()
+        self._flatten = flatten
+        self._space = action_space
+
+    def reset(self, seed: int) -> None:
+        """Seed the generator of PyTorch."""
+        self._torch.manual_seed(seed)
+
+    def act(self, observation: Any) -> Any:
+        """Return the module's answer."""
+        with self._torch.inference_mode():
+            answer = self._module(self._torch.from_numpy(_batch(observation, flatten=self._flatten)))
+        return _decide(answer.numpy(), self._space)
+
+
+class OnnxPolicy:
+    """Drives by an ONNX model with one input and one output, with the same meaning as for `TorchPolicy`.
+
+    Args:
+        path: of the model.
+        flatten: whether it expects observations as one row of numbers.
+        action_space: of the vehicle.
+
+    Raises:
+        ValueError: there is no such file.
+    """
+
+    def __init__(
+        self,
+        path: Annotated[str, Argument("path", help="of the model, an .onnx file")],
+        flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
+        action_space: Space[Any] | None = None,
+    ) -> None:
+        runtime = _library("onnxruntime", "onnx")
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self._session = runtime.InferenceSession(_existing(path), options, providers=["CPUExecutionProvider"])
+        self._input = self._session.get_inputs()[0].name
+        self._flatten = flatten
+        self._space = action_space
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Any) -> Any:
+        """Return the model's answer."""
+        answer, *_ = self._session.run(None, {self._input: _batch(observation, flatten=self._flatten)})
+        return _decide(answer, self._space)
+
+
+def _library(name: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(f"needs {name}: pip install 'crashhunt[{extra}]' ({error})") from error
+
+
+def _existing(path: str) -> Path:
+    if not Path(path).is_file():
+        raise ValueError(f"there is no file {path!r}")
+    return Path(path)
+
+
+def _shape(space: Any) -> Any:
+    return {name: _shape(inner) for name, inner in space.spaces.items()} if hasattr(space, "spaces") else space.shape
+
+
+def _batch(observation: NDArray[Any], *, flatten: bool) -> NDArray[np.float32]:
+    array = np.array(observation, np.float32)
+    return array.reshape(1, -1) if flatten else array[None]
+
+
+def _decide(answer: NDArray[Any], space: Space[Any] | None) -> Any:
+    values = answer[0]
+    low, high = getattr(space, "low", None), getattr(space, "high", None)
+    if low is None or high is None:
+        return int(np.argmax(values))
+    return np.clip(values.reshape(low.shape), low, high).astype(low.dtype)

@@ -1,0 +1,209 @@
+"""Trained policies as agents. PyTorch and Stable-Baselines3 are tested where they are installed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from crashhunt.agents import NumpyPolicy, OnnxPolicy, StableBaselines3, TorchPolicy
+from crashhunt.scenario import load_scenario, shipped_folder
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators._spaces import action_form
+from crashhunt.testing import AgentContract
+
+WEIGHTS = shipped_folder() / "highway-policy" / "policy.npz"
+BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def scenes(count=30, seed=0):
+    """Observations in the default layout: a lane in the middle, and others around."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(count):
+        shown = np.zeros((8, 7), np.float32)
+        shown[:, 0] = 1.0
+        shown[0, 1:] = rng.uniform(0, 900), 4.0, rng.uniform(15, 30), 0.0, 1.0, 0.0
+        shown[1:, 1] = rng.uniform(-80, 80, 7)
+        shown[1:, 2] = rng.choice([-4.0, 0.0, 4.0], 7)
+        shown[1:, 3] = rng.uniform(-10, 5, 7)
+        shown[1:, 5] = 1.0
+        found.append(shown)
+    return found
+
+
+class _Policy(AgentContract):
+    @pytest.fixture
+    def observations(self):
+        return scenes()
+
+    @pytest.fixture
+    def form(self):
+        return MetaAction()
+
+
+class TestNumpyPolicy(_Policy):
+    @pytest.fixture
+    def make(self, form):
+        return lambda: NumpyPolicy(str(WEIGHTS), step_length_s=1.0, action_space=form.space)
+
+
+class TestNumpyPolicyByTargetSpeed(_Policy):
+    @pytest.fixture
+    def form(self):
+        return SpeedAndLaneChange()
+
+    @pytest.fixture
+    def make(self, form):
+        return lambda: NumpyPolicy(str(WEIGHTS), step_length_s=0.1, action_space=form.space)
+
+
+def test_the_shipped_policy_is_small_and_has_learned_to_keep_away():
+    assert WEIGHTS.stat().st_size < 250_000
+    policy = NumpyPolicy(str(WEIGHTS), action_space=MetaAction().space)
+    ahead, free = np.zeros((8, 7), np.float32), np.zeros((8, 7), np.float32)
+    for shown in (ahead, free):
+        shown[0] = 1, 300, 4, 30, 0, 1, 0
+    ahead[1] = 1, 12, 0, -10, 0, 1, 0  # close, in the same lane, much slower
+    names = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+    assert names[policy.act(ahead)] in ("LANE_LEFT", "LANE_RIGHT", "SLOWER")
+    policy.reset(0)
+    assert names[policy.act(free)] != "SLOWER"
+    assert len(policy.values) == 5
+    assert "values" in policy.panels()
+
+
+def test_it_decides_once_a_period_and_idles_in_between():
+    policy = NumpyPolicy(str(WEIGHTS), step_length_s=0.2, action_space=MetaAction().space)
+    decisions = [policy.act(shown) for shown in scenes(25)]
+    assert all(decision == 1 for number, decision in enumerate(decisions) if number % 5)
+    assert any(decision != 1 for decision in decisions[::5])
+
+
+def test_by_target_speed_it_never_leaves_the_leftmost_lane_to_the_left():
+    policy = NumpyPolicy(str(WEIGHTS), action_space=SpeedAndLaneChange().space)
+    for shown in scenes(60, seed=3):
+        shown[0, 2] = 0.0
+        speed, change = policy.act(shown)
+        assert speed in (20.0, 25.0, 30.0)
+        assert change != 1
+
+
+@pytest.mark.parametrize(
+    ("path", "says"), [("no/such.npz", "no weights"), ("text.npz", "no weights"), ("other.npz", "no weights")]
+)
+def test_a_file_without_weights_is_said_to_be_one(tmp_path, path, says):
+    (tmp_path / "text.npz").write_text("hello")
+    np.savez(tmp_path / "other.npz", something=np.zeros(3))
+    with pytest.raises(ValueError, match=says):
+        NumpyPolicy(str(tmp_path / path))
+
+
+def test_the_weights_of_a_scenario_lie_beside_it_and_are_named_by_their_path():
+    for name in ("highway-policy", "motorway"):
+        default = load_scenario(name).agents["ego"].arguments["path"].default
+        assert Path(default).resolve() == WEIGHTS.resolve()
+
+
+@pytest.fixture
+def linear(tmp_path):
+    """A network of one layer as an ONNX model, and its weights."""
+    onnx = pytest.importorskip("onnx")
+    rng = np.random.default_rng(1)
+    weights = rng.normal(size=(56, 5)).astype(np.float32)
+
+    def save(matrix, path):
+        graph = onnx.helper.make_graph(
+            [onnx.helper.make_node("MatMul", ["seen", "weights"], ["values"])],
+            "policy",
+            [onnx.helper.make_tensor_value_info("seen", onnx.TensorProto.FLOAT, [1, 56])],
+            [onnx.helper.make_tensor_value_info("values", onnx.TensorProto.FLOAT, [1, matrix.shape[1]])],
+            [onnx.numpy_helper.from_array(matrix, "weights")],
+        )
+        model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=9)
+        onnx.save(model, path)
+        return str(path)
+
+    return weights, save(weights, tmp_path / "policy.onnx"), save(weights[:, :2] * 9, tmp_path / "steering.onnx")
+
+
+class TestOnnxPolicy(_Policy):
+    @pytest.fixture
+    def make(self, linear, form):
+        return lambda: OnnxPolicy(linear[1], action_space=form.space)
+
+    def test_it_takes_the_greatest_value(self, make, linear, observations):
+        agent = make()
+        agent.reset(1)
+        assert [agent.act(seen) for seen in observations] == [
+            int((seen.ravel() @ linear[0]).argmax()) for seen in observations
+        ]
+
+
+class TestOnnxPolicyThatSteers(_Policy):
+    @pytest.fixture
+    def form(self):
+        return action_form(BOX)
+
+    @pytest.fixture
+    def make(self, linear):
+        return lambda: OnnxPolicy(linear[2], action_space=BOX)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of torch.jit, whose files still are around
+class TestTorchPolicy(_Policy):
+    @pytest.fixture(params=["pt", "pt2"])
+    def make(self, request, tmp_path, form):
+        torch = pytest.importorskip("torch")
+        torch.manual_seed(0)
+        module = torch.nn.Sequential(torch.nn.Linear(56, 8), torch.nn.ReLU(), torch.nn.Linear(8, 5)).eval()
+        path = tmp_path / f"policy.{request.param}"
+        if request.param == "pt2":
+            torch.export.save(torch.export.export(module, (torch.zeros(1, 56),)), path)
+        else:
+            torch.jit.trace(module, torch.zeros(1, 56)).save(str(path))
+        return lambda: TorchPolicy(str(path), action_space=form.space)
+
+
+class TestStableBaselines3(_Policy):
+    @pytest.fixture(params=["PPO", "DQN"])
+    def make(self, request, tmp_path, form):
+        library = pytest.importorskip("stable_baselines3")
+        gymnasium = pytest.importorskip("gymnasium")
+
+        class Nothing(gymnasium.Env):
+            observation_space = spaces.Box(-1e6, 1e6, (8, 7), np.float32)
+            action_space = form.space
+
+        model = getattr(library, request.param)("MlpPolicy", Nothing(), seed=1, device="cpu")
+        model.save(tmp_path / "model.zip")
+        space = Nothing.observation_space
+        return lambda: StableBaselines3(str(tmp_path / "model.zip"), algorithm=request.param, observation_space=space)
+
+    def test_a_model_of_other_observations_is_refused(self, make, request, tmp_path):
+        make()
+        algorithm = request.node.callspec.params["make"]
+        other = spaces.Box(-1.0, 1.0, (3,), np.float32)
+        with pytest.raises(ValueError, match="was trained on"):
+            StableBaselines3(str(tmp_path / "model.zip"), algorithm=algorithm, observation_space=other)
+
+
+@pytest.mark.parametrize("kind", [StableBaselines3, TorchPolicy, OnnxPolicy])
+def test_what_is_not_installed_or_not_there_is_said(kind, tmp_path, monkeypatch):
+    library = {"StableBaselines3": "stable_baselines3", "TorchPolicy": "torch", "OnnxPolicy": "onnxruntime"}[
+        kind.__name__
+    ]
+    if library in sys.modules or kind is OnnxPolicy:
+        with pytest.raises(ValueError, match="there is no file"):
+            kind(str(tmp_path / "no.zip"))
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ValueError, match="pip install 'crashhunt"):
+        kind(str(tmp_path / "no.zip"))
+
+
+def test_an_algorithm_that_nobody_knows_is_refused():
+    with pytest.raises(ValueError, match="none of PPO"):
+        StableBaselines3("x.zip", algorithm="POP")
