@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-__all__ = ["environment", "environment_changes", "versions"]
+__all__ = ["environment", "environment_changes", "processor", "versions"]
 
 _VERSIONED = ("crashhunt", "libsumo", "gymnasium", "numpy", "highway-env")
 _VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "SUMO_HOME", "OMP_NUM_THREADS", "VIRTUAL_ENV")
@@ -31,7 +31,7 @@ def environment() -> dict[str, Any]:
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "cpu": _cpu(),
+        "cpu": processor(),
         "versions": versions(),
         "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
         "loaded": sorted(loaded, key=str.lower),
@@ -73,7 +73,8 @@ def environment_changes(recorded: dict[str, Any]) -> dict[str, tuple[str, str]]:
     return changes
 
 
-def _cpu() -> str:
+def processor() -> str:
+    """Return the model of the processor; NumPy rounds otherwise on some than on others."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.errors import CrashhuntError
 from crashhunt.plugins import locate, registered, signature_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.space import without_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -82,7 +83,11 @@ def _table(indent: str, arguments: list[dict[str, Any]]) -> list[str]:
         (
             entry["name"],
             entry["range"] or "",
-            f"default {entry['default']}" if entry["default"] is not None else "required" if not entry["range"] else "",
+            f"default {without_folder(entry['default'])}"
+            if entry["default"] is not None
+            else "required"
+            if not entry["range"]
+            else "",
             entry["unit"],
             entry["help"],
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.edits import edited_spec
-from crashhunt.environment import environment_changes
+from crashhunt.environment import environment_changes, processor
 from crashhunt.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, FreshProcessExecutor, WorkerSettings, scratch_of
 from crashhunt.plan import with_settings
@@ -205,6 +205,9 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     changed = environment_changes(snapshot.environment())
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in changed.items()]
     settings = read_settings(bundle.hunt / "hunt.toml")
+    then, now = snapshot.environment().get("cpu", ""), processor()
+    if snapshot.scenario().highway is not None and then != now:
+        warnings.append(f"the processor was {then!r} and is {now!r}, on which NumPy may round otherwise")
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
     scenario = with_settings(snapshot.scenario(), settings)
     if code == "log":
@@ -224,7 +227,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         if code == "log":
             message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
             raise UsageError(message, fix="leave --scenario or --from-log out")
-        scenario, spec = _elsewhere(options.scenario, scenario, spec)
+        scenario, spec = _elsewhere(options.scenario, scenario, spec, recorded.prologue.step_length_s)
         edits.append(f"the scenario was {settings.scenario} and is {options.scenario}")
     worker = WorkerSettings(
         scenario=scenario,
@@ -241,20 +244,24 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     return Rerun(bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere)
 
 
-def _elsewhere(name: str, scenario: Scenario, spec: TrialSpec) -> tuple[Scenario, TrialSpec]:
-    """The same agents, arguments and seed in another scenario; its traffic is its own but for what both have."""
+def _elsewhere(name: str, scenario: Scenario, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
+    """The same agents, arguments, seed and simulation time elsewhere; the traffic is its own but for what both have."""
     other = load_scenario(name)
     if len(other.agents) != len(scenario.agents):
-        there, here = len(other.agents), len(scenario.agents)
-        message = f"--scenario {name!r} has {there} controlled vehicles, and the crash has {here}"
+        counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(scenario.agents)}"
+        message = f"--scenario {name!r} has {counts}"
         raise UsageError(message, fix="give one with as many")
     ids = dict(zip(scenario.agents, other.agents, strict=True))
     drivers = {ids[agent]: setup.agent for agent, setup in scenario.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
+    there = other.step_length_s
+    if other.highway is not None:
+        there = 1.0 / other.highway.config.get("policy_frequency", 1)
     return other.with_agents(drivers), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
         scenario_arguments=argument_values(other) | shared,
+        max_steps=max(1, round(spec.max_steps * step_length_s / there)),
     )
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.errors import ArgumentError
@@ -35,6 +36,7 @@ __all__ = [
     "describe",
     "kind_of",
     "parse_spec",
+    "without_folder",
 ]
 
 Value = bool | int | float | str
@@ -183,6 +185,12 @@ class Argument:
     distribution: Distribution | None = None
     unit: str = ""
     help: str = ""
+
+
+def without_folder(value: object) -> str:
+    """Return a value for people, who know in which folder their weights are."""
+    text = str(value)
+    return f"…/{Path(text).name}" if Path(text).is_absolute() else text
 
 
 def kind_of(value: Value) -> Kind:

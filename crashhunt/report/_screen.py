@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from crashhunt.recording import Phase
+from crashhunt.space import without_folder
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
     from crashhunt.hunt import HuntStatus
+    from crashhunt.space import Value
     from crashhunt.trial import TrialResult
 
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
@@ -95,7 +97,13 @@ def format_arguments(result: TrialResult) -> str:
         for name, value in values.items()
     ]
     pairs += list(spec.scenario_arguments.items())
-    return " ".join(f"{name}={value:.4g}" if isinstance(value, float) else f"{name}={value}" for name, value in pairs)
+    return " ".join(f"{name}={_short(value)}" for name, value in pairs)
+
+
+def _short(value: Value) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return without_folder(value)
 
 
 def format_seconds(seconds: float) -> str:

@@ -297,8 +297,8 @@ class HighwaySimulator:
         points, headings, speeds = [], [], []
         for thing, actor in zip(things, self._roster.actors, strict=True):
             (x, y), heading, half = thing.position.tolist(), float(thing.heading), actor.length / 2
-            points.append((x + half * math.cos(heading), -(y + half * math.sin(heading))))
-            headings.append(-heading)
+            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # no minus zero
+            headings.append(0.0 - heading)
             speeds.append(float(thing.speed))
         contacts = tuple(self._contacts)
         lanes: tuple[str, ...] = ()

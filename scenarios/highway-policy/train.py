@@ -1,6 +1,6 @@
 """Trains the policy that this scenario hunts: deep Q-learning in highway-env, with Stable-Baselines3.
 
-python train.py [STEPS]   writes policy.npz beside this file; needs pip install 'crashhunt[sb3]' and about ten minutes.
+python train.py [STEPS]   writes policy.npz beside this file; needs pip install 'crashhunt[sb3]' and some five minutes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Motorway(gymnasium.Env):
 
 def main() -> None:
     """Train, and write the weights."""
-    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 150_000
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 60_000
     model = DQN(
         "MlpPolicy",
         Motorway(),

@@ -63,7 +63,7 @@ def test_every_command_does_what_it_says(shown):
             )
             assert done.returncode == 0, done.stderr
             assert re.search(r"'outcome': '\w+'|^[\d.]+ s: \[|13 crashes>", done.stdout), done.stdout
-    assert len(ran) == 16
+    assert len(ran) == 20
 
 
 def test_the_shown_scenario_is_valid(shown):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -150,6 +151,10 @@ def test_the_accelerator_changes_nothing_but_the_time(shell):
 def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
     shell.crashhunt("run", "h", "2", "20", "150", *words)
+    (facts,) = shell.folder.glob("h/snapshots/*/environment.json")
+    facts.write_text(json.dumps(json.loads(facts.read_text()) | {"cpu": "Abacus"}))
+    (warning,) = shell.crashhunt("replay", "h", "--json").json["warnings"]
+    assert "the processor was 'Abacus'" in warning
     done = shell.crashhunt("replay", "h", "--scenario", "motorway", expect=None)
     assert "the scenario was highway and is motorway" in done.out
     assert "it crashes there as well" in done.out or "no crash there" in done.out
