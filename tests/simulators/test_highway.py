@@ -44,7 +44,7 @@ def drive(simulator, meaning, steps, seed=1, options=None):
 
 @pytest.mark.parametrize("name", IDS)
 class TestEveryEnvironment(SimulatorContract):
-    steps = 6
+    steps = 4
 
     @pytest.fixture
     def make(self, tmp_path, name):
