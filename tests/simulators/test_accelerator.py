@@ -306,18 +306,21 @@ def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
 
 
 PATCHED = """
+import highway_env
+from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
-def clip_actions(self): ...
-Vehicle.clip_actions = clip_actions
+def mine(self, *words): ...
+{} = mine
 from crashhunt.simulators._accelerator import accelerate
 print(accelerate())
 """
 
 
-def test_it_steps_aside_where_somebody_else_has_replaced_a_method(tmp_path):
-    (tmp_path / "patched.py").write_text(PATCHED)
+@pytest.mark.parametrize("name", ["Vehicle.clip_actions", "AbstractLane.on_lane", "highway_env.utils.not_zero"])
+def test_it_steps_aside_where_somebody_else_has_replaced_a_method(tmp_path, name):
+    (tmp_path / "patched.py").write_text(PATCHED.format(name))
     done = subprocess.run([sys.executable, "patched.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "Vehicle.clip_actions has been replaced by" in done.stdout
+    assert f"{name.removeprefix('highway_env.utils.')} has been replaced by" in done.stdout
 
 
 def test_it_is_undone():

@@ -15,16 +15,15 @@ from highway_env.road.road import Road
 
 from crashhunt.simulators._accelerator._drive import decide
 from crashhunt.simulators._accelerator._frame import Frame
-from crashhunt.simulators._accelerator._known import reason_against
+from crashhunt.simulators._accelerator._known import reason_against, replaced
 from crashhunt.simulators._accelerator._move import collide, enforce, move
 from crashhunt.simulators._accelerator._network import Network
 from crashhunt.simulators._accelerator._observe import close_objects, fill_lanes, observe
 
-__all__ = ["accelerate", "decelerate", "original"]
+__all__ = ["accelerate", "decelerate"]
 
 _networks: WeakKeyDictionary[Any, Network] = WeakKeyDictionary()
 _frames: WeakKeyDictionary[Any, Frame] = WeakKeyDictionary()
-_originals: dict[str, Any] = {}
 
 
 def accelerate() -> str:
@@ -33,12 +32,12 @@ def accelerate() -> str:
     Returns:
         Why not; empty where it is faster now.
     """
-    if _originals:
+    if replaced:
         return ""
     reason = reason_against()
     if not reason:
         for owner, name, faster in _REPLACED:
-            _originals[name] = getattr(owner, name)
+            replaced[name] = getattr(owner, name)
             setattr(owner, name, faster)
     return reason
 
@@ -46,13 +45,8 @@ def accelerate() -> str:
 def decelerate() -> None:
     """Have highway-env as it was."""
     for owner, name, _ in _REPLACED:
-        if name in _originals:
-            setattr(owner, name, _originals.pop(name))
-
-
-def original(name: str) -> Any:
-    """Return a method as highway-env has it."""
-    return _originals[name]
+        if name in replaced:
+            setattr(owner, name, replaced.pop(name))
 
 
 def _network_of(road: Road) -> Network | None:
@@ -80,12 +74,12 @@ def _frame_of(road: Road) -> Frame | None:
 def _act(self: Road) -> None:
     frame = _frame_of(self) if len(self.vehicles) > 1 else None
     if frame is None or not decide(self, frame):
-        _originals["act"](self)
+        replaced["act"](self)
 
 
 def _step(self: Road, dt: float) -> None:
     if len(self.vehicles) + len(self.objects) < 2:
-        _originals["step"](self, dt)
+        replaced["step"](self, dt)
         return
     network = _network_of(self)
     frame = move(self, network, dt) if network is not None else None
@@ -105,7 +99,7 @@ def _neighbour_vehicles(self: Road, vehicle: Any, lane_index: Any = None) -> Any
         found = frame.neighbours(vehicle, row, key)
         if found is not None:
             return found
-    return _originals["neighbour_vehicles"](self, vehicle, lane_index)
+    return replaced["neighbour_vehicles"](self, vehicle, lane_index)
 
 
 def _close_objects_to(
@@ -124,12 +118,12 @@ def _close_objects_to(
         )
         if found is not None:
             return found
-    return _originals["close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
+    return replaced["close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
     if type(self) is not RegulatedRoad or not enforce(self):
-        _originals["enforce_road_rules"](self)
+        replaced["enforce_road_rules"](self)
 
 
 def _observe(self: KinematicObservation) -> Any:
@@ -138,7 +132,7 @@ def _observe(self: KinematicObservation) -> Any:
         found = observe(self, _frame_of(road))
         if found is not None:
             return found
-    return _originals["observe"](self)
+    return replaced["observe"](self)
 
 
 def _fill_road_layer_by_lanes(
@@ -148,7 +142,7 @@ def _fill_road_layer_by_lanes(
     if network is not None and type(self) is OccupancyGridObservation:
         fill_lanes(self, network, layer_index, lane_perception_distance)
     else:
-        _originals["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
+        replaced["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
 _REPLACED: tuple[tuple[Any, str, Any], ...] = (

@@ -15,7 +15,7 @@ from highway_env.utils import not_zero
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.simulators._accelerator._known import kind_of
+from crashhunt.simulators._accelerator._known import kind_of, replaced
 from crashhunt.simulators._accelerator._network import wrap_to_pi
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["decide"]
 
 _STEERING = attrgetter("speed", "heading", "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "LENGTH", "MAX_STEERING_ANGLE")
-_FOLLOWING = attrgetter("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DELTA", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX")
+_FOLLOWING = attrgetter("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DELTA", "DISTANCE_WANTED", "TIME_WANTED")
 
 
 def decide(road: Road, frame: Frame) -> bool:
@@ -99,7 +99,7 @@ class _Decisions:
     def _neighbours(self, row: int, vehicle: Any, key: Any) -> Any:
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
-            found = _original_neighbours(self.road, vehicle, key)
+            found = replaced["neighbour_vehicles"](self.road, vehicle, key)
         return found
 
     def _follow_road(self, row: int, vehicle: Any) -> None:
@@ -192,7 +192,7 @@ class _Decisions:
     def _accelerate_all(self, following: list[tuple[int, Any, Any]]) -> list[float]:
         """The same for many who follow for themselves."""
         table = np.array([_FOLLOWING(vehicle) for _, vehicle, _ in following], float).T
-        comfort, braking, delta, distance_wanted, time_wanted, _ = table
+        comfort, braking, delta, distance_wanted, time_wanted = table
         rows = np.array([row for row, _, _ in following])
         speed = self.speeds[rows]
         target = np.array([not_zero(_target_speed(vehicle)) for _, vehicle, _ in following], float)
@@ -249,9 +249,3 @@ def _target_speed(vehicle: Any) -> float:
 def _clip(value: float, low: float, high: float) -> float:
     """`numpy.clip` of one number; what is not a number stays so."""
     return float(low if value < low else high if value > high else value)
-
-
-def _original_neighbours(road: Road, vehicle: Any, key: Any) -> Any:
-    from crashhunt.simulators._accelerator import original
-
-    return original("neighbour_vehicles")(road, vehicle, key)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import inspect
 import logging
+import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import highway_env
 import numpy as np
@@ -17,19 +18,14 @@ from highway_env.vehicle import behavior, controller, kinematics, objects
 
 from crashhunt.simulators._versions import ACCELERATED
 
-__all__ = ["Kind", "kind_of", "reason_against"]
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["Kind", "kind_of", "reason_against", "replaced"]
 
 _MODULES = (utils, observation, lane, regulation, road, behavior, controller, kinematics, objects)
 
-_COLLIDES: tuple[str, ...] = (
-    "handle_collisions",
-    "_is_colliding",
-    "polygon",
-    "direction",
-    "velocity",
-    "lane_distance_to",
-)
-_COLLIDES += ("front_distance_to", "on_road")
+_COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
 _MOVES = ("step", "clip_actions", "on_state_update")
 _DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
 _DRIVES += ("change_lane_policy", "mobil")
@@ -49,6 +45,10 @@ _ORIGINALS = {
     for owner in _BASES
     for name in (*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES)
 }
+
+
+replaced: dict[str, Any] = {}
+"""The methods of highway-env that are replaced at the moment, by name; nothing where it is as it was."""
 
 
 class Kind:
@@ -115,18 +115,29 @@ def reason_against() -> str:
         digest.update(Path(str(module.__file__)).read_bytes())
     if digest.hexdigest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
-    for (owner, name), original in _ORIGINALS.items():
-        function = getattr(original, "fget", original)
-        function = getattr(function, "__func__", function)
-        code = getattr(function, "__code__", None)
-        if code is not None and code.co_filename not in _FILES:
-            return f"{owner.__name__}.{name} has been replaced by {code.co_filename}"
+    for name, function in _functions():
+        place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
+        if place not in _FILES:
+            return f"{name} has been replaced by {place}"
     if not _arrays_equal_scalars():
         return "NumPy's functions give other results for arrays than for single numbers on this processor"
     return ""
 
 
 _FILES = {str(module.__file__) for module in _MODULES}
+
+
+def _functions() -> Iterator[tuple[str, Any]]:
+    """All functions and methods that the sources of the modules define, by name, as they are now."""
+    for module in _MODULES:
+        source = Path(str(module.__file__)).read_text(encoding="utf-8")
+        for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE):
+            owner = getattr(module, name)
+            members = vars(owner).items() if kind == "class" else [("", owner)]
+            for member, found in members:
+                function = getattr(found, "fget", None) or getattr(found, "__func__", found)
+                if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
+                    yield f"{name}.{member}".rstrip("."), inspect.unwrap(function)
 
 
 def _arrays_equal_scalars() -> bool:
