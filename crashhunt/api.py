@@ -160,6 +160,8 @@ def replay(
     changes: Mapping[str, Spec] | None = None,
     times: int = 1,
     force: bool = False,
+    scenario: str | Path = "",
+    accelerate: bool = True,
 ) -> ReplayReport:
     """Run a saved crash again in a fresh process, as ``crashhunt replay`` does.
 
@@ -170,6 +172,8 @@ def replay(
         changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
         times: how often.
         force: replay even from a snapshot that is damaged.
+        scenario: the name or path of another scenario in which the same agents drive, on another simulator too.
+        accelerate: speed simulators up where that changes no bit.
 
     Returns:
         The verdict, and everything behind it.
@@ -179,7 +183,10 @@ def replay(
     """
     bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
     edits = {name: _spec(value) for name, value in (changes or {}).items()}
-    return _replay(bundle, ReplayOptions(code=code, changes=edits, times=times, force=force))
+    options = ReplayOptions(
+        code=code, changes=edits, times=times, force=force, scenario=str(scenario), accelerate=accelerate
+    )
+    return _replay(bundle, options)
 
 
 def _locator(who: str | type | Callable[..., Any]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import crashhunt
 from crashhunt.scenario import shipped_scenarios
 
 SEEDS = {"merge": 3, "intersection": 3}  # with which a crash comes soon
@@ -163,6 +164,7 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     told = shell.crashhunt("replay", "h", "--scenario", "motorway", "--json", expect=None).json
     assert told["verdict"] in ("changed", "fixed")
     assert told["divergence"] is None
+    assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
     for more, says in (("--from-log", "recorded actions belong"), ("--scenario=loop-two-agents", "2 controlled")):
         refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
         assert says in refused.err
