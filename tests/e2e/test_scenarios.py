@@ -1,4 +1,4 @@
-"""Every shipped scenario has a crash, and everything that is done with a crash works on it; on an environment too."""
+"""Every shipped scenario has a crash, which is replayed and filmed; on some, all else is done with it too."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEEDS = {"merge": 3, "intersection": 3}  # with which a crash comes soon
 
 
 @pytest.mark.parametrize("scenario", sorted(shipped_scenarios()))
-def test_a_crash_of_it_is_found_replayed_shown_filmed_and_handed_on(shell, scenario):
+def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
     seed = str(SEEDS.get(scenario, 1))
     words = ("--scenario", scenario, "--seed", seed, "--deterministic")
     found = shell.crashhunt("run", "h", "2", "400", "1500", *words, "--json").json
@@ -24,13 +24,14 @@ def test_a_crash_of_it_is_found_replayed_shown_filmed_and_handed_on(shell, scena
     whole = scenario in ("loop", "loop-two-agents", "highway", "intersection-two-agents")
     for who in ((), ("--code", "current"), ("--from-log",)) if whole else ((),):
         assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
-    shell.crashhunt("export", "h", "crash.zip")
-    if whole:
-        assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
-    told = shell.crashhunt("show", "h").out
-    assert f"step {crash['step']}" in told
-    written = shell.crashhunt("replay", "h", "--frames", "f", "--last-seconds", "1", "--size", "160x120", "--json").json
+    frames = ("--frames", "f", "--last-seconds", "1", "--size", "160x120", "--json")
+    written = shell.crashhunt("replay", "h", *frames).json
     assert written["written"]["f"] in (21, 16, 12)  # steps of 0.1, 0.2 and 1 s, and the last one again
+    if not whole:
+        return
+    shell.crashhunt("export", "h", "crash.zip")
+    assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
+    assert f"step {crash['step']}" in shell.crashhunt("show", "h").out
     shell.crashhunt("report", "h")
     assert crash["id"] in (shell.folder / "h/report.html").read_text(encoding="utf-8")
 
