@@ -103,7 +103,8 @@ class NumpyPolicy:
         """Show the values."""
         from crashhunt import render
 
-        return {"values": render.Bar(dict(zip(_MEANINGS, self.values.tolist(), strict=True)))}
+        names = [name.removeprefix("LANE_") for name in _MEANINGS]
+        return {"values": render.Bar(dict(zip(names, self.values.tolist(), strict=True)))}
 
     def _continuous(self, decision: str, observation: NDArray[np.float32]) -> tuple[float, int]:
         speed = float(observation[0, VX])
