@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import subprocess
 import sys
+import weakref
 
 import gymnasium
 import highway_env
@@ -355,3 +357,20 @@ def test_highway_envs_own_tests_pass_with_it(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:]
     assert "165 passed" in done.stdout
+
+
+def test_roads_of_earlier_episodes_are_forgotten():
+    assert accelerate() == ""
+    gone = []
+    for seed in range(40):
+        env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
+        env.reset(seed=seed)
+        env.step(1)
+        gone.append(weakref.ref(env.road))
+        env.close()
+        del env
+    gc.collect()
+    assert sum(road() is not None for road in gone) <= 16
+    decelerate()
+    gc.collect()
+    assert not any(road() is not None for road in gone)

@@ -7,7 +7,6 @@ know, such as a class that overrides what it speeds up, is left to highway-env's
 from __future__ import annotations
 
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
 from highway_env.road.regulation import RegulatedRoad
@@ -22,8 +21,8 @@ from crashhunt.simulators._accelerator._observe import close_objects, fill_lanes
 
 __all__ = ["accelerate", "decelerate"]
 
-_networks: WeakKeyDictionary[Any, Network] = WeakKeyDictionary()
-_frames: WeakKeyDictionary[Any, Frame] = WeakKeyDictionary()
+_ROADS = 16  # that are remembered: those of several environments in one process
+_roads: dict[int, _Prepared] = {}
 
 
 def accelerate() -> str:
@@ -44,31 +43,46 @@ def accelerate() -> str:
 
 def decelerate() -> None:
     """Have highway-env as it was."""
+    _roads.clear()
     for owner, name, _ in _REPLACED:
         if name in replaced:
             setattr(owner, name, replaced.pop(name))
 
 
-def _network_of(road: Road) -> Network | None:
-    """The network of a road, prepared; None where it has lanes that are not known."""
+class _Prepared:
+    """What is computed once for a road: its network, and where everybody is."""
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+        self.network = Network(road.network)
+        self.frame: Frame | None = None
+
+
+def _prepared(road: Road) -> _Prepared | None:
+    """What is known about a road; None where it has lanes that are not known."""
     if type(road) not in (Road, RegulatedRoad):
         return None
-    found = _networks.get(road)
-    if found is None or not found.is_of(road.network):
-        found = _networks[road] = Network(road.network)
-        _frames.pop(road, None)
-    return found if found.plain else None
+    found = _roads.get(id(road))
+    if found is None or found.road is not road or not found.network.is_of(road.network):
+        found = _roads[id(road)] = _Prepared(road)
+        while len(_roads) > _ROADS:  # an episode has one road, which nobody needs afterwards
+            del _roads[next(iter(_roads))]
+    return found if found.network.plain else None
+
+
+def _network_of(road: Road) -> Network | None:
+    found = _prepared(road)
+    return found.network if found is not None else None
 
 
 def _frame_of(road: Road) -> Frame | None:
     """Where everybody is on a road now."""
-    network = _network_of(road)
-    if network is None:
+    found = _prepared(road)
+    if found is None:
         return None
-    found = _frames.get(road)
-    if found is None or found.network is not network or not found.is_of(road):
-        found = _frames[road] = Frame(network, road)
-    return found
+    if found.frame is None or not found.frame.is_of(road):
+        found.frame = Frame(found.network, road)
+    return found.frame
 
 
 def _act(self: Road) -> None:
@@ -81,10 +95,10 @@ def _step(self: Road, dt: float) -> None:
     if len(self.vehicles) + len(self.objects) < 2:
         replaced["step"](self, dt)
         return
-    network = _network_of(self)
-    frame = move(self, network, dt) if network is not None else None
-    if frame is not None:
-        _frames[self] = frame
+    found = _prepared(self)
+    frame = move(self, found.network, dt) if found is not None else None
+    if found is not None and frame is not None:
+        found.frame = frame
     else:
         for vehicle in self.vehicles:
             vehicle.step(dt)
