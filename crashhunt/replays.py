@@ -256,7 +256,8 @@ def _elsewhere(name: str, scenario: Scenario, spec: TrialSpec, step_length_s: fl
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.step_length_s
     if other.highway is not None:
-        there = 1.0 / other.highway.config.get("policy_frequency", 1)
+        rate = other.highway.config.get("policy_frequency")  # where it is not said, it is once a second in most
+        there = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
     return other.with_agents(drivers), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},

@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 _STEP_LENGTH_S = 0.1
+_TABLES = {"sumo": "net and routes", "highway": "the id of the environment", "gym": "the id of the environment"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,9 +243,6 @@ def _check(scenario: Scenario, where: str) -> None:
         raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
 
 
-_TABLES = {"sumo": "net and routes", "highway": "the id of the environment", "gym": "the id of the environment"}
-
-
 def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:
     for option in sumo.options:
         if option in RESERVED:
@@ -279,6 +277,10 @@ def _check_environment(scenario: Scenario, where: str) -> None:
             value = getattr(setup, item.name)
             if item.name not in ("agent", "arguments") and value != getattr(plain, item.name):
                 _refuse(where, f"agents.{agent}.{item.name}", value, "is for SUMO", "remove it")
+    for item in fields(Scenario):
+        value = getattr(scenario, item.name)
+        if item.name in ("warmup_s", "insertion_timeout_s") and value != item.default:
+            _refuse(where, item.name, value, "is for SUMO", "remove it")
     if scenario.highway is not None and scenario.step_length_s != _STEP_LENGTH_S:
         fix = "set policy_frequency in highway.config"
         _refuse(where, "step_length_s", scenario.step_length_s, "is not for highway-env", fix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -52,12 +53,12 @@ class NumpyPolicy:
         try:
             with np.load(Path(path), allow_pickle=False) as file:
                 data = {name: file[name] for name in file.files}
-            count = sum(name.startswith("weight_") for name in data)
+            count = max(1, sum(name.startswith("weight_") for name in data))
             self._layers = [(data[f"weight_{n}"], data[f"bias_{n}"]) for n in range(count)]
             self._rows, self._columns, self._scale = int(data["rows"]), data["columns"], data["scale"]
             self._target_speeds = data["target_speeds"].tolist()
             self._hold = max(1, round(float(data["period_s"]) / step_length_s))
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise ValueError(f"{path!r} has no weights of a policy: {error}") from error
         self.reset(0)
 

@@ -147,6 +147,11 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
         "--until": options.until is not None,
         "--before": options.before is not None,
     }
+    if options.scenario:
+        for name in [
+            name for name, given in {**look, "--print": options.fields, "a film": film is not None}.items() if given
+        ]:
+            raise UsageError(f"--scenario: {name} is for the scenario of the crash", fix="leave one of the two out")
     if film is not None and options.from_log:
         look |= {"--print": options.fields, "--set": options.sets, "--times": options.times != 1}
         for name in [name for name, given in look.items() if given]:

@@ -93,11 +93,13 @@ def test_by_target_speed_it_never_leaves_the_leftmost_lane_to_the_left():
 
 
 @pytest.mark.parametrize(
-    ("path", "says"), [("no/such.npz", "no weights"), ("text.npz", "no weights"), ("other.npz", "no weights")]
+    ("path", "says"),
+    [("no/such.npz", "no weights"), ("text.npz", "no weights"), ("other.npz", "no weights"), ("cut.npz", "no weights")],
 )
 def test_a_file_without_weights_is_said_to_be_one(tmp_path, path, says):
     (tmp_path / "text.npz").write_text("hello")
     np.savez(tmp_path / "other.npz", something=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes(WEIGHTS.read_bytes()[:5000])
     with pytest.raises(ValueError, match=says):
         NumpyPolicy(str(tmp_path / path))
 

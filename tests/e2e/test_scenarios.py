@@ -123,6 +123,7 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
         ('[highway]\nid = "highway-fast-v0"\nconfig = { vehicle_count = 3 }', "did you mean 'vehicles_count'"),
         ('[highway]\nid = "higway-v0"', "higway"),
         ('[highway]\nid = "highway-v0"\n[agents.ego]\nroute = "r"', "agents.ego.route = 'r' is for SUMO"),
+        ('warmup_s = 5.0\n[highway]\nid = "highway-v0"', "warmup_s = 5.0 is for SUMO"),
         ('step_length_s = 0.5\n[highway]\nid = "highway-v0"', "policy_frequency"),
         ('[sumo]\nnet = "x.net.xml"', "add a table [highway]"),
     ],
@@ -166,7 +167,12 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     assert told["verdict"] in ("changed", "fixed")
     assert told["divergence"] is None
     assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
-    for more, says in (("--from-log", "recorded actions belong"), ("--scenario=loop-two-agents", "2 controlled")):
+    for more, says in (
+        ("--from-log", "recorded actions belong"),
+        ("--scenario=loop-two-agents", "2 controlled"),
+        ("--frames=f", "a film is for the scenario of the crash"),
+        ("--until=3", "--until is for the scenario of the crash"),
+    ):
         refused = shell.crashhunt("replay", "h", "--scenario", "motorway", more, expect=2)
         assert says in refused.err
 

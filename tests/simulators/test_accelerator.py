@@ -302,6 +302,11 @@ def test_it_steps_aside_for_a_changed_installation(monkeypatch):
     assert "not the published one" in reason_against()
 
 
+def test_it_steps_aside_for_an_older_numpy(monkeypatch):
+    monkeypatch.delattr(np, "vecdot")
+    assert "needs NumPy 2.0" in accelerate()
+
+
 def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
     monkeypatch.setattr(_known, "_arrays_equal_scalars", lambda: False)
     assert "on this processor" in accelerate()

@@ -119,6 +119,8 @@ def reason_against() -> str:
         place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
         if place not in _FILES:
             return f"{name} has been replaced by {place}"
+    if not hasattr(np, "vecdot"):
+        return f"it needs NumPy 2.0, and {np.__version__} is installed"
     if not _arrays_equal_scalars():
         return "NumPy's functions give other results for arrays than for single numbers on this processor"
     return ""
