@@ -257,13 +257,14 @@ class Hunt:
 
     def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
         """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
+        trial = scratch_of(self._place.scratch, result.spec.number)
         bundle = write_bundle(
             self.directory,
             result,
-            scratch_of(self._place.scratch, result.spec.number),
+            trial,
             hunt_seed=self.settings.seed,
             snapshot=snapshot.digest,
-            lanes=read_map(self._place.scratch),
+            lanes=read_map(self._place.scratch, trial),
         )
         progress.crashes.append(bundle)
         ledger.record(result, snapshot=snapshot.digest)

@@ -13,6 +13,7 @@ import shutil
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from crashhunt.simulators import Simulator
@@ -73,6 +75,7 @@ class Worker:
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
         self._folder: Path | None = None
+        self._lanes: Sequence[Lane] | None = None  # of the map that all workers share
         self._fresh = 0
         _die_with_parent()
         # Ctrl-C reaches the whole terminal; the hunt decides what becomes of its workers. A request to end must work
@@ -109,9 +112,9 @@ class Worker:
             crash_on=self._settings.crash_on,
         )
         faulthandler.cancel_dump_traceback_later()
-        if result.outcome is not Outcome.INVALID:
-            self._draw_map(simulator)
         kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
+        if result.outcome is not Outcome.INVALID:
+            self._draw_map(simulator, folder if kept else None)
         failure = result.failure and replace(result.failure, last_output=read_tail(folder / OUTPUT))
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         result = replace(result, worker=os.getpid(), kept=kept, wall_s=wall_s, setup_s=setup_s, failure=failure)
@@ -122,15 +125,24 @@ class Worker:
                 (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return result
 
-    def _draw_map(self, simulator: Simulator) -> None:
-        """Write the map down, once for all workers, so that whoever keeps a trial can show it."""
+    def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
+        """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""
         path = self._settings.scratch / MAP
-        lanes = getattr(simulator, "lanes", None)
-        if lanes is None or path.exists():
+        draw = getattr(simulator, "lanes", None)
+        if draw is None or (path.exists() and kept is None):
             return
-        temporary = path.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes()]), encoding="utf-8")
-        temporary.replace(path)
+        lanes = draw()
+        if lanes is self._lanes:  # of a simulator whose map is always the same
+            return
+        text = json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes])
+        if not path.exists():
+            temporary = path.with_suffix(f".{os.getpid()}")
+            temporary.write_text(text, encoding="utf-8")
+            temporary.replace(path)
+        elif kept is not None and path.read_text(encoding="utf-8") != text:
+            (kept / MAP).write_text(text, encoding="utf-8")
+            return
+        self._lanes = lanes
 
     def _prepare(self, spec: TrialSpec) -> tuple[BlackBox, Path]:
         """Give the trial its scratch folder: that of the last one, whose pages are warm, or a new one."""
@@ -161,13 +173,13 @@ class Worker:
         return self._box, folder
 
 
-def read_map(scratch: Path) -> list[Lane]:
-    """Return the map that the workers of a hunt have written down; nothing where none has."""
-    try:
-        data = json.loads((scratch / MAP).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
-    return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+def read_map(scratch: Path, trial: Path) -> list[Lane]:
+    """Return the map of a trial that is kept, or that of its hunt; nothing where none has been written down."""
+    for folder in (trial, scratch):
+        with suppress(OSError, ValueError):
+            data = json.loads((folder / MAP).read_text(encoding="utf-8"))
+            return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+    return []
 
 
 def read_tail(path: Path) -> str:

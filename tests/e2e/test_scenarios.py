@@ -6,9 +6,11 @@ import json
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import crashhunt
+from crashhunt.recording import read_lanes
 from crashhunt.scenario import shipped_scenarios
 
 SEEDS = {"merge": 3, "intersection": 3}  # with which a crash comes soon
@@ -198,3 +200,32 @@ def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
     assert isinstance(scenario, Scenario)
     with pytest.raises(UsageError, match=says):
         refuse_side_effects(scenario, settings)
+
+
+WIDER = """
+simulator = "highway"
+[highway]
+id = "roundabout-generic-v1"
+config = { policy_frequency = 5 }
+[observation]
+vehicles = 6
+[arguments.radius]
+default = 20.0
+range = "16:40"
+option = "roundabout_radius"
+[agents.ego]
+agent = "keep-lane"
+"""
+
+
+def test_every_crash_has_the_map_of_its_own_trial(shell):
+    """An argument may change the road; what is drawn is the road that was driven."""
+    (shell.folder / "scenario.toml").write_text(WIDER)
+    words = ("--scenario", ".", "--seed", "1", "--keep-going")
+    found = shell.crashhunt("run", "h", "2", "12", "100", *words, "--json").json["crashes"]
+    assert len(found) >= 3
+    for crash in found:
+        lanes = read_lanes(shell.folder / crash["path"] / "log.mcap")
+        rings = [np.hypot(*np.concatenate(borders).T) for borders in lanes]
+        inner = min(distances.max() for distances in rings if np.ptp(distances) < 5)
+        assert inner == pytest.approx(crash["scenario_arguments"]["radius"] + 2, abs=0.5)
