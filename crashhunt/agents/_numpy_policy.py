@@ -51,7 +51,8 @@ class NumpyPolicy:
         check_layout(observation_space)
         self._meta = meta_actions(action_space)
         try:
-            with np.load(Path(path), allow_pickle=False) as file:
+            # Opened here: NumPy would leave a broken file open.
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 data = {name: file[name] for name in file.files}
             count = max(1, sum(name.startswith("weight_") for name in data))
             self._layers = [(data[f"weight_{n}"], data[f"bias_{n}"]) for n in range(count)]

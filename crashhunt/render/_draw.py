@@ -32,6 +32,7 @@ PAPER, INK, FAINT, GRID = (255, 255, 255), (27, 36, 48), (93, 107, 125), (217, 2
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (90, 90, 90))
 _LONGEST = 80  # characters of a name
+_NEAREST = 1e-100  # what is closer is one place
 # Nine points of viridis (S. van der Walt, N. Smith), between which is interpolated.
 _VIRIDIS = (
     (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
@@ -64,7 +65,7 @@ def map_colors(values: NDArray[np.float64], low: float, high: float) -> NDArray[
 
 def span_of(low: float, high: float) -> float:
     """Return how far apart two limits are; 1 where they are not."""
-    return high - low if high - low > 1e-100 else 1.0
+    return high - low if high - low > _NEAREST else 1.0
 
 
 def number(value: float) -> str:
@@ -75,7 +76,7 @@ def number(value: float) -> str:
 @lru_cache(maxsize=256)
 def ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
     """Return round numbers between two limits."""
-    if not high - low > max(abs(low), abs(high)) * 1e-12:  # as far as floats can tell
+    if not high - low > max(_NEAREST, abs(low) * 1e-12, abs(high) * 1e-12):  # as far as floats can tell
         return (low,)
     raw = (high - low) / most
     power = 10.0 ** math.floor(math.log10(raw))
