@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.errors import BusyError, HuntDirectoryError
 from crashhunt.settings import HuntSettings, read_settings, write_settings
+from crashhunt.status import is_hunt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,9 +22,7 @@ __all__ = ["HuntDirectory"]
 _DIFFERENCES_SHOWN = 4
 # What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
 _OWN = ("snapshots", "crashes", "trials", "ledger.sqlite", "ledger.sqlite-wal", "ledger.sqlite-shm", "hunt.toml")
-# What may be there before: of a run of a suite that is planned, or could not begin.
-_PLANNED = (".lock", ".scratch", "request.json", "run.log", "error.log", "ledger.sqlite", "ledger.sqlite-wal",
-            "ledger.sqlite-shm")  # fmt: skip
+_BEFORE = (".lock", ".scratch", ".hunt.")  # what may be there before: of a hunt that could not begin
 
 
 class HuntDirectory:
@@ -50,7 +49,8 @@ class HuntDirectory:
         """
         try:
             self.path.mkdir(exist_ok=True)
-            self._refuse_foreign()
+            if not (self.path / ".lock").exists():  # nothing is left behind in a folder of somebody else's
+                self._refuse_foreign()
             lock = (self.path / ".lock").open("a+")
         except OSError as error:
             raise self._unusable(error) from error
@@ -64,6 +64,7 @@ class HuntDirectory:
                     fix="wait for it, stop it, or choose another directory",
                     where=str(self.path),
                 ) from None
+            self._refuse_foreign()
             lock.truncate(0)
             lock.write(str(os.getpid()))
             lock.flush()
@@ -110,10 +111,8 @@ class HuntDirectory:
         return settings
 
     def _refuse_foreign(self) -> None:
-        if (self.path / "hunt.toml").exists():
-            return
-        foreign = sorted(path.name for path in self.path.iterdir() if path.name not in _PLANNED)
-        if foreign:
+        foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_BEFORE))
+        if foreign and not is_hunt(self.path):
             raise HuntDirectoryError(
                 f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
                 fix="give an empty or a new folder",

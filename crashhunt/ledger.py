@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.trial import TrialResult
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["Ledger", "has_begun"]
+__all__ = ["Ledger"]
 
 _VERSION = 1  # of the tables, as PRAGMA user_version
 _SCHEMA = """
@@ -41,17 +42,6 @@ CREATE TABLE IF NOT EXISTS hunt (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRI
 """
 
 
-def has_begun(path: Path) -> bool:
-    """Whether there is a ledger, and not only the file that is about to become one."""
-    try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
-            return database.execute("SELECT 1 FROM sqlite_schema").fetchone() is not None
-    except sqlite3.OperationalError:
-        return path.exists() and path.stat().st_size > 0
-    except sqlite3.DatabaseError:
-        return True  # something else is there, and whoever opens it is told
-
-
 class Ledger:
     """What happened in a hunt.
 
@@ -71,13 +61,13 @@ class Ledger:
                 fix="give the directory that crashhunt run was given",
             )
         try:
+            if not path.exists():
+                _create(path)
             self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
             if writable:
                 # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.execute("PRAGMA synchronous = NORMAL")
-                if not self._version() and not self._database.execute("SELECT 1 FROM sqlite_schema").fetchone():
-                    self._database.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {_VERSION}; COMMIT;")
             found = self._version()
             self._database.execute("SELECT count(*) FROM hunt").fetchone()
         except sqlite3.Error as error:
@@ -241,3 +231,10 @@ class Ledger:
             reason = "is not writable" if os.path.exists(self._path.parent) else "does not exist"  # noqa: PTH110
             return HuntDirectoryError(f"the folder {reason} ({text})", fix="choose another", where=where)
         return HuntDirectoryError(f"not a ledger of crashhunt ({text})", fix="choose another directory", where=where)
+
+
+def _create(path: Path) -> None:
+    """Make an empty ledger, as a whole: whoever sees the file can read it."""
+    path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
+    with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
+        database.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {_VERSION}; COMMIT;")

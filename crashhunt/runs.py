@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.directory import HuntDirectory
 from crashhunt.errors import BusyError, CrashhuntError, HuntDirectoryError
 from crashhunt.ledger import Ledger
 from crashhunt.plan import Request, plan, with_settings
@@ -220,7 +221,7 @@ def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, H
 
 def _fail(folder: Path, message: str, trace: str) -> None:
     """Write down why a hunt could not run."""
-    with suppress(CrashhuntError, OSError):
+    with suppress(CrashhuntError, OSError), HuntDirectory(folder).locked():  # where another runs, that one has the word
         (folder / "error.log").write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
         with closing(Ledger(folder / "ledger.sqlite", writable=True)) as ledger:
             if ledger.facts().get("state") != "error":

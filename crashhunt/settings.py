@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import tomllib
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.space import Distribution, Kind, parse_spec
 from crashhunt.trial import CRASHES, Outcome
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from crashhunt.samplers import Space
@@ -143,9 +143,8 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str]) -> No
     # No line break of an argument may end the comment.
     line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     text = f"# {line}\n{tomli_w.dumps(data)}"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_settings(path: Path) -> HuntSettings:

@@ -4,6 +4,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.ledger import Ledger, has_begun
+from crashhunt.ledger import Ledger
 from crashhunt.trial import ClosestApproach, Outcome, TrialResult, TrialSpec
 
 
@@ -61,17 +62,30 @@ def test_every_state_is_written_down(tmp_path):
     ledger.close()
 
 
-def test_a_file_that_is_about_to_become_a_ledger_is_none_yet(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    assert not has_begun(path)
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA journal_mode = WAL")
-    database.close()
-    assert not has_begun(path)
-    Ledger(path, writable=True).close()
-    assert has_begun(path)
-    path.write_bytes(b"nonsense" * 1000)
-    assert has_begun(path)
+def _read_when_there(folder, said):
+    said.put("ready")
+    wrong = []
+    for number in range(300):
+        path = folder / f"{number}.sqlite"
+        while not path.exists():
+            pass
+        try:
+            Ledger(path).close()
+        except HuntDirectoryError as error:
+            wrong.append(str(error))
+    said.put(wrong)
+
+
+def test_whoever_sees_a_ledger_can_read_it(tmp_path):
+    context = get_context("spawn")  # forking a process with threads is asking for it
+    said = context.Queue()
+    reader = context.Process(target=_read_when_there, args=(tmp_path, said))
+    reader.start()
+    assert said.get(timeout=60) == "ready"
+    for number in range(300):
+        Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
+    assert said.get(timeout=60) == []
+    reader.join()
 
 
 def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
