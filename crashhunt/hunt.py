@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.bundle import list_bundles, write_bundle, write_trial
 from crashhunt.directory import HuntDirectory
-from crashhunt.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
 from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_of
 from crashhunt.ledger import Ledger
 from crashhunt.plan import spec_of, with_settings
@@ -173,7 +173,6 @@ class Hunt:
             argument_files=snapshot.argument_files,
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
-            accelerate=run.accelerate,
         )
         waiting = iter(number for number in range(settings.trials) if number not in finished)
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))
@@ -214,6 +213,9 @@ class Hunt:
                 lowest = min(progress.found)
                 self._save(progress.found[lowest], ledger, snapshot, progress)
                 return "crash"
+        except ScenarioError as error:  # of which file is for somebody who wants to mend it
+            mine, theirs = worker_settings.scenario.origin, self.scenario.origin
+            raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
             executor.close()
         if self._interrupted:

@@ -30,7 +30,7 @@ class ArgumentSetup:
         unit: for people.
         help: for people.
         option: of a scenario argument, what it sets: an option of SUMO such as ``scale``, or a dotted entry of the
-            configuration of a highway-env or Gymnasium environment such as ``observation.vehicles_count``. Where there
+            configuration or the keywords of an environment such as ``observation.vehicles_count``. Where there
             is none, it fills ``${NAME}`` in SUMO's route and additional files, or sets the entry of its own name.
     """
 

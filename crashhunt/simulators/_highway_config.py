@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from highway_env.vehicle.objects import RoadObject
 
 from crashhunt.errors import ScenarioError
+from crashhunt.simulators._options import as_tables, merge
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,17 +35,10 @@ def configured(default: Mapping[str, Any], scenario: Scenario, arguments: Mappin
     """
     assert scenario.highway is not None
     config = deepcopy(dict(default))
-    tables = [deepcopy(scenario.highway.config)]
-    for name, value in arguments.items():
-        option = scenario.arguments[name].option or name if name in scenario.arguments else name
-        *path, last = option.split(".")
-        table: dict[str, Any] = {last: value}
-        for part in reversed(path):
-            table = {part: table}
-        tables.append(table)
+    tables = [deepcopy(scenario.highway.config), *as_tables(scenario, arguments)]
     for table in tables:
         _check_keys(scenario, config, table)
-        _merge(config, table)
+        merge(config, table)
     if "duration" in config and not any("duration" in table for table in tables):
         config["duration"] = math.inf
     policy, simulation = config["policy_frequency"], config["simulation_frequency"]
@@ -97,15 +91,6 @@ def _check_keys(scenario: Scenario, config: Mapping[str, Any], table: Mapping[st
             close = difflib.get_close_matches(key, config, 1)
             fix = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(config)}"
             raise mistake(scenario, "config", key, "is no entry of the environment's configuration", fix)
-
-
-def _merge(config: dict[str, Any], table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        old = config.get(key)
-        if isinstance(old, dict) and isinstance(value, dict) and value.get("type", old.get("type")) == old.get("type"):
-            _merge(old, value)
-        else:
-            config[key] = value
 
 
 def _use_tuples(table: Any) -> None:

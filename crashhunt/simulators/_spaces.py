@@ -67,7 +67,8 @@ class FlatAction:
         """Return the flattened action; one that is flattened already stays as it is."""
         try:
             if isinstance(action, np.ndarray) and action.shape == self._flat.shape:
-                array, inside = action, self.space.contains(spaces.unflatten(self.space, action))
+                array = action.astype(self._flat.dtype, casting="same_kind")
+                inside = self.space.contains(spaces.unflatten(self.space, array))
             else:
                 inside = self.space.contains(action)
                 array = np.asarray(spaces.flatten(self.space, action)) if inside else np.empty(0)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.plugins import load_object
+from crashhunt.scenario import argument_values
 from crashhunt.scene import Contact, Roster, Scene
+from crashhunt.simulators._options import as_tables, merge
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
 
 if TYPE_CHECKING:
@@ -50,9 +53,14 @@ class GymSimulator:
         (self._agent,) = scenario.agents
         self.step_length_s = scenario.step_length_s
         self._factory = self._find()
-        self._rule = _Rule(self._setup.crash, scenario.origin)
+        self._rule = _Rule(self._setup.crash)
         self.agents: list[str] = []
-        self._adopt(self._make({name: setup.default for name, setup in scenario.arguments.items()}))
+        try:
+            self._adopt(self._make(argument_values(scenario)))  # which says what the spaces are
+        except CrashhuntError:
+            raise
+        except Exception as error:
+            raise self._mistake(f"{type(error).__name__}: {error}") from error
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Make the environment and reset it."""
@@ -100,17 +108,21 @@ class GymSimulator:
         return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
     def _make(self, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
-        setups = self._scenario.arguments
-        options = {setups[name].option or name if name in setups else name: value for name, value in arguments.items()}
+        kwargs = deepcopy(self._setup.kwargs)
+        for table in as_tables(self._scenario, arguments):
+            merge(kwargs, table)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
-                made = self._factory(**{**self._setup.kwargs, **options})
+                made = self._factory(**kwargs)
         except (gymnasium.error.Error, ImportError, TypeError) as error:
-            message = " ".join(str(error).split())
-            raise ScenarioError(f"gym.id = {self._setup.id!r}: {message}", where=self._scenario.origin) from None
-        found: gymnasium.Env[Any, Any] = made
-        return found
+            raise self._mistake(str(error)) from None
+        if not isinstance(made, gymnasium.Env):
+            raise self._mistake(f"a gymnasium.Env is needed, and it made a {type(made).__name__}")
+        return made
+
+    def _mistake(self, message: str) -> ScenarioError:
+        return ScenarioError(f"gym.id = {self._setup.id!r}: {' '.join(message.split())}", where=self._scenario.origin)
 
     def _adopt(self, env: gymnasium.Env[Any, Any]) -> None:
         self._env = env
@@ -128,7 +140,7 @@ class GymSimulator:
 
 
 class _Rule:
-    def __init__(self, rule: CrashRule, where: str) -> None:
+    def __init__(self, rule: CrashRule) -> None:
         self._rule = rule
         self._function = load_object(rule.function) if rule.function else None
 

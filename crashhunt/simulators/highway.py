@@ -18,6 +18,7 @@ os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 import gymnasium
 import highway_env
 import numpy as np
+from gymnasium.spaces import Discrete
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 from highway_env.envs.common.observation import MultiAgentObservation
@@ -79,7 +80,10 @@ class HighwaySimulator:
             logging.getLogger(__name__).warning("the accelerator steps aside: %s", reason)
         self.agents: list[str] = []
         self._lane_names: dict[tuple[str, str, int], str] = {}
-        self.reset(seed=0, options={"arguments": argument_values(scenario)})  # which says what the spaces are
+        try:
+            self.reset(seed=0, options={"arguments": argument_values(scenario)})  # which says what the spaces are
+        except InvalidEpisodeError as error:
+            raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Make the environment, and let everybody in."""
@@ -214,7 +218,7 @@ class HighwaySimulator:
         kind, space = self._kinds[agent], self.actions[agent].space
         if isinstance(kind, DiscreteMetaAction):
             return kind.actions_indexes["IDLE"]
-        return getattr(space, "n", 0) // 2 if hasattr(space, "n") else space.sample() * 0
+        return space.n // 2 if isinstance(space, Discrete) else np.zeros(space.shape, space.dtype)
 
     def _show(self, agents: Mapping[str, Any] | list[str], shown: Any) -> Observations:
         if self._kinematics is not None:

@@ -124,6 +124,7 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     [
         ('[highway]\nid = "highway-fast-v0"\nconfig = { vehicle_count = 3 }', "did you mean 'vehicles_count'"),
         ('[highway]\nid = "higway-v0"', "higway"),
+        ('[highway]\nid = "highway-v0"\nconfig = { observation = { type = "Sonar" } }', "Unknown observation type"),
         ('[highway]\nid = "highway-v0"\n[agents.ego]\nroute = "r"', "agents.ego.route = 'r' is for SUMO"),
         ('warmup_s = 5.0\n[highway]\nid = "highway-v0"', "warmup_s = 5.0 is for SUMO"),
         ('step_length_s = 0.5\n[highway]\nid = "highway-v0"', "policy_frequency"),
@@ -135,6 +136,7 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
     done = shell.crashhunt("run", "h", "1", "1", "5", "--scenario", ".", expect=2)
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
+    assert "snapshots" not in done.err  # the file to mend is the one that was given
 
 
 def test_the_accelerator_changes_nothing_but_the_time(shell):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
 from crashhunt.scenario import Scenario
 from crashhunt.setups import AgentSetup, ArgumentSetup, CrashRule, GymSetup
@@ -146,6 +146,41 @@ def test_scenario_arguments_are_keywords(tmp_path):
         simulator.reset(seed=1, options={"arguments": {"wide": -1.0}})
 
 
+def make_nested(config=None, **kwargs):
+    """One that takes a table, and refuses what is in it."""
+    if config["friction"]["of"] < 0:
+        raise ValueError("friction is\nnegative")
+    made = Tray(**kwargs)
+    made.config = config
+    return made
+
+
+def make_nothing():
+    return "a tray"
+
+
+def test_a_dotted_option_is_an_entry_of_a_table_and_the_rest_of_it_stays(tmp_path):
+    config = {"friction": {"of": 0.1, "type": "dry"}}
+    arguments = {"wet": ArgumentSetup(default=0.5, option="config.friction.of")}
+    name = f"{__name__}:make_nested"
+    simulator = simulator_of(tmp_path, name, arguments=arguments, config=config, size=1.0)
+    assert simulator._env.config == {"friction": {"of": 0.5, "type": "dry"}}
+    simulator.reset(seed=1, options={"arguments": {"wet": 0.7}})
+    assert simulator._env.config == {"friction": {"of": 0.7, "type": "dry"}}
+    assert config == {"friction": {"of": 0.1, "type": "dry"}}
+    with pytest.raises(InvalidEpisodeError, match="friction is"):
+        simulator.reset(seed=1, options={"arguments": {"wet": -1.0}})
+
+
+def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):
+    form = simulator_of(tmp_path, "Tray-v0").actions["ball"]
+    encoded = form.encode(FALL)
+    again = form.encode(encoded.astype(np.float16))
+    assert (again.dtype, again.tolist()) == (encoded.dtype, encoded.tolist())
+    with pytest.raises(ActionError, match="is not in"):
+        form.encode(encoded.astype(complex))
+
+
 class Endless(Tray):
     observation_space = spaces.Sequence(spaces.Discrete(3))
 
@@ -160,6 +195,8 @@ gymnasium.register("Endless-v0", entry_point=Endless)
         ("Tray-v0", {"colour": "red"}, "colour"),
         ("Endless-v0", {}, "no fixed size"),
         ("no_such_module:make", {}, "no_such_module"),
+        (f"{__name__}:make_nested", {"config": {"friction": {"of": -1}}}, "friction is negative"),
+        (f"{__name__}:make_nothing", {}, "it made a str"),
         ("CartPole-v1", {"crash": {"function": "math:cosine"}}, "cosine"),
     ],
 )
