@@ -104,13 +104,15 @@ def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
 
 
 def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
-    """Return the scenario with the agents that the settings name at the wheel."""
+    """Return the scenario as the settings say: who is at the wheel, and whether its simulator is sped up."""
     missing = scenario.agents.keys() ^ settings.agents.keys()
     if missing:
         raise UsageError(
             f"hunt.toml and the scenario do not agree on the controlled vehicle {min(missing)!r}",
             fix="name the same vehicles in both",
         )
+    if scenario.highway is not None and not settings.run.accelerate:
+        scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
 
 

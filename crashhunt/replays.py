@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
     from crashhunt.scenario import Scenario
+    from crashhunt.settings import HuntSettings
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
@@ -202,14 +203,15 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         warnings += [f"the snapshot is damaged: {fault}" for fault in snapshot.faults()]
     else:
         snapshot.verify()
-    changed = environment_changes(snapshot.environment())
-    warnings += [f"{name} was {then} and is {now}" for name, (then, now) in changed.items()]
     settings = read_settings(bundle.hunt / "hunt.toml")
-    then, now = snapshot.environment().get("cpu", ""), processor()
-    if snapshot.scenario().highway is not None and then != now:
-        warnings.append(f"the processor was {then!r} and is {now!r}, on which NumPy may round otherwise")
-    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
+    settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
     scenario = with_settings(snapshot.scenario(), settings)
+    environment = snapshot.environment()
+    warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
+    there, here = environment.get("cpu", ""), processor()
+    if scenario.highway is not None and there != here:
+        warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
+    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
     if code == "log":
         if edits:
             raise UsageError(
@@ -227,7 +229,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         if code == "log":
             message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
             raise UsageError(message, fix="leave --scenario or --from-log out")
-        scenario, spec = _elsewhere(options.scenario, scenario, spec, recorded.prologue.step_length_s)
+        scenario, spec = _elsewhere(options.scenario, settings, spec, recorded.prologue.step_length_s)
         edits.append(f"the scenario was {settings.scenario} and is {options.scenario}")
     worker = WorkerSettings(
         scenario=scenario,
@@ -238,27 +240,27 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         argument_files=snapshot.argument_files if code == "snapshot" else {},
         timeout_s=settings.run.timeout_s,
         keep_trials=True,
-        accelerate=settings.run.accelerate and options.accelerate,
     )
-    elsewhere = bool(options.scenario)
-    return Rerun(bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere)
+    return Rerun(
+        bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere=bool(options.scenario)
+    )
 
 
-def _elsewhere(name: str, scenario: Scenario, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
+def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
     """The same agents, arguments, seed and simulation time elsewhere; the traffic is its own but for what both have."""
     other = load_scenario(name)
-    if len(other.agents) != len(scenario.agents):
-        counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(scenario.agents)}"
+    if len(other.agents) != len(settings.agents):
+        counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(settings.agents)}"
         message = f"--scenario {name!r} has {counts}"
         raise UsageError(message, fix="give one with as many")
-    ids = dict(zip(scenario.agents, other.agents, strict=True))
-    drivers = {ids[agent]: setup.agent for agent, setup in scenario.agents.items()}
+    ids = dict(zip(settings.agents, other.agents, strict=True))
+    agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.step_length_s
     if other.highway is not None:
         rate = other.highway.config.get("policy_frequency")  # where it is not said, it is once a second in most
         there = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
-    return other.with_agents(drivers), replace(
+    return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
         scenario_arguments=argument_values(other) | shared,

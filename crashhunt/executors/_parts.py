@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,8 +41,6 @@ class Parts:
         stage = self._settings.scratch / f"stage-{os.getpid()}"
         stage.mkdir(exist_ok=True)
         scenario = self._settings.scenario
-        if scenario.highway is not None and not self._settings.accelerate:
-            scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
         made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
         return made
 

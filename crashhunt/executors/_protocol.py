@@ -34,7 +34,6 @@ class WorkerSettings:
         argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
-        accelerate: whether simulators are sped up where that changes no bit.
     """
 
     scenario: Scenario
@@ -45,7 +44,6 @@ class WorkerSettings:
     argument_files: dict[str, str] = field(default_factory=dict)
     timeout_s: float = 60.0
     keep_trials: bool = False
-    accelerate: bool = True
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers."""
@@ -81,7 +79,6 @@ class WorkerSettings:
             argument_files=data.get("argument_files", {}),
             timeout_s=data["timeout_s"],
             keep_trials=data["keep_trials"],
-            accelerate=data.get("accelerate", True),
         )
 
 
