@@ -8,6 +8,7 @@ import sys
 import time
 import traceback
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -188,7 +189,7 @@ class _Run:
         """Step until something ends the episode."""
         simulator, box, scribe, names = self.simulator, self.box, self.scribe, self.names
         forms = [simulator.actions[name].encode for name in names]
-        structures = getattr(simulator, "shown_spaces", {})
+        restored = {name: _restorer(space) for name, space in getattr(simulator, "shown_spaces", {}).items()}
         observations = self.observations
         everybody = tuple(range(len(names)))
         active = everybody
@@ -199,8 +200,8 @@ class _Run:
                 observation = observations[name]
                 box.observation(number, observation)
                 try:
-                    if name in structures:
-                        observation = _structured(structures[name], observation)
+                    if name in restored:
+                        observation = restored[name](observation)
                     action = forms[number](agents[name].act(observation))
                 except BaseException as error:
                     return self._result(Outcome.AGENT_ERROR, failure=_failure(error, name))
@@ -245,11 +246,11 @@ def _agent_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 
-def _structured(space: Any, flat: Any) -> Any:
-    """A Dict or Tuple observation, of which the flattened array is recorded."""
+def _restorer(space: Any) -> Callable[[Any], Any]:
+    """What makes a Dict or Tuple observation again of the flattened array, which is recorded."""
     from gymnasium.spaces import unflatten
 
-    return unflatten(space, flat)
+    return partial(unflatten, space)
 
 
 def _any_action(space: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,7 +67,38 @@ class StableBaselines3:
         return action
 
 
-class TorchPolicy:
+class _Network(ABC):
+    """One that is called with a batch of one observation."""
+
+    def __init__(
+        self,
+        path: Annotated[str, Argument("path", help="of the weights, with their layers")],
+        flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
+        action_space: Space[Any] | None = None,
+    ) -> None:
+        self._load(path)
+        self._flatten = flatten
+        self._space = action_space
+
+    @abstractmethod
+    def _load(self, path: str) -> None:
+        """Load the library and the weights."""
+
+    @abstractmethod
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
+        """Return a value for each discrete action, or the continuous action, of each observation of a batch."""
+
+    def act(self, observation: Any) -> Any:
+        """Return the action of the network's answer."""
+        seen = np.array(observation, np.float32)
+        values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
+        low, high = getattr(self._space, "low", None), getattr(self._space, "high", None)
+        if low is None or high is None:
+            return int(np.argmax(values))
+        return np.clip(values.reshape(low.shape), low, high).astype(low.dtype)
+
+
+class TorchPolicy(_Network):
     """Drives by a PyTorch module, saved by ``torch.export.save`` (``.pt2``) or ``torch.jit.save``.
 
     It is called with a batch of one observation, float32. Of a discrete action it returns a value each, of which the
@@ -81,33 +113,25 @@ class TorchPolicy:
         ValueError: there is no such file.
     """
 
-    def __init__(
-        self,
-        path: Annotated[str, Argument("path", help="of the module, a .pt2 or .pt file")],
-        flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
-        action_space: Space[Any] | None = None,
-    ) -> None:
+    def _load(self, path: str) -> None:
         self._torch = _library("torch", "torch")
         file = _existing(path)
         if file.suffix == ".pt2":
             self._module = self._torch.export.load(file).module()
         else:
             self._module = self._torch.jit.load(str(file), map_location="cpu").eval()
-        self._flatten = flatten
-        self._space = action_space
 
     def reset(self, seed: int) -> None:
         """Seed the generator of PyTorch."""
         self._torch.manual_seed(seed)
 
-    def act(self, observation: Any) -> Any:
-        """Return the module's answer."""
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
         with self._torch.inference_mode():
-            answer = self._module(self._torch.from_numpy(_batch(observation, flatten=self._flatten)))
-        return _decide(answer.numpy(), self._space)
+            answer: NDArray[Any] = self._module(self._torch.from_numpy(batch)).numpy()
+        return answer
 
 
-class OnnxPolicy:
+class OnnxPolicy(_Network):
     """Drives by an ONNX model with one input and one output, with the same meaning as for `TorchPolicy`.
 
     Args:
@@ -119,27 +143,19 @@ class OnnxPolicy:
         ValueError: there is no such file.
     """
 
-    def __init__(
-        self,
-        path: Annotated[str, Argument("path", help="of the model, an .onnx file")],
-        flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
-        action_space: Space[Any] | None = None,
-    ) -> None:
+    def _load(self, path: str) -> None:
         runtime = _library("onnxruntime", "onnx")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._session = runtime.InferenceSession(_existing(path), options, providers=["CPUExecutionProvider"])
         self._input = self._session.get_inputs()[0].name
-        self._flatten = flatten
-        self._space = action_space
 
     def reset(self, seed: int) -> None:
         """Nothing to forget."""
 
-    def act(self, observation: Any) -> Any:
-        """Return the model's answer."""
-        answer, *_ = self._session.run(None, {self._input: _batch(observation, flatten=self._flatten)})
-        return _decide(answer, self._space)
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
+        answer: NDArray[Any] = self._session.run(None, {self._input: batch})[0]
+        return answer
 
 
 def _library(name: str, extra: str) -> Any:
@@ -157,16 +173,3 @@ def _existing(path: str) -> Path:
 
 def _shape(space: Any) -> Any:
     return {name: _shape(inner) for name, inner in space.spaces.items()} if hasattr(space, "spaces") else space.shape
-
-
-def _batch(observation: NDArray[Any], *, flatten: bool) -> NDArray[np.float32]:
-    array = np.array(observation, np.float32)
-    return array.reshape(1, -1) if flatten else array[None]
-
-
-def _decide(answer: NDArray[Any], space: Space[Any] | None) -> Any:
-    values = answer[0]
-    low, high = getattr(space, "low", None), getattr(space, "high", None)
-    if low is None or high is None:
-        return int(np.argmax(values))
-    return np.clip(values.reshape(low.shape), low, high).astype(low.dtype)

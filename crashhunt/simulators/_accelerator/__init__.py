@@ -53,7 +53,7 @@ class _Prepared:
     """What is computed once for a road: its network, and where everybody is."""
 
     def __init__(self, road: Road) -> None:
-        self.road = road
+        self.road = road  # held, so that no other road can have its identity
         self.network = Network(road.network)
         self.frame: Frame | None = None
 
@@ -63,7 +63,7 @@ def _prepared(road: Road) -> _Prepared | None:
     if type(road) not in (Road, RegulatedRoad):
         return None
     found = _roads.get(id(road))
-    if found is None or found.road is not road or not found.network.is_of(road.network):
+    if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = _Prepared(road)
         while len(_roads) > _ROADS:  # an episode has one road, which nobody needs afterwards
             del _roads[next(iter(_roads))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,34 +34,26 @@ class Frame:
         self._looks_further = road.neighbour_vehicles_connected_lanes
         self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
         self.row = {id(thing): row for row, thing in enumerate(self.things)}
-        self._on_axis: tuple[Any, Any] | None = None
         self._columns: dict[int, tuple[list[float], list[float]]] = {}
-        self._boxes: NDArray[np.float64] | None = None
         self._single: dict[tuple[int, int], tuple[float, float]] = {}
         self._queues: dict[Any, tuple[list[float], list[RoadObject]]] = {}
 
     def is_of(self, road: Road) -> bool:
         """Whether everybody is still there, and where they were."""
         things = road.vehicles + road.objects
-        if len(things) != len(self.things) or self._looks_further != road.neighbour_vehicles_connected_lanes:
-            return False
-        if any(one is not two for one, two in zip(things, self.things, strict=True)):
+        if things != self.things or self._looks_further != road.neighbour_vehicles_connected_lanes:
             return False
         return np.array_equal(np.array([thing.position for thing in things], float).reshape(-1, 2), self.places)
 
-    @property
+    @cached_property
     def on_axis(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coordinates of all on the lanes along an axis, each of shape (things, lanes)."""
-        if self._on_axis is None:
-            self._on_axis = self.network.on_axis(self.places[:, 0], self.places[:, 1])
-        return self._on_axis
+        return self.network.on_axis(self.places[:, 0], self.places[:, 1])
 
-    @property
+    @cached_property
     def boxes(self) -> NDArray[np.float64]:
         """Lower bounds of the distances of all from the other lanes."""
-        if self._boxes is None:
-            self._boxes = self.network.box_distance(self.places[:, 0], self.places[:, 1])
-        return self._boxes
+        return self.network.box_distance(self.places[:, 0], self.places[:, 1])
 
     def coordinates(self, row: int, lane: int) -> tuple[float, float]:
         """Coordinates of one on one lane."""

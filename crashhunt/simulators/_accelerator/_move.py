@@ -116,7 +116,7 @@ def _distance(frame: Frame, row: int, lane: int, heading: float) -> float:
 def collide(road: Road, dt: float) -> None:
     """Let everybody collide with everybody, as `Road.step` does, but without the pairs that cannot touch."""
     vehicles, things = road.vehicles, road.vehicles + road.objects
-    if not all(kind_of(type(thing)).collides and kind_of(type(thing)).is_of(thing) for thing in things):
+    if not all((kind := kind_of(type(thing))).collides and kind.is_of(thing) for thing in things):
         for number, vehicle in enumerate(vehicles):
             for other in things[number + 1 :]:
                 vehicle.handle_collisions(other, dt)
@@ -167,7 +167,7 @@ def _stay_apart(one: Any, two: Any, dt: float) -> bool:
 def enforce(road: RegulatedRoad) -> bool:
     """`RegulatedRoad.enforce_road_rules`, foreseeing each vehicle once; False where one is not known."""
     vehicles = road.vehicles
-    if not all(kind_of(type(vehicle)).predicts and kind_of(type(vehicle)).is_of(vehicle) for vehicle in vehicles):
+    if not all((kind := kind_of(type(vehicle))).predicts and kind.is_of(vehicle) for vehicle in vehicles):
         return False
     for vehicle in vehicles:
         if getattr(vehicle, "is_yielding", False):
