@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-__all__ = ["Ledger"]
+__all__ = ["Ledger", "has_begun"]
 
 _VERSION = 1  # of the tables, as PRAGMA user_version
 _SCHEMA = """
@@ -42,6 +42,11 @@ CREATE TABLE IF NOT EXISTS hunt (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRI
 """
 
 
+def has_begun(path: Path) -> bool:
+    """Whether there is a ledger; an empty file, which whoever looks with SQLite leaves behind, is none."""
+    return path.exists() and path.stat().st_size > 0
+
+
 class Ledger:
     """What happened in a hunt.
 
@@ -61,7 +66,7 @@ class Ledger:
                 fix="give the directory that crashhunt run was given",
             )
         try:
-            if not path.exists():
+            if writable and not has_begun(path):
                 _create(path)
             self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
             if writable:

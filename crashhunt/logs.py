@@ -7,7 +7,7 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +49,7 @@ class LogReader:
                 yield from self._texts(folder, f"trial {int(number)}, ")
 
     def _states(self) -> Iterator[tuple[str, str]]:
-        if not (self._hunt / "ledger.sqlite").exists():
+        if not has_begun(self._hunt / "ledger.sqlite"):
             return
         with closing(Ledger(self._hunt / "ledger.sqlite")) as ledger:
             events = ledger.events()[self._told :]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import Outcome
 
 __all__ = ["HuntState", "State", "find_hunts", "hunt_state", "is_hunt", "this_process"]
@@ -104,7 +104,7 @@ def hunt_state(directory: Path) -> HuntState:
     Raises:
         HuntDirectoryError: it is not the directory of a hunt.
     """
-    if not (directory / "ledger.sqlite").exists() and is_hunt(directory):
+    if not has_begun(directory / "ledger.sqlite") and is_hunt(directory):
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / "request.json"))
     if not directory.is_dir():
         raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")

@@ -16,7 +16,7 @@ FINE = ("--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
 
 
 def ledger(folder: Path) -> dict[int, str]:
-    database = sqlite3.connect(folder / "ledger.sqlite")
+    database = sqlite3.connect(f"file:{folder / 'ledger.sqlite'}?mode=ro", uri=True)
     try:
         return dict(database.execute("SELECT number, result FROM trials"))
     finally:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import ClosestApproach, Outcome, TrialResult, TrialSpec
 
 
@@ -60,6 +60,16 @@ def test_every_state_is_written_down(tmp_path):
     ledger.enter("running")
     assert "detail" not in ledger.facts()
     ledger.close()
+
+
+def test_an_empty_file_is_no_ledger_yet(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    sqlite3.connect(path).execute("PRAGMA schema_version").close()  # as whoever looks too early does
+    assert path.exists()
+    assert not has_begun(path)
+    Ledger(path, writable=True).close()
+    assert has_begun(path)
+    assert Ledger(path).outcomes() == {}
 
 
 def _read_when_there(folder, said):
