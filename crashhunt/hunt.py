@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from crashhunt.bundle import Bundle
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.samplers import Sampler
     from crashhunt.scenario import Scenario
@@ -273,11 +275,15 @@ class Hunt:
 
     def _confirm(self, progress: Progress) -> None:
         """Run every crash that nobody has confirmed yet once more, in a fresh process."""
-        for place, bundle in enumerate(progress.crashes):
+
+        def confirmed(bundle: Bundle) -> Bundle:
             if bundle.confirmed is None and not self._interrupted:
-                confirmed = confirm(bundle)
-                confirmed.write()
-                progress.crashes[place] = confirmed
+                bundle = confirm(bundle)
+                bundle.write()
+            return bundle
+
+        with ThreadPoolExecutor(self.settings.run.parallel) as threads:  # which only wait for their process
+            progress.crashes = list(threads.map(confirmed, progress.crashes))
 
     def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
         enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
