@@ -9,9 +9,12 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
@@ -76,6 +79,23 @@ def shell(tmp_path: Path) -> Shell:
     """An empty folder with a module `faulty` of agents that go wrong."""
     shutil.copy(FAULTY, tmp_path / "faulty.py")
     return Shell(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[Shell], object], Shell], Shell]:
+    """Fills a folder with what a function makes in one; it is called once, everybody gets a copy."""
+    made: dict[Callable[[Shell], object], Path] = {}
+
+    def fill(make: Callable[[Shell], object], shell: Shell) -> Shell:
+        if make not in made:
+            folder = tmp_path_factory.mktemp("made")
+            shutil.copytree(shell.folder, folder, dirs_exist_ok=True)
+            make(Shell(folder))
+            made[make] = folder
+        shutil.copytree(made[make], shell.folder, dirs_exist_ok=True)
+        return shell
+
+    return fill
 
 
 TOY = """

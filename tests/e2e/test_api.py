@@ -38,11 +38,14 @@ def test_a_script_needs_no_guard(toy):
     assert done.stdout.split() == ["top", "level", "crash", "True", "done", "reproduced", "fixed"]
 
 
-@pytest.fixture
-def hunt(toy, monkeypatch):
+def hunted(toy):
     toy.crashhunt("run", "h", "2", "25", "99", *KEEP)
+
+
+@pytest.fixture
+def hunt(toy, made_once, monkeypatch):
     monkeypatch.chdir(toy.folder)
-    return toy
+    return made_once(hunted, toy)
 
 
 def test_results_are_typed_objects_and_arrays(hunt):

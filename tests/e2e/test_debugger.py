@@ -8,11 +8,14 @@ import pytest
 from conftest import CRASHHUNT
 
 
-@pytest.fixture
-def crash(shell):
+def hunted(shell):
     words = ("--agent", "faulty:Raises", "--arg", "at=30", "--arg", "speed=8", "--set", "vehicles=10", "--seed", "1")
     shell.crashhunt("run", "h", "1", "1", "60", *words)
-    return shell
+
+
+@pytest.fixture
+def crash(shell, made_once):
+    return made_once(hunted, shell)
 
 
 def typed(shell, text: str, *words: str) -> str:

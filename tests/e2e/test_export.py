@@ -25,16 +25,20 @@ class Agent:
 """
 
 
-@pytest.fixture
-def exported(shell):
-    """A crash of an own agent as ``crash.zip``, the hunt and the agent gone."""
+def archived(shell):
     shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
     (shell.folder / "mine.py").write_text(AGENT)
     shell.crashhunt("run", "h", "1", "1", "60", "--agent", "mine:Agent", "--set", "vehicles=10")
     shell.crashhunt("export", "h", "crash ä.zip")
     shutil.rmtree(shell.folder / "h")
     (shell.folder / "mine.py").unlink()
-    return shell
+
+
+@pytest.fixture
+def exported(shell, made_once):
+    """A crash of an own agent as ``crash.zip``, the hunt and the agent gone."""
+    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
+    return made_once(archived, shell)
 
 
 def test_it_replays_here_and_elsewhere_if_trusted(exported):

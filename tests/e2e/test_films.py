@@ -40,11 +40,14 @@ BUILTIN = 4
 WORDS = ("--arg", "speed=8", "--set", "vehicles=10", "--seed", "1", "--crash-on", "agent_error")
 
 
-@pytest.fixture
-def crash(shell):
+def hunted(shell):
     (shell.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
     shell.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", *WORDS)
-    return shell
+
+
+@pytest.fixture
+def crash(shell, made_once):
+    return made_once(hunted, shell)
 
 
 def pictures(path) -> list[np.ndarray]:

@@ -22,11 +22,14 @@ def screen():
         server.terminate()
 
 
-@pytest.fixture
-def crash(shell):
+def hunted(shell):
     words = ("--arg", "speed=20", "--seed", "1", "--crash-on", "collision")
     shell.crashhunt("run", "h", "1", "9", "800", *words)
-    return shell
+
+
+@pytest.fixture
+def crash(shell, made_once):
+    return made_once(hunted, shell)
 
 
 def seen(screen: str) -> dict[str, int]:
@@ -81,9 +84,10 @@ def test_sleep_slows_it_down(crash, screen):
 
 def test_a_closed_window_is_no_divergence(crash, screen):
     crash.environment["DISPLAY"] = screen
-    process = crash.start("replay", "h", "--gui", "--sleep", "0.05", stdin=subprocess.DEVNULL)
+    process = crash.start("replay", "h", "--gui", "--sleep", "0.3", stdin=subprocess.DEVNULL)
     keys = needed("xdotool")
-    for _ in range(100):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
         time.sleep(0.1)
         found = subprocess.run([keys, "search", "--name", "SUMO"], env=crash.environment, capture_output=True,
                                text=True, check=False).stdout.split()  # fmt: skip

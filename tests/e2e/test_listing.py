@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.scenario import shipped_scenarios
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -24,15 +26,15 @@ def test_agents_are_listed_with_arguments_ranges_and_units(shell):
     assert all(entry["locator"] in text and entry["title"] in text for entry in agents.values())
 
 
-def test_every_listed_scenario_and_agent_can_be_hunted_by_name(shell):
+def test_every_listed_scenario_says_what_it_is(shell):
     scenarios = shell.crashhunt("scenarios", "--json").json["scenarios"]
-    assert {"loop", "merge", "intersection", "loop-two-agents"} <= {entry["name"] for entry in scenarios}
+    assert {entry["name"] for entry in scenarios} == set(shipped_scenarios())  # each of which test_scenarios hunts
     for entry in scenarios:
         assert entry["title"]
         assert entry["arguments"]
-        found = shell.crashhunt("run", f"out-{entry['name']}", "1", "1", "3", "--scenario", entry["name"], "--json")
-        assert found.json["trials_run"] == 1
-        assert "invalid" not in found.json["outcomes"]
+
+
+def test_listed_agents_can_be_hunted_by_name(shell):
     for agent in ("car-following", "lane-changer", "random"):
         found = shell.crashhunt("run", f"out-{agent}", "1", "1", "3", "--agent", agent, "--json")
         assert found.json["trials_run"] == 1

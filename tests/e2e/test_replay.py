@@ -30,31 +30,24 @@ class Planner:
 '''
 
 
-@pytest.fixture
-def crash(shell):
+def hunted(shell):
     (shell.folder / "my_pkg").mkdir()
     (shell.folder / "my_pkg" / "__init__.py").write_text("")
     (shell.folder / "my_pkg" / "agents.py").write_text(AGENT)
     (shell.folder / "helper.py").write_text("WORDS = 'out of ideas'\nGAIN = 0.01\n")
     shutil.copytree(Path(__file__).parents[2] / "scenarios" / "loop", shell.folder / "own")
-    words = (
-        "run",
-        "h",
-        "1",
-        "2",
-        "100",
-        "--scenario",
-        "own",
-        "--agent",
-        "my_pkg.agents:Planner",
-        "--set",
-        "vehicles=10",
-    )
-    shell.crashhunt(*words)
+    words = ("--scenario", "own", "--agent", "my_pkg.agents:Planner", "--set", "vehicles=10")
+    shell.crashhunt("run", "h", "1", "2", "100", *words)
     return shell
 
 
-def test_the_originals_may_be_gone(crash):
+@pytest.fixture
+def crash(shell, made_once):
+    return made_once(hunted, shell)
+
+
+def test_the_originals_may_be_gone(shell):
+    crash = hunted(shell)
     for name in ("my_pkg", "own"):
         shutil.rmtree(crash.folder / name)
     (crash.folder / "helper.py").write_text("WORDS = 'something else'\nGAIN = 5.0\n")

@@ -7,11 +7,13 @@ import re
 import pytest
 
 
+def hunted(shell):
+    shell.crashhunt("run", "h", "2", "50", "800", "--arg", "speed=20:25", "--seed", "1", "--deterministic")
+
+
 @pytest.fixture
-def crash(shell):
-    words = ("run", "h", "2", "50", "800", "--arg", "speed=20:25", "--seed", "1", "--deterministic")
-    shell.crashhunt(*words)
-    return shell
+def crash(shell, made_once):
+    return made_once(hunted, shell)
 
 
 def test_a_collision_is_told_in_words_and_a_table(crash):

@@ -47,7 +47,7 @@ scenario = "nowhere"
 SLOW = """
 [defaults]
 scenario = "toy"
-trials = 120
+trials = 80
 max_steps = 50
 seed = 3
 scenario_arguments = { step_wall_s = 0.001 }
@@ -152,7 +152,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(120))
+        assert numbers(toy, f"out/{name}/0") == list(range(80))
     for name, rows in before.items():
         after = digests(toy, f"out/{name}/0")
         assert {number: after[number] for number in rows} == rows
@@ -181,7 +181,7 @@ def test_two_at_once_do_not_disturb_each_other(toy):
         assert process.returncode == 0, err
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(120))
+        assert numbers(toy, f"out/{name}/0") == list(range(80))
         assert "error" not in toy.crashhunt("logs", "out", "--run", name, "--type", "state").out
 
 

@@ -39,12 +39,15 @@ def browser(tmp_path_factory):
     opened.quit()
 
 
-@pytest.fixture
-def hunt(shell):
-    """Five real crashes, in a directory whose name would be markup."""
+def hunted(shell):
     words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "<b>bold&", "2", "5", "800", *words)
-    return shell
+
+
+@pytest.fixture
+def hunt(shell, made_once):
+    """Five real crashes, in a directory whose name would be markup."""
+    return made_once(hunted, shell)
 
 
 def wait_until(condition, seconds: float = 15.0):
