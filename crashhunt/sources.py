@@ -151,14 +151,14 @@ def _listing_that_has(place: Path, name: str, found: Sources) -> tuple[Path, lis
 
 
 def _listed(tree: Path) -> Iterator[str]:
-    """What is tracked, and what is untracked and not ignored; inside submodules too."""
+    """What is tracked, and what is untracked and not ignored, but nothing generated; inside submodules too."""
     output = git(tree, "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--deduplicate") or b""
     for entry in filter(None, output.split(b"\0")):
         name = os.fsdecode(entry).rstrip("/")
         path = tree / name
         if path.is_dir() and not path.is_symlink():
             yield from (f"{name}/{inner}" for inner in _listed(path) if path.resolve() != tree)
-        else:
+        elif _GENERATED.isdisjoint(name.split("/")):
             yield name
 
 

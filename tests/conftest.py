@@ -40,7 +40,10 @@ class Shell:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+        # Users have Python keep what it compiled; without, every process would compile crashhunt again.
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+        kept.pop("PYTHONDONTWRITEBYTECODE", None)
+        self.environment = kept
 
     def crashhunt(self, *words: str, expect: int | None = 0) -> Done:
         """Run a command to its end."""

@@ -79,7 +79,8 @@ def test_the_whole_work_tree_is_kept_and_nothing_else(project):
     status = git(project.folder, "status", "--porcelain")
     project.crashhunt(*RUN)
     assert (project.folder / ".git" / "index").read_bytes() == before
-    assert git(project.folder, "status", "--porcelain") == status
+    after = git(project.folder, "status", "--porcelain").splitlines()
+    assert [line for line in after if "__pycache__" not in line] == status.splitlines()
     (snapshot,) = snapshots(project)
     kept = {
         path.relative_to(snapshot / "code").as_posix()
@@ -131,6 +132,19 @@ def test_files_that_arguments_name_are_kept(project):
     kept.write_bytes(kept.read_bytes()[:-1] + b"x")
     refused = project.crashhunt("replay", "../out", expect=2)
     assert "policy ä.npz has changed" in refused.err
+
+
+def test_what_python_and_others_generate_is_not_code(project):
+    """Nothing of it is ignored there; Python writes its caches again whenever it likes."""
+    for name in ("src/planner/__pycache__/tuning.cpython-311.pyc", ".venv/lib/huge.py"):
+        (project.folder / name).parent.mkdir(parents=True)
+        (project.folder / name).write_bytes(b"generated")
+    git(project.folder, "add", "--force", "src/planner/__pycache__")
+    project.crashhunt(*RUN)
+    (snapshot,) = snapshots(project)
+    kept = json.loads((snapshot / "manifest.json").read_text())["files"]
+    assert not any("__pycache__" in name or ".venv" in name for name in kept)
+    assert project.crashhunt("replay", "../out", "--json").json["verdict"] == "reproduced"
 
 
 def test_a_missing_file_is_named_and_a_new_module_too(project):
