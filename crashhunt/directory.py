@@ -37,8 +37,8 @@ class HuntDirectory:
 
     @property
     def scratch(self) -> Path:
-        """Where running trials write."""
-        return self.path / ".scratch"
+        """Where running trials write, wherever their process goes meanwhile."""
+        return self.path.absolute() / ".scratch"
 
     @contextmanager
     def locked(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.episode import run_episode
@@ -26,7 +27,6 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from crashhunt.simulators import Simulator
     from crashhunt.trial import TrialResult, TrialSpec
@@ -77,6 +77,7 @@ class Worker:
         self._folder: Path | None = None
         self._lanes: Sequence[Lane] | None = None  # of the map that all workers share
         self._fresh = 0
+        self._home = Path.cwd()
         _die_with_parent()
         # Ctrl-C reaches the whole terminal; the hunt decides what becomes of its workers. A request to end must work
         # even while the simulator does not return to Python.
@@ -95,6 +96,7 @@ class Worker:
         Raises:
             OSError: the disk is full.
         """
+        os.chdir(self._home)  # from wherever the last agent has gone
         box, folder = self._prepare(spec)
         began = time.monotonic()
         simulator = self._simulator

@@ -5,6 +5,7 @@ import math
 import os
 import sys
 import time
+from pathlib import Path
 
 
 class Fine:
@@ -64,6 +65,17 @@ class HangsHoldingTheInterpreter(Fine):
 class Nan(Fine):
     def go_wrong(self):
         return math.nan, 0
+
+
+class Wanders(Raises):
+    """Goes elsewhere, and needs a file of where it was."""
+
+    def __init__(self, speed: float = 8.0):
+        super().__init__(speed=float(Path("needed.txt").read_text()))
+
+    def act(self, observation):
+        os.chdir("/")
+        return super().act(observation)
 
 
 class OutOfSpace(Fine):

@@ -62,6 +62,15 @@ def test_a_software_fault_is_found_saved_and_replayed(shell, agent, outcome, kin
     assert verdict["divergence"] is None
 
 
+def test_an_agent_that_goes_elsewhere_takes_nobody_along(shell):
+    (shell.folder / "needed.txt").write_text("8")
+    words = ("run", "h", "1", "3", "60", "--agent", "faulty:Wanders", *QUIET, "--keep-going", "--json")
+    report = shell.crashhunt(*words).json
+    assert report["outcomes"] == {"agent_error": 3}
+    assert all(crash["confirmed"] for crash in report["crashes"])
+    assert shell.crashhunt("replay", "h", "--frames", "f", "--json").json["verdict"] == "reproduced"
+
+
 def test_the_log_of_a_dead_process_ends_with_the_step_before(shell):
     from crashhunt.recording import read_log
 
