@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import sys
@@ -21,7 +22,7 @@ from crashhunt.cli._show import add_show
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import CrashhuntError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,7 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # not every terminal knows every letter
     try:
+        _check_names(words)
         options = _parser().parse_args(words)
         code = options.command(options, words)
     except CrashhuntError as error:
@@ -64,6 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except KeyboardInterrupt:
         code = 130
     sys.exit(code)
+
+
+def _check_names(words: Sequence[str]) -> None:
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise UsageError(f"{word!a} is not valid UTF-8", fix="rename it") from None
 
 
 def _parser() -> argparse.ArgumentParser:

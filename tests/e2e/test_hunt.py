@@ -293,3 +293,9 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing_behind(shell, words, say
     as_json = shell.crashhunt(*words, "--json", expect=2).json
     assert set(as_json) == {"error"}
     assert set(as_json["error"]) == {"message", "fix", "where"}
+
+
+def test_a_name_that_is_no_text_is_refused_before_anything_is_made(shell):
+    done = shell.crashhunt("run", os.fsdecode(b"bad\xff"), "1", "1", "5", expect=2)
+    assert done.err == "crashhunt: 'bad\\udcff' is not valid UTF-8; rename it\n"
+    assert [path.name for path in shell.folder.iterdir()] == ["faulty.py"]
