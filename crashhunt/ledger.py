@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import HuntDirectoryError
@@ -69,20 +69,16 @@ class Ledger:
             if writable and not has_begun(path):
                 _create(path)
             self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-            if writable:
-                # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
-                self._database.execute("PRAGMA journal_mode = WAL")
-                self._database.execute("PRAGMA synchronous = NORMAL")
-            found = self._version()
-            self._database.execute("SELECT count(*) FROM hunt").fetchone()
+            with ExitStack() as failed:
+                failed.callback(self._database.close)
+                if writable:
+                    # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
+                    self._database.execute("PRAGMA journal_mode = WAL")
+                    self._database.execute("PRAGMA synchronous = NORMAL")
+                self._check()
+                failed.pop_all()
         except sqlite3.Error as error:
             raise self._explained(error) from error
-        if found != _VERSION:
-            raise HuntDirectoryError(
-                f"a ledger of version {found}, and this crashhunt reads version {_VERSION}",
-                fix="use the crashhunt that made it, or run with --overwrite to begin anew",
-                where=str(path),
-            )
 
     def record(self, result: TrialResult, *, snapshot: str) -> None:
         """Add a trial that has ended; one that ran again replaces its row.
@@ -217,13 +213,19 @@ class Ledger:
         except sqlite3.Error as error:  # also in the middle of a file that is damaged
             raise self._explained(error) from error
 
-    def _version(self) -> int:
-        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+    def _check(self) -> None:
+        found = int(self._database.execute("PRAGMA user_version").fetchone()[0])
+        self._database.execute("SELECT count(*) FROM hunt").fetchone()
+        if found != _VERSION:
+            raise HuntDirectoryError(
+                f"a ledger of version {found}, and this crashhunt reads version {_VERSION}",
+                fix="use the crashhunt that made it, or run with --overwrite to begin anew",
+                where=str(self._path),
+            )
 
     def close(self) -> None:
         """Close the file."""
-        with closing(self._database):
-            pass
+        self._database.close()
 
     def _explained(self, error: sqlite3.Error) -> HuntDirectoryError:
         where = str(self._path)

@@ -147,9 +147,10 @@ def _in_scene(step: int, left: Scene, right: Scene) -> Divergence | None:
         who = left.roster.actors[row].id
         return Divergence(step, who, f"scene.{name}", was_value, now_value, ("scene", (column,)))
     for field in ("contacts", "off_road", "lanes"):
-        was_events, now_events = getattr(left, field), getattr(right, field)
+        # As text, in which a speed that nobody knows, NaN, equals itself.
+        was_events, now_events = str(getattr(left, field)), str(getattr(right, field))
         if was_events != now_events:
-            return Divergence(step, "", f"scene.{field}", str(was_events), str(now_events))
+            return Divergence(step, "", f"scene.{field}", was_events, now_events)
     return None
 
 

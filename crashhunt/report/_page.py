@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt import __version__
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.oracles import approaches
 from crashhunt.recording import read_lanes
 from crashhunt.report._screen import format_arguments
@@ -77,7 +77,7 @@ def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str) -> dic
 def _trials(directory: Path) -> dict[str, Any]:
     """Outcomes, and what was tried against how it went."""
     path = directory / "ledger.sqlite"
-    if not path.exists():
+    if not has_begun(path):
         return {"outcomes": {}, "steps": 0, "trials": [], "thinned": False}
     ledger = Ledger(path)
     try:

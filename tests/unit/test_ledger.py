@@ -4,6 +4,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -64,12 +65,14 @@ def test_every_state_is_written_down(tmp_path):
 
 def test_an_empty_file_is_no_ledger_yet(tmp_path):
     path = tmp_path / "ledger.sqlite"
-    sqlite3.connect(path).execute("PRAGMA schema_version").close()  # as whoever looks too early does
+    with closing(sqlite3.connect(path)) as database:  # as whoever looks too early does
+        database.execute("PRAGMA schema_version")
     assert path.exists()
     assert not has_begun(path)
     Ledger(path, writable=True).close()
     assert has_begun(path)
-    assert Ledger(path).outcomes() == {}
+    with closing(Ledger(path)) as ledger:
+        assert ledger.outcomes() == {}
 
 
 def _read_when_there(folder, said):
