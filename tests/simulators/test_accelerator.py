@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import logging
 import os
@@ -23,7 +24,9 @@ from hypothesis import strategies as st
 
 from crashhunt.simulators import _accelerator as accelerator
 from crashhunt.simulators._accelerator import _known, accelerate, decelerate
+from crashhunt.simulators._accelerator._frame import Frame
 from crashhunt.simulators._accelerator._known import kind_of, reason_against
+from crashhunt.simulators._accelerator._network import Network
 from crashhunt.simulators._highway_config import restore_classes
 
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
@@ -379,3 +382,14 @@ def test_roads_of_earlier_episodes_are_forgotten():
     decelerate()
     gc.collect()
     assert not any(road() is not None for road in gone)
+
+
+def test_a_vehicle_that_calls_itself_equal_to_another_is_not_taken_for_it():
+    env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
+    env.reset(seed=0)
+    frame = Frame(Network(env.road.network), env.road)
+    assert frame.is_of(env.road)
+    other = copy.copy(env.road.vehicles[-1])
+    other.__class__ = type("Equal", (type(other),), {"__eq__": lambda *_: True, "__hash__": object.__hash__})
+    env.road.vehicles[-1] = other
+    assert not frame.is_of(env.road)
