@@ -94,7 +94,7 @@ class _Network(ABC):
         values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
         low, high = getattr(self._space, "low", None), getattr(self._space, "high", None)
         if low is None or high is None:
-            return int(np.argmax(values))
+            return int(np.argmax(values) + getattr(self._space, "start", 0))
         return np.clip(values.reshape(low.shape), low, high).astype(low.dtype)
 
 

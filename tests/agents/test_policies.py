@@ -144,6 +144,10 @@ class TestOnnxPolicy(_Policy):
             int((seen.ravel() @ linear[0]).argmax()) for seen in observations
         ]
 
+    def test_actions_need_not_begin_at_0(self, linear, observations):
+        plain, shifted = (OnnxPolicy(linear[1], action_space=spaces.Discrete(5, start=start)) for start in (0, -1))
+        assert [plain.act(seen) - 1 for seen in observations] == [shifted.act(seen) for seen in observations]
+
 
 class TestOnnxPolicyThatSteers(_Policy):
     @pytest.fixture
