@@ -111,7 +111,10 @@ class HuntDirectory:
         return settings
 
     def _refuse_foreign(self) -> None:
-        foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_BEFORE))
+        try:
+            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_BEFORE))
+        except OSError as error:
+            raise self._unusable(error) from error
         if foreign and not is_hunt(self.path):
             raise HuntDirectoryError(
                 f"the folder is not empty and not a hunt: it has {foreign[0]!r}",

@@ -277,10 +277,9 @@ def _check_environment(scenario: Scenario, where: str) -> None:
             value = getattr(setup, item.name)
             if item.name not in ("agent", "arguments") and value != getattr(plain, item.name):
                 _refuse(where, f"agents.{agent}.{item.name}", value, "is for SUMO", "remove it")
-    for item in fields(Scenario):
-        value = getattr(scenario, item.name)
-        if item.name in ("warmup_s", "insertion_timeout_s") and value != item.default:
-            _refuse(where, item.name, value, "is for SUMO", "remove it")
+    for name in ("warmup_s", "insertion_timeout_s"):
+        if getattr(scenario, name) != getattr(Scenario, name):
+            _refuse(where, name, getattr(scenario, name), "is for SUMO", "remove it")
     if scenario.highway is not None and scenario.step_length_s != _STEP_LENGTH_S:
         fix = "set policy_frequency in highway.config"
         _refuse(where, "step_length_s", scenario.step_length_s, "is not for highway-env", fix)

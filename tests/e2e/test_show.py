@@ -56,5 +56,5 @@ def test_software_faults_are_told_too(shell, agent, says):
 
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):
     crash.environment["PYTHONIOENCODING"] = "ascii"
-    assert "Braking at 8 m/s? would have avoided it" in crash.crashhunt("show", "h").out
-    assert "m/s?" in crash.crashhunt("agents").out
+    assert "Braking at 8 m/s\\xb2 would have avoided it" in crash.crashhunt("show", "h").out
+    assert "m/s\\xb2" in crash.crashhunt("agents").out
