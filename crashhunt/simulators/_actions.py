@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange"]
+__all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast", "is_masked", "told"]
 
 MAX_TARGET_SPEED = 100.0
+_LONGEST = 200  # characters of an action in a message
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """In the order of highway-env's DiscreteMetaAction."""
 
@@ -34,19 +35,27 @@ class SpeedAndLaneChange:
         """Return float64, shape (2,)."""
         try:
             speed, lane_change = action
-            # NaN fails both comparisons.
-            if 0.0 <= speed <= MAX_TARGET_SPEED and lane_change in (-1, 0, 1):
-                return np.array((speed, lane_change), np.float64)
-        except (TypeError, ValueError, OverflowError):
+            # NaN fails both comparisons, as does what is masked. Of a dictionary it would be the keys.
+            if (
+                not isinstance(action, dict | set | frozenset)
+                and 0.0 <= speed <= MAX_TARGET_SPEED
+                and lane_change in (-1, 0, 1)
+            ):
+                array = np.array((speed, lane_change))
+                if array.dtype.kind in "fiubO" and array.shape == (2,):  # complex numbers can be compared as well
+                    return array.astype(np.float64, copy=False)
+        except Exception:  # whatever it is that the agent returned, its comparisons are its own
             pass
-        raise ActionError(
-            f"the action {action!r} is not (target_speed, lane_change)",
-            fix=f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1",
-        )
+        fix = f"return a speed within 0 and {MAX_TARGET_SPEED:g} m/s, and -1, 0 or 1"
+        raise ActionError(f"the action {told(action)} is not (target_speed, lane_change)", fix=fix)
 
 
 class SpaceAction:
-    """Anything inside a Box or Discrete space."""
+    """Anything inside a Box or Discrete space.
+
+    Numbers count by their value: True is 1, and 1.0 of a float64 policy is one of a float32 space. What would have to
+    be changed to fit is refused: 1.7 or 1.0 for a whole number, 300 for eight bits, complex numbers, masked ones.
+    """
 
     names: tuple[str, ...] = ()
 
@@ -57,15 +66,12 @@ class SpaceAction:
     def encode(self, action: Any) -> NDArray[np.generic]:
         """Return an array of the space's type and shape."""
         try:
-            given = np.asarray(action)
-            # 1.7 is no discrete action, but 1.0 of a float64 policy is one of a float32 space.
-            with np.errstate(over="ignore"):  # what becomes infinite is not inside
-                array = given.astype(self._dtype) if np.can_cast(given.dtype, self._dtype, "same_kind") else given
-            inside = array.dtype == self._dtype and self.space.contains(array if self.space.shape else array[()])
-        except (TypeError, ValueError, OverflowError):
+            array = cast(action, self._dtype)
+            inside = self.space.contains(array if self.space.shape else array[()])
+        except Exception:  # whatever it is that the agent returned, turning it into an array runs its code
             inside = False
         if not inside:
-            raise ActionError(f"the action {action!r} is not in {self.space}", fix="return one that is")
+            raise ActionError(f"the action {told(action)} is not in {self.space}", fix="return one that is")
         return array
 
 
@@ -89,3 +95,37 @@ class MetaAction(SpaceAction):
         if isinstance(action, np.ndarray) and action.size == 1:
             action = action.reshape(())
         return super().encode(action).reshape(1)
+
+
+def cast(action: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an action as an array of a type; an encoded one stays as it is.
+
+    Raises:
+        TypeError, ValueError: that would change it by more than rounding.
+    """
+    if is_masked(action):
+        raise ValueError("a part of it is masked")
+    given = np.asarray(action)
+    if given.dtype == dtype:
+        return given.copy()  # the agent may go on with its own
+    with np.errstate(over="ignore"):  # what becomes infinite is refused below
+        array = given.astype(dtype, casting="same_kind")
+    # Whole numbers wrap around silently, and what is too large for a float becomes infinite.
+    same = array == given if dtype.kind in "biu" else np.isfinite(array) == np.isfinite(given)
+    if not np.all(same):
+        raise ValueError("it does not fit")
+    return array
+
+
+def is_masked(action: Any) -> bool:
+    """Whether a part of an array is not there."""
+    return isinstance(action, np.ma.MaskedArray) and bool(np.ma.is_masked(action))
+
+
+def told(action: Any) -> str:
+    """Return what an agent has returned as errors show it: one line of at most 200 characters."""
+    try:
+        text = " ".join(repr(action).split())
+    except Exception as error:
+        text = f"of class {type(action).__name__}, whose repr raises {type(error).__name__},"
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"

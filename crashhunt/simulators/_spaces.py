@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from crashhunt.errors import ActionError, ScenarioError
-from crashhunt.simulators._actions import SpaceAction
+from crashhunt.simulators._actions import SpaceAction, cast, is_masked, told
 
 if TYPE_CHECKING:
     from gymnasium import Space
@@ -65,18 +67,29 @@ class FlatAction:
 
     def encode(self, action: Any) -> NDArray[np.generic]:
         """Return the flattened action; one that is flattened already stays as it is."""
+        array: NDArray[Any] = np.empty(0)
         try:
             if isinstance(action, np.ndarray) and action.shape == self._flat.shape:
-                array = action.astype(self._flat.dtype, casting="same_kind")
-                inside = self.space.contains(spaces.unflatten(self.space, array))
+                array = cast(action, np.dtype(self._flat.dtype))
+                structured = spaces.unflatten(self.space, array)
+                # Of two choices at once unflatten would take the first.
+                again = np.asarray(spaces.flatten(self.space, structured))
+                inside = self.space.contains(structured) and np.allclose(again, array, rtol=1e-3, atol=1e-3)
             else:
-                inside = self.space.contains(action)
-                array = np.asarray(spaces.flatten(self.space, action)) if inside else np.empty(0)
-        except (TypeError, ValueError, OverflowError, IndexError):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # Gymnasium's, that lists are turned into arrays
+                    inside = not _any_masked(action) and self.space.contains(action)
+                    array = np.asarray(spaces.flatten(self.space, action)) if inside else array
+        except Exception:  # whatever it is that the agent returned, looking at it runs its code
             inside = False
         if not inside:
-            raise ActionError(f"the action {action!r} is not in {self.space}", fix="return one that is")
+            raise ActionError(f"the action {told(action)} is not in {self.space}", fix="return one that is")
         return array
+
+
+def _any_masked(action: Any) -> bool:
+    parts = action.values() if isinstance(action, Mapping) else action if isinstance(action, list | tuple) else ()
+    return is_masked(action) or any(map(_any_masked, parts))
 
 
 def action_form(space: Space[Any]) -> ActionForm:
