@@ -193,6 +193,7 @@ class _Run:
         observations = self.observations
         everybody = tuple(range(len(names)))
         active = everybody
+        before = simulator.scene()
         for step in range(1, self.spec.max_steps + 1):
             actions: dict[str, Any] = {}
             for number in active:
@@ -210,6 +211,8 @@ class _Run:
             try:
                 observations, rewards, terminations, truncations, _ = simulator.step(actions)
                 scene = simulator.scene()
+                scene.follow(before)
+                before = scene
             except Exception as error:
                 return self._result(Outcome.SIMULATOR_ERROR, failure=_failure(error, ""))
             scribe.scene(step, scene, tuple([rewards.get(name, 0.0) for name in names]))

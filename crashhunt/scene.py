@@ -124,6 +124,7 @@ class Scene:
 
     Attributes:
         agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
+        previous: the scene one step before; None at the start. It has no previous one itself, so that nothing piles up.
     """
 
     __slots__ = (
@@ -134,6 +135,7 @@ class Scene:
         "lanes",
         "off_road",
         "points",
+        "previous",
         "roster",
         "speeds",
         "time_s",
@@ -159,7 +161,16 @@ class Scene:
         self.off_road = off_road
         self.lanes = lanes
         self.agent_lanes: dict[str, str] = {}
+        self.previous: Scene | None = None
         self._neighbors: dict[int, list[tuple[float, int]]] = {}
+
+    def follow(self, previous: Scene | None) -> None:
+        """Say which scene was one step before."""
+        if previous is self:
+            return  # a simulator that hands out the same object again
+        if previous is not None:
+            previous.previous = None
+        self.previous = previous
 
     @property
     def frame(self) -> Frame:

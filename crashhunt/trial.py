@@ -125,8 +125,9 @@ class Collision:
         x: of the controlled vehicle's front bumper, in m.
         y: likewise.
         lane: where the controlled vehicle was.
-        collider_speed: in m/s.
-        victim_speed: in m/s.
+        collider_speed: at the first contact, in m/s.
+        victim_speed: likewise.
+        time_s: simulation time of the first contact, which lies within the step; NaN where nobody knows.
     """
 
     agent: str
@@ -140,6 +141,7 @@ class Collision:
     lane: str = ""
     collider_speed: float = math.nan
     victim_speed: float = math.nan
+    time_s: float = math.nan
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Collision:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
-
-from crashhunt.trial import Collision, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.scene import Scene
+    from crashhunt.trial import Collision, Outcome
 
 __all__ = ["Finding", "Oracle", "merge_findings"]
 
@@ -46,9 +45,4 @@ def merge_findings(findings: Sequence[Finding]) -> Finding | None:
     parties = {first.collision.collider, first.collision.victim}
     same = [other for other in findings if {other.collision.collider, other.collision.victim} == parties]
     seen_by = tuple(sorted({name for other in same for name in other.collision.seen_by}))
-    hit = first.collision
-    merged = Collision(
-        hit.agent, hit.role, hit.collider, hit.victim, seen_by, hit.kind, hit.x, hit.y, hit.lane,
-        hit.collider_speed, hit.victim_speed,
-    )  # fmt: skip
-    return Finding(first.outcome, merged)
+    return Finding(first.outcome, replace(first.collision, seen_by=seen_by))

@@ -225,6 +225,7 @@ class Recording:
                 points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
                 headings, speeds = values[2 * count : 3 * count], values[3 * count :]
                 current.scene = Scene(time_s, roster, points, headings, speeds, contacts, off_road, lanes)
+                current.scene.previous = self.all_steps[-1].scene if self.all_steps else None
                 current.rewards = {agent.id: float(reward) for agent, reward in zip(agents, rewards, strict=True)}
                 self.all_steps.append(current)
                 current, lanes, events = StepRecord(step + 1), (), {}

@@ -101,8 +101,10 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         for other, driver in self._others.items():
             if other in self._simulator.agents:
                 actions[other] = self._simulator.actions[other].encode(driver.act(self._observations[other]))
+        before = self._simulator.scene()
         self._observations, rewards, terminations, _, _ = self._simulator.step(actions)
         scene = self._simulator.scene()
+        scene.follow(before)
         self._steps += 1
         finding = merge_findings([found for oracle in self._oracles for found in oracle.check(scene, (self.agent,))])
         terminated = terminations[self.agent] or finding is not None

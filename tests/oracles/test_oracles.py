@@ -21,7 +21,7 @@ from crashhunt.oracles import (
     time_to_contact,
 )
 from crashhunt.scene import Actor, Contact, Roster, Scene, corners
-from crashhunt.trial import Outcome
+from crashhunt.trial import Collision, Outcome
 
 rectangles = st.tuples(
     st.floats(-15, 15), st.floats(-15, 15), st.floats(-math.pi, math.pi), st.floats(0.5, 14), st.floats(0.4, 3)
@@ -198,3 +198,17 @@ def test_leaving_the_road():
     assert finding.outcome is Outcome.OFF_ROAD
     assert (finding.collision.role, finding.collision.x, finding.collision.collider_speed) == ("alone", 3, 7)
     assert OffRoad().check(view, ["other"]) == []
+
+
+def test_a_scene_knows_the_one_before_and_no_more():
+    first, second, third = scene(("ego", 0, 0, 0, 1)), scene(("ego", 1, 0, 0, 1)), scene(("ego", 2, 0, 0, 1))
+    second.follow(first)
+    third.follow(second)
+    third.follow(third)  # a simulator that hands out the same object again
+    assert third.previous is second
+    assert second.previous is None
+
+
+def test_a_collision_written_before_its_time_was_known_is_read():
+    old = {"agent": "ego", "role": "alone", "collider": "ego", "seen_by": ["x"], "collider_speed": None}
+    assert math.isnan(Collision.from_json(old).time_s)
