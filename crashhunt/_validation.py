@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+
+from crashhunt._names import did_you_mean
 
 if TYPE_CHECKING:
     from crashhunt.errors import CrashhuntError
@@ -33,8 +34,7 @@ def validate(kind: type[T], data: object, *, where: str, error: type[CrashhuntEr
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             known = _known_keys(kind, tuple(str(part) for part in first["loc"][:-1]))
-            close = difflib.get_close_matches(str(first["loc"][-1]), known, 1)
-            fix = f"did you mean {close[0]!r}?" if close else f"the keys here are {', '.join(known)}"
+            fix = did_you_mean(str(first["loc"][-1]), known) or f"the keys here are {', '.join(known)}"
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
         if first["type"] in ("missing", "missing_argument"):
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None

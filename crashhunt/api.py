@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._calls import clear_calls
 from crashhunt.bundle import Bundle, find_bundle
 from crashhunt.comparison import compare
 from crashhunt.errors import UsageError
@@ -30,6 +30,7 @@ __all__ = ["Hunt", "Suite", "compare", "load", "prepare", "replay", "run"]
 Spec = str | int | float | bool
 
 
+@clear_calls()
 def prepare(
     directory: Path | str,
     parallel: int,
@@ -103,7 +104,7 @@ def prepare(
         seed=seed,
         crash_on=[str(outcome) for outcome in crash_on],
         run=RunSettings(
-            parallel=parallel or len(os.sched_getaffinity(0)),
+            parallel=parallel,
             keep_going=keep_going,
             deterministic=deterministic,
             keep_trials=keep_trials,
@@ -124,6 +125,7 @@ def prepare(
     )
 
 
+@clear_calls(options_of=prepare)
 def run(
     directory: Path | str,
     parallel: int,
@@ -152,6 +154,7 @@ def run(
     return prepare(directory, parallel, trials, max_steps, **options).run(watch)
 
 
+@clear_calls()
 def replay(
     crash: Bundle | Path | str,
     crash_id: str = "",

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._names import listed, near_path, one_of
 from crashhunt.environment import versions
 from crashhunt.errors import BundleError
 from crashhunt.executors import BLACK_BOX, OUTPUT
@@ -164,7 +165,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
 
     Args:
         directory: of the hunt, or of the bundle itself.
-        crash: its id, or its trial's number.
+        crash: its id, the beginning of it, or its trial's number, with leading zeros or without.
 
     Raises:
         BundleError: there is no such crash.
@@ -174,20 +175,31 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     bundles = list_bundles(directory)
     if not bundles:
         if not directory.is_dir():
-            raise BundleError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")
+            fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
+            raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
         raise BundleError(
             "no crash was saved here", fix="give the directory of a hunt that found one", where=str(directory)
         )
     if not crash:
         return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-    for bundle in bundles:
-        if crash in (bundle.id, str(bundle.result.spec.number)):
-            return bundle
-    raise BundleError(
-        f"there is no crash {crash!r}",
-        fix=f"give one of {', '.join(bundle.id for bundle in bundles)}",
-        where=str(directory),
-    )
+    return _named(bundles, crash, directory)
+
+
+def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
+    """The one crash that somebody can mean; an id is exact, and else a number, before the beginning of an id."""
+    number = int(crash) if crash.isdecimal() else None
+    for meant in (
+        [bundle for bundle in bundles if bundle.id == crash],
+        [bundle for bundle in bundles if bundle.result.spec.number == number],
+        [bundle for bundle in bundles if bundle.id.startswith(crash)],
+    ):
+        if len(meant) == 1:
+            return meant[0]
+        if meant:
+            fix = f"give one of {listed(bundle.id for bundle in meant)}"
+            raise BundleError(f"{crash!r} may be several crashes", fix=fix, where=str(directory))
+    fix = one_of(crash, (bundle.id for bundle in bundles))
+    raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))
 
 
 def write_bundle(

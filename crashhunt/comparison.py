@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
+from crashhunt._calls import clear_calls
 from crashhunt.errors import UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
@@ -133,6 +134,7 @@ class Comparison:
         return f"<comparison {rates}>"
 
 
+@clear_calls()
 def compare(*directories: Path | str) -> Comparison:
     """Compare hunts: how often each crashed, and over trials with the same seeds, whether one crashes less.
 

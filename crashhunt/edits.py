@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._names import did_you_mean, listed
 from crashhunt.errors import ArgumentError, UsageError
 from crashhunt.space import Constant, parse_spec
 
@@ -91,9 +91,9 @@ def _find(name: str, recorded: TrialSpec, settings: HuntSettings) -> tuple[str, 
     if name in recorded.scenario_arguments:
         return "", name
     known = [_name(key) for key in _specs(settings)]
-    close = difflib.get_close_matches(name, known, 1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=f"{hint}it has {', '.join(known) or 'none'}")
+    hint = did_you_mean(name, [*known, *(key[1] for key in _specs(settings))])
+    fix = f"{hint} it has {listed(known)}".lstrip()
+    raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=fix)
 
 
 def _name(key: tuple[str, str]) -> str:

@@ -4,7 +4,8 @@
 
     CrashhuntError                 exit code 2 unless said otherwise
     ├── UsageError                 a command line, call or setting that cannot be meant
-    │   └── ArgumentError          an argument specification or value
+    │   ├── ArgumentError          an argument specification or value
+    │   └── CallError              a call from Python with arguments that there are not; a TypeError as well
     ├── ScenarioError              a scenario file: which file, which key, which value
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
@@ -25,6 +26,7 @@ __all__ = [
     "ArgumentError",
     "BundleError",
     "BusyError",
+    "CallError",
     "CrashhuntError",
     "EpisodeError",
     "HuntDirectoryError",
@@ -79,6 +81,10 @@ class UsageError(CrashhuntError):
 
 class ArgumentError(UsageError):
     """An argument specification or value that cannot be used."""
+
+
+class CallError(UsageError, TypeError):
+    """A call from Python with arguments that there are not, or without some that there must be."""
 
 
 class ScenarioError(CrashhuntError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt._names import one_of
 from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.plugins import locate, signature_of
 from crashhunt.scenario import Scenario, load_scenario
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Sampler
 
 __all__ = ["Request", "plan", "spec_of", "with_settings"]
+
+_ZERO = {"PARALLEL": " (0: one per core)", "--recycle-after": " (0: never)"}  # what nought means, where it may be given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +72,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         CrashhuntError: with what is wrong with it.
     """
     _check_numbers(request)
+    run = replace(request.run, parallel=request.run.parallel or len(os.sched_getaffinity(0)))  # of this machine
     scenario = load_scenario(request.scenario, ego=request.ego)
     scenario = scenario.with_agents(_locators(request, scenario))
     sampler = locate("samplers", request.sampler)
@@ -84,9 +89,9 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         crash_on=_crash_on(request.crash_on),
         agents=_agents(request, scenario, signatures, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
-        run=request.run,
+        run=run,
     )
-    scenario = _noted(scenario, request.run)
+    scenario = _noted(scenario, run)
     sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
     return scenario, settings
 
@@ -120,13 +125,13 @@ def _check_numbers(request: Request) -> None:
     for name, value, least in (
         ("TRIALS", request.trials, 1),
         ("MAX_STEPS", request.max_steps, 1),
-        ("PARALLEL", request.run.parallel, 1),
+        ("PARALLEL", request.run.parallel, 0),
         ("--points", request.points, 1),
         ("--recycle-after", request.run.recycle_after, 0),
         ("--seed", request.seed or 0, 0),
     ):
         if value < least:
-            raise UsageError(f"{name} is {value}", fix=f"give at least {least}")
+            raise UsageError(f"{name} is {value}", fix=f"give at least {least}{_ZERO.get(name, '')}")
     if not 0 < request.run.timeout_s < float("inf"):
         raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
 
@@ -135,7 +140,7 @@ def _crash_on(names: Sequence[str]) -> tuple[Outcome, ...]:
     crashes = [str(outcome) for outcome in CRASHES]
     for name in names:
         if name not in crashes:
-            raise UsageError(f"--crash-on {name!r} is not a crash", fix=f"give some of {','.join(crashes)}")
+            raise UsageError(f"--crash-on {name!r} is not a crash", fix=one_of(name, crashes, give="give some of"))
     if not names:
         raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
     return tuple(outcome for outcome in CRASHES if outcome in names)
@@ -151,7 +156,8 @@ def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
                 fix=f"write --agent {next(iter(scenario.agents))}={locator}",
             )
         if agent and agent not in scenario.agents:
-            raise UsageError(f"--agent: there is no controlled vehicle {agent!r}", fix=f"the scenario has {ids}")
+            fix = one_of(agent, scenario.agents, give="the scenario has")
+            raise UsageError(f"--agent: there is no controlled vehicle {agent!r}", fix=fix)
         locators[agent or next(iter(scenario.agents))] = locator
     return locators
 
@@ -169,10 +175,9 @@ def _agents(
         known = scenario.agent_arguments(agent)
         for name in known:
             if name not in signature.arguments and not signature.open:
-                accepted = ", ".join(signature.arguments) or "no arguments"
                 raise ScenarioError(
                     f"agents.{agent}.arguments.{name}: {setup.agent} takes no such argument",
-                    fix=f"it takes {accepted}",
+                    fix=one_of(name, signature.arguments, give="it takes", none="no arguments"),
                     where=scenario.origin,
                 )
         specs: dict[str, ArgumentSpec] = {}
@@ -242,8 +247,7 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
     known = scenario.scenario_arguments()
     for name in request.scenario_arguments:
         if name not in known:
-            accepted = ", ".join(known) or "none"
-            raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=f"it has {accepted}")
+            raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))
     specs: dict[str, ArgumentSpec] = {}
     for name, argument in known.items():
         asked = request.scenario_arguments.get(name)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import inspect
 import os
+import pkgutil
 import sys
 import types
 import typing
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt._blame import place_of
+from crashhunt._names import did_you_mean, one_of
 from crashhunt.errors import ArgumentError, PluginError
 from crashhunt.space import Argument, Kind, kind_of
 
@@ -43,12 +45,8 @@ def locate(group: Group, name: str) -> Any:
     target = points[name].value if name in points else name
     module_name, colon, attribute = target.partition(":")
     if not colon or not module_name or not attribute:
-        close = difflib.get_close_matches(name, points, 1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        raise PluginError(
-            f"{name!r} is not a registered name of {group}",
-            fix=f"{hint}give one of {', '.join(points) or '(none)'}, or module:attribute",
-        )
+        fix = f"{one_of(name, points, none='(none)')}, or module:attribute"
+        raise PluginError(f"{name!r} is not a registered name of {group}", fix=fix)
     return load_object(target, shown=name)
 
 
@@ -69,10 +67,9 @@ def load_object(target: str, *, shown: str = "") -> Any:
     for part in attribute.split("."):
         if not hasattr(found, part):
             public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
-            close = difflib.get_close_matches(part, public, 1)
             raise PluginError(
                 f"{name!r}: {module_name} has no attribute {attribute!r}",
-                fix=f"did you mean {close[0]!r}?" if close else "mend the name",
+                fix=did_you_mean(part, public) or "mend the name",
             )
         found = getattr(found, part)
     if not callable(found):
@@ -96,15 +93,28 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
         sys.path.insert(0, os.getcwd())  # noqa: PTH109
     try:
         return importlib.import_module(name)
-    except ImportError as error:
-        raise PluginError(
-            f"{shown or name!r} cannot be imported: {type(error).__name__}: {error}",
-            fix="run from the folder that holds the module, install it, or mend the name",
-        ) from error
-    except Exception as error:
-        raise PluginError(
-            f"importing {shown or name!r} raised {type(error).__name__}: {error}", fix="mend the module"
-        ) from error
+    except (Exception, SystemExit) as error:
+        raise _not_imported(name, shown or name, error) from error
+
+
+def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
+    """Tell a module that is not there from one that is and fails."""
+    what = error.msg if isinstance(error, SyntaxError) else str(error)
+    said = " ".join(f"{type(error).__name__}: {what}".split())
+    missing = error.name or "" if isinstance(error, ModuleNotFoundError) else ""
+    if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
+        hint = did_you_mean(missing.rpartition(".")[2], _modules_beside(missing))
+        fix = f"{hint} run from the folder that holds the module, install it, or mend the name".lstrip()
+        return PluginError(f"{shown!r} cannot be imported: there is no module {missing!r}", fix=fix)
+    fix = f"install {missing.partition('.')[0]!r}, or mend the import" if missing else "mend it"
+    return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
+
+
+def _modules_beside(name: str) -> list[str]:
+    """The modules of the same package, or of the current directory."""
+    package, _, _ = name.rpartition(".")
+    places = getattr(sys.modules.get(package), "__path__", None) if package else [os.getcwd()]  # noqa: PTH109
+    return [module.name for module in pkgutil.iter_modules(places)] if places else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +139,8 @@ class Signature:
         """
         for name in names:
             if name not in self.arguments and not self.open:
-                close = difflib.get_close_matches(name, self.arguments, 1)
-                hint = f"did you mean {close[0]!r}? " if close else ""
-                accepted = ", ".join(self.arguments) or "no arguments"
-                raise ArgumentError(f"{where} takes no argument {name!r}", fix=f"{hint}it takes {accepted}")
+                fix = one_of(name, self.arguments, give="it takes", none="no arguments")
+                raise ArgumentError(f"{where} takes no argument {name!r}", fix=fix)
 
 
 def signature_of(factory: Callable[..., Any]) -> Signature:

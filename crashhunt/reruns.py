@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plan import Request
-from crashhunt.runs import REQUEST, RunRequest, run_all, set_aside, write_request
+from crashhunt.runs import REQUEST, RunRequest, run_all, set_aside, slots_of, write_request
 from crashhunt.scenario import shipped_scenarios
 from crashhunt.settings import HuntSettings, read_settings
 from crashhunt.snapshot import latest_snapshot
@@ -51,6 +51,7 @@ def rerun(
         UsageError: a change cannot be meant.
         HuntDirectoryError: a directory cannot be used.
     """
+    slots_of(parallel)
     changes = changes or {}
     if to is not None:
         return _elsewhere(hunts, to, changes, parallel, watch), []

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt._calls import clear_calls
+from crashhunt._names import one_of
 from crashhunt.bundle import Bundle, list_bundles
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.executors import Parts, WorkerSettings
@@ -144,7 +146,7 @@ class HuntResults:
         arguments = self.trial(trial).spec.arguments
         name = agent or next(iter(arguments))
         if name not in arguments:
-            raise UsageError(f"there is no controlled vehicle {name!r}", fix=f"give one of {', '.join(arguments)}")
+            raise UsageError(f"there is no controlled vehicle {name!r}", fix=one_of(name, arguments))
         with tempfile.TemporaryDirectory(prefix="crashhunt-") as folder:
             settings = WorkerSettings(scenario=self.scenario, oracles=(), crash_on=(), scratch=Path(folder))
             parts = Parts(settings)
@@ -170,6 +172,7 @@ class SuiteResults(dict[str, HuntResults]):
         return f"<suite {str(self.directory)!r}: {len(self)} hunts, {counts}>"
 
 
+@clear_calls()
 def load(directory: Path | str) -> HuntResults | SuiteResults:
     """Load a hunt, or all hunts of a suite. What is not finished is loaded as far as it is, with a warning.
 
@@ -182,7 +185,8 @@ def load(directory: Path | str) -> HuntResults | SuiteResults:
     for hunt in [found] if isinstance(found, HuntResults) else found.values():
         if hunt.state.state not in ("finished", "crashed"):
             detail = f": {hunt.state.detail}" if hunt.state.detail else ""
-            warnings.warn(f"{hunt!r} is not finished{detail}", UnfinishedWarning, stacklevel=2)
+            # The second frame is of what checks the call.
+            warnings.warn(f"{hunt!r} is not finished{detail}", UnfinishedWarning, stacklevel=3)
     return found
 
 

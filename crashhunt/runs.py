@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.directory import HuntDirectory
-from crashhunt.errors import BusyError, CrashhuntError, HuntDirectoryError
+from crashhunt.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.settings import HuntSettings
 
-__all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "write_request"]
+__all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "slots_of", "write_request"]
 
 REQUEST = "request.json"
 _LOOK_EVERY_S = 0.1
@@ -80,6 +80,17 @@ def write_request(folder: Path, request: RunRequest) -> None:
         temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
 
 
+def slots_of(parallel: int) -> int:
+    """Return how many trials run at a time; 0 means one per core.
+
+    Raises:
+        UsageError: it is negative.
+    """
+    if parallel < 0:
+        raise UsageError(f"PARALLEL is {parallel}", fix="give at least 0 (0: one per core)")
+    return parallel or len(os.sched_getaffinity(0))
+
+
 def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], None] | None = None) -> None:
     """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
 
@@ -89,9 +100,10 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
         watch: called about once a second, and at the end.
 
     Raises:
+        UsageError: ``parallel`` is negative.
         KeyboardInterrupt: interrupted; what has finished is kept, and the hunts have stopped.
     """
-    slots = parallel if parallel > 0 else len(os.sched_getaffinity(0))
+    slots = slots_of(parallel)
     waiting = deque(folders)
     running: dict[subprocess.Popen[bytes], int] = {}
     watched = 0.0

@@ -5,7 +5,6 @@ A scenario is a folder with a ``scenario.toml``, or a bare ``.sumocfg`` that nob
 
 from __future__ import annotations
 
-import difflib
 import os
 import string
 import tomllib
@@ -13,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
+from crashhunt._names import did_you_mean, listed, near_path
 from crashhunt.errors import ArgumentError, ScenarioError
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_files import RESERVED
@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 _STEP_LENGTH_S = 0.1
+_ENDINGS = (".toml", ".sumocfg", ".sumo.cfg")
 _TABLES = {"sumo": "net and routes", "highway": "the id of the environment", "gym": "the id of the environment"}
 
 
@@ -56,6 +57,7 @@ class Scenario:
         schema: of the file format.
         name: what people call it; the folder's name by default.
         folder: where its files are; not part of the file.
+        file: what was read, relative to the folder; not part of it, and not of what crosses to a worker.
         notes: what was decided on the user's behalf, for people; not part of the file.
     """
 
@@ -73,12 +75,13 @@ class Scenario:
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()
+    file: str = "scenario.toml"
     notes: tuple[str, ...] = ()
 
     @property
     def origin(self) -> str:
         """Where errors about it point."""
-        return str(self.folder / "scenario.toml")
+        return str(self.folder / self.file)
 
     def files(self) -> Iterator[str]:
         """Yield the files that an episode reads, relative to the folder."""
@@ -126,13 +129,14 @@ def shipped_scenarios() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in shipped_folder().glob("*/scenario.toml")))
 
 
-def load_scenario(name: str | Path, *, ego: str = "") -> Scenario:
+def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Scenario:
     """Load a scenario.
 
     Args:
         name: of a shipped one, or the path of a folder, a ``scenario.toml`` or a ``.sumocfg``.
         ego: for a ``.sumocfg``, which vehicle is controlled: ``VEHICLE``, ``vehicle=ID``, ``route=ID`` or
             ``edges=FROM,TO``.
+        kept: it is that of a snapshot, which has been run: what was accepted then is not refused now.
 
     Raises:
         ScenarioError: it does not exist or is not valid, with file, key, value and the fix.
@@ -144,20 +148,20 @@ def load_scenario(name: str | Path, *, ego: str = "") -> Scenario:
     if path.is_dir():
         path = path / "scenario.toml"
     if not path.is_file():
-        close = difflib.get_close_matches(text, shipped_scenarios(), 1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        shipped = ", ".join(shipped_scenarios())
-        raise ScenarioError(
-            f"there is no scenario {text!r}",
-            fix=f"{hint}give one of {shipped}, or the path of a folder, a scenario.toml or a .sumocfg",
-        )
+        if path.parent.is_dir() and path.parent == Path(name):
+            inside = sorted(str(file) for file in path.parent.iterdir() if file.name.endswith(_ENDINGS))
+            fix = f"give {listed(inside)}" if inside else "give the folder that has one"
+            raise ScenarioError("the folder has no scenario.toml", fix=fix, where=text)
+        fix = f"{near_path(path, *_ENDINGS) or did_you_mean(text, shipped_scenarios())} give one of "
+        fix += f"{listed(shipped_scenarios())}, or the path of a folder, a scenario.toml or a .sumocfg"
+        raise ScenarioError(f"there is no scenario {text!r}", fix=" ".join(fix.split()))
     if path.suffix == ".toml":
         if ego:
             raise ScenarioError(
                 f"--ego {ego!r} is for a bare .sumocfg", fix="set the vehicle under [agents] instead", where=str(path)
             )
-        return _load_toml(path)
-    if path.name.endswith((".sumocfg", ".sumo.cfg")):
+        return _load_toml(path, kept=kept)
+    if path.name.endswith(_ENDINGS):
         from crashhunt.sumocfg import load_sumocfg
 
         return load_sumocfg(path, ego=ego)
@@ -166,20 +170,25 @@ def load_scenario(name: str | Path, *, ego: str = "") -> Scenario:
     )
 
 
-def _load_toml(path: Path) -> Scenario:
+def _load_toml(path: Path, *, kept: bool) -> Scenario:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ScenarioError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
-    for key in ("folder", "notes"):
+    for key in ("folder", "file", "notes"):
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent)
+    scenario = replace(scenario, file=path.name)
+    _check_arguments(scenario, kept=kept)
     agents = {agent: _beside(setup, scenario.folder) for agent, setup in scenario.agents.items()}
     scenario = replace(scenario, agents=agents)
     _check(scenario, str(path))
+    if "schema" not in data and not kept:
+        # Some day there will be another one, and then nobody knows which of the two this file is.
+        raise ScenarioError("the key 'schema' is missing", fix="add schema = 1", where=str(path))
     return scenario
 
 
@@ -235,12 +244,21 @@ def _check(scenario: Scenario, where: str) -> None:
         _check_sumo(scenario, scenario.sumo, where)
     elif scenario.simulator in _TABLES:
         _check_environment(scenario, where)
-    try:
-        scenario.scenario_arguments()
-        for agent in scenario.agents:
-            scenario.agent_arguments(agent)
-    except ArgumentError as error:
-        raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
+
+
+def _check_arguments(scenario: Scenario, *, kept: bool) -> None:
+    """Refuse ranges that are none, and defaults outside of them."""
+    tables = {"arguments": scenario.arguments}
+    tables |= {f"agents.{agent}.arguments": setup.arguments for agent, setup in scenario.agents.items()}
+    for table, setups in tables.items():
+        for name, setup in setups.items():
+            try:
+                range_ = setup.argument(name, f"{scenario.origin}: {table}").distribution
+            except ArgumentError as error:
+                raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
+            if range_ is not None and setup.default is not None and not range_.contains(setup.default) and not kept:
+                message, fix = f"is outside its range {setup.range!r}", "give a default within it, or widen the range"
+                _refuse(scenario.origin, f"{table}.{name}.default", setup.default, message, fix)
 
 
 def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt._names import near_path
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.space import Distribution, Kind, parse_spec
 from crashhunt.trial import CRASHES, Outcome
@@ -158,10 +159,11 @@ def read_settings(path: Path) -> HuntSettings:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise HuntDirectoryError(
-            f"{str(path.parent)!r} is not the directory of a hunt: it has no hunt.toml",
-            fix="give the directory that crashhunt run was given",
-        ) from None
+        place = str(path.parent)
+        what = "is not the directory of a hunt: it has no hunt.toml" if path.parent.is_dir() else "does not exist"
+        hint = "" if path.parent.is_dir() else near_path(path.parent, ".zip")
+        fix = f"{hint}give the directory that crashhunt run was given"
+        raise HuntDirectoryError(f"{place!r} {what}", fix=fix) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise HuntDirectoryError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
     except OSError as error:

@@ -94,7 +94,7 @@ class Snapshot:
 
     def scenario(self) -> Scenario:
         """Return the scenario as it was."""
-        return load_scenario(self.path / "scenario" / "scenario.toml")
+        return load_scenario(self.path / "scenario" / "scenario.toml", kept=True)
 
     def settings(self) -> HuntSettings:
         """Return the settings of the hunt as they were."""
@@ -299,7 +299,7 @@ def _as_dict(scenario: Scenario) -> dict[str, Any]:
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
 
     data: dict[str, Any] = plain(asdict(replace(scenario, folder=Path())))
-    return {key: value for key, value in data.items() if key not in ("folder", "notes")}
+    return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}
 
 
 def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from crashhunt._names import near_path
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import Outcome
@@ -81,7 +82,8 @@ def find_hunts(directory: Path) -> list[Path]:
         HuntDirectoryError: there is none.
     """
     if not directory.is_dir():
-        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt or a suite")
+        fix = f"{near_path(directory)}give the directory of a hunt or a suite"
+        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix=fix)
     if is_hunt(directory):
         return [directory]
     found: set[Path] = set()
@@ -107,7 +109,8 @@ def hunt_state(directory: Path) -> HuntState:
     if not has_begun(directory / "ledger.sqlite") and is_hunt(directory):
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / "request.json"))
     if not directory.is_dir():
-        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix="give the directory of a hunt")
+        fix = f"{near_path(directory)}give the directory of a hunt"
+        raise HuntDirectoryError(f"{str(directory)!r} does not exist", fix=fix)
     try:
         with closing(Ledger(directory / "ledger.sqlite")) as ledger:
             facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()

@@ -15,7 +15,7 @@ import numpy as np
 from crashhunt._validation import validate
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.plan import Request
-from crashhunt.runs import REQUEST, RunRequest, run_all, write_request
+from crashhunt.runs import REQUEST, RunRequest, run_all, slots_of, write_request
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.settings import RunSettings
 from crashhunt.status import HuntState, hunt_state, is_hunt
@@ -189,6 +189,7 @@ class Suite:
         Raises:
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
         """
+        slots_of(parallel)
         folders = self.plan(directory)
         waiting = [folder for folder in folders if hunt_state(folder).state in ("queued", "interrupted", "killed")]
         run_all(waiting, parallel, watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]))

@@ -83,6 +83,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         title=f"{path.name}, as it is",
         name=path.name.removesuffix(".sumocfg"),
         folder=folder,
+        file=os.path.relpath(path.resolve(), folder),
         step_length_s=step_length,
         warmup_s=0.0,
         insertion_timeout_s=_PATIENCE_S,

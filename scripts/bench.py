@@ -619,7 +619,7 @@ def _toy(place: Path) -> Path:
     scenario = place / "toy"
     scenario.mkdir(exist_ok=True)
     (scenario / "scenario.toml").write_text(
-        'simulator = "toy"\n[agents.ego]\nagent = "crashhunt.agents:KeepLaneWithSpeed"\n'
+        'schema = 1\nsimulator = "toy"\n[agents.ego]\nagent = "crashhunt.agents:KeepLaneWithSpeed"\n'
         '[agents.ego.arguments.speed]\ndefault = 1.0\nrange = "1:2"\n'
     )
     return scenario

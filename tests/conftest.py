@@ -103,6 +103,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[S
 
 TOY = """
 title = "A toy"
+schema = 1
 simulator = "toy"
 [arguments.gap_m]
 default = 30.0

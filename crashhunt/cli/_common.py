@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
+from crashhunt._names import did_you_mean, one_of
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,7 +22,30 @@ __all__ = ["Parser", "add_crash", "add_json", "chosen_runs", "integer", "opened_
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports mistakes as every other error is reported."""
+    """Reports mistakes as every other error is reported, and says what was probably meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown options first: argparse would take the value of one for an argument, and complain of that.
+
+        Raises:
+            UsageError: there is no such option.
+        """
+        known = [option for option in self._option_string_actions if option.startswith("--")]
+        for word in takewhile(lambda word: word != "--", args or ()):
+            if any(word in (action.choices or ()) for action in self._actions if action.nargs == argparse.PARSER):
+                break  # what follows is for the command
+            name = word.partition("=")[0]
+            if name.startswith("--") and " " not in name and not any(option.startswith(name) for option in known):
+                fix = f"{did_you_mean(name, known)} see {self.prog} --help".lstrip()
+                raise UsageError(f"there is no option {name!r}", fix=fix)
+        return super().parse_known_args(args, namespace)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        choices = [str(choice) for choice in action.choices or ()]
+        if choices and value not in choices:
+            name = "/".join(action.option_strings) or str(action.metavar or action.dest)
+            what = f"there is no command {value!r}" if name == "COMMAND" else f"{name} {value!r} is none of its choices"
+            raise UsageError(what, fix=one_of(str(value), choices))
 
     def error(self, message: str) -> NoReturn:
         """Refuse a command line.
@@ -98,7 +123,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
     names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_hunts(directory)}
     for run in runs:
         if not any(run in (name, name.partition("/")[0]) for name in names.values()):
-            raise UsageError(f"--run: there is no run {run!r}", fix=f"give one of {', '.join(names.values())}")
+            raise UsageError(f"--run: there is no run {run!r}", fix=one_of(run, names.values()))
     return {hunt: name for hunt, name in names.items() if not runs or {name, name.partition("/")[0]} & set(runs)}
 
 

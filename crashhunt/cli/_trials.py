@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._names import one_of
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     outcomes = [name for name in options.outcome.split(",") if name]
     for name in outcomes:
         if name not in list(Outcome):
-            raise UsageError(f"--outcome {name!r} is none", fix=f"give some of {','.join(Outcome)}")
+            raise UsageError(f"--outcome {name!r} is none", fix=one_of(name, Outcome, give="give some of"))
     hunt = HuntResults(options.directory)
     if options.out is None:
         if options.format == "parquet":

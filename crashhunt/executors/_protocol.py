@@ -49,6 +49,7 @@ class WorkerSettings:
         """Return plain dicts, strings and numbers."""
         data = asdict(self)
         data["scenario"]["folder"] = str(self.scenario.folder)
+        del data["scenario"]["file"]  # the crashhunt of an older snapshot would not know it
         crash_on = [str(outcome) for outcome in self.crash_on]
         return {**data, "schema": _SCHEMA, "scratch": str(self.scratch), "crash_on": crash_on}
 

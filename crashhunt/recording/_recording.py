@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt._names import one_of
 from crashhunt.errors import BundleError
 from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.scene import Actor, Contact, Roster, Scene
@@ -186,7 +187,9 @@ class Recording:
         for channel in self.prologue.agents:
             if channel.id == agent:
                 return channel
-        raise BundleError(f"there is no agent {agent!r} in the recording", fix=f"it has {', '.join(self.agents)}")
+        raise BundleError(
+            f"there is no agent {agent!r} in the recording", fix=one_of(agent, self.agents, give="it has")
+        )
 
     def _read(self) -> None:
         agents = self.prologue.agents

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._names import did_you_mean
 from crashhunt.errors import UsageError
 from crashhunt.oracles import approaches
 
@@ -41,10 +41,9 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str) -> list
     for field in fields:
         name = field.replace(" ", "")
         if name != "action" and name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {close[0]!r}? " if close else ""
+            hint = did_you_mean(name, known)
             shown = ", ".join([*_SCENE, "reward", *_MEASURED, "action", *actions, *list(observed)[:3]])
-            raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint}there are {shown}, …")
+            raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
         names += actions if name == "action" else (name,)
     measured: dict[str, Any] = {}
     if set(names) & set(_MEASURED):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 from highway_env.vehicle.objects import RoadObject
 
+from crashhunt._names import did_you_mean
 from crashhunt.errors import ScenarioError
 from crashhunt.simulators._options import as_tables, merge
 
@@ -88,8 +88,7 @@ def _let_in(scenario: Scenario, config: dict[str, Any]) -> None:
 def _check_keys(scenario: Scenario, config: Mapping[str, Any], table: Mapping[str, Any]) -> None:
     for key in table:
         if key not in config and not key.endswith("_reward"):  # which is 0 where it is not there
-            close = difflib.get_close_matches(key, config, 1)
-            fix = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(config)}"
+            fix = did_you_mean(key, config) or f"it has {', '.join(config)}"
             raise mistake(scenario, "config", key, "is no entry of the environment's configuration", fix)
 
 

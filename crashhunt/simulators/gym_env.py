@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from crashhunt._names import one_of
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.errors import UsageError
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
@@ -55,7 +56,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         chosen = load_scenario(scenario)
         if agent and agent not in chosen.agents:
-            raise UsageError(f"there is no controlled vehicle {agent!r}", fix=f"give one of {', '.join(chosen.agents)}")
+            raise UsageError(f"there is no controlled vehicle {agent!r}", fix=one_of(agent, chosen.agents))
         self.agent = agent or next(iter(chosen.agents))
         if action:
             chosen = with_action(chosen, self.agent, action)

@@ -39,6 +39,7 @@ def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
 
 
 POLE = """
+schema = 1
 title = "A pole on a cart, which falls"
 simulator = "gym"
 [gym]
@@ -81,6 +82,7 @@ class Swing:
         return observation["speed"] * 0 + push
 """
 SWING = """
+schema = 1
 simulator = "gym"
 [gym]
 id = "shaky:make"
@@ -132,7 +134,7 @@ def test_an_environment_of_ones_own_is_part_of_the_snapshot(shell):
     ],
 )
 def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
-    (shell.folder / "scenario.toml").write_text(f'simulator = "highway"\n{table}\n')
+    (shell.folder / "scenario.toml").write_text(f'schema = 1\nsimulator = "highway"\n{table}\n')
     done = shell.crashhunt("run", "h", "1", "1", "5", "--scenario", ".", expect=2)
     assert says in done.err
     assert len(done.err.strip().splitlines()) == 1
@@ -205,6 +207,7 @@ def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
 
 
 WIDER = """
+schema = 1
 simulator = "highway"
 [highway]
 id = "roundabout-generic-v1"

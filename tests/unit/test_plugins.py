@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import sys
 from typing import Annotated
 
@@ -73,3 +74,30 @@ def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says)
     sys.modules.pop("broken", None)
     assert says in str(caught.value)
     assert caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "where", "says"),
+    [
+        ("import os\nimport not_there", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
+        ("import os\nimport not_there.inner", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
+        ("import json\n\njson.loads('x')", "broken:Agent", "broken.py, line 3", "JSONDecodeError"),
+        ("def f():\n  return (", "broken:Agent", "broken.py, line 2", "SyntaxError"),
+        ("import sys\nsys.exit(3)", "broken:Agent", "broken.py, line 2", "SystemExit: 3"),
+        ("from json import nothing", "broken:Agent", "broken.py, line 1", "cannot import name 'nothing'"),
+        ("", "brokn:Agent", "", "there is no module 'brokn'; did you mean 'broken'?"),
+        ("", "broken.inner:Agent", "", "there is no module 'broken.inner'"),
+        ("x\0y", "broken:Agent", "", "null bytes"),
+    ],
+)
+def test_an_import_that_fails_says_where(tmp_path, monkeypatch, content, name, where, says):
+    (tmp_path / "broken.py").write_text(content)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    sys.modules.pop("broken", None)
+    importlib.invalidate_caches()
+    with pytest.raises(PluginError) as caught:
+        locate("agents", name)
+    sys.modules.pop("broken", None)
+    assert caught.value.where == where
+    assert says in str(caught.value)

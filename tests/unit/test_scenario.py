@@ -72,6 +72,13 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
         (("observation",), {"features": ["smell"]}, ["observation.features", "'smell'"]),
         (("arguments", "vehicles"), None, ["'vehicles'", "traffic.rou.xml"]),
         (("schema",), 2, ["schema", "2"]),
+        (("schema",), None, ["'schema' is missing", "add schema = 1"]),
+        (("arguments", "vehicles", "default"), 40, ["arguments.vehicles.default = 40", "'10:35'"]),
+        (
+            ("agents", "ego", "arguments", "speed", "default"),
+            4.0,
+            ["speed.default = 4.0", "'5:25'"],
+        ),
         (("sumo", "options"), {"seed": 3}, ["seed", "sets itself"]),
     ],
 )
@@ -85,6 +92,46 @@ def test_a_mistake_is_named_with_file_key_value_and_fix(loop, keys, value, says)
     assert str(loop) in text
     assert caught.value.fix
     assert "\n" not in text
+
+
+@pytest.mark.parametrize("file", ["bad.toml", "scenario.toml"])
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("simulater",), "sumo"),
+        (("agents", "ego", "arguments", "speed", "range"), "5:x"),
+        (("agents", "ego", "arguments", "speed", "default"), 4.0),
+        (("sumo", "net"), "gone.net.xml"),
+    ],
+)
+def test_an_error_names_the_file_that_was_read(loop, keys, value, file):
+    change(loop, *keys, value=value)
+    (loop / "scenario.toml").rename(loop / file)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(loop / file)
+    assert caught.value.where.startswith(str(loop / file))
+
+
+def test_what_ran_before_is_not_refused_in_a_snapshot(loop):
+    change(loop, "arguments", "vehicles", "default", value=40)
+    change(loop, "schema", value=None)
+    assert load_scenario(loop / "scenario.toml", kept=True).arguments["vehicles"].default == 40
+
+
+def test_a_path_that_is_not_there_has_a_neighbour(loop, monkeypatch):
+    monkeypatch.chdir(loop.parent)
+    for name, says in (
+        ("owm", "did you mean 'own'?"),
+        ("own/scenari.toml", "did you mean 'own/scenario.toml'?"),
+        ("Loop", "did you mean 'loop'?"),
+        (".", "give the folder that has one"),
+    ):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(name)
+        assert says in caught.value.fix
+    (loop / "scenario.toml").rename(loop / "mine.toml")
+    with pytest.raises(ScenarioError, match=r"own: the folder has no scenario\.toml; give own/mine\.toml"):
+        load_scenario("own")
 
 
 @pytest.mark.parametrize("content", ["", "title = ", "\x00", "a = 1\na = 2"])
@@ -194,6 +241,7 @@ def test_files_beside_and_above_and_compressed(town):
         file.write((town / "r.rou.xml").read_bytes())
     path = sumocfg(town / "cfg", '<net-file value="../net.net.xml"/><route-files value="../r.rou.xml.gz"/>')
     scenario = load_scenario(path)
+    assert scenario.origin == str(path)
     assert scenario.folder == town
     assert sorted(scenario.files()) == ["net.net.xml", "r.rou.xml.gz"]
     assert list(scenario.agents) == ["odd name #1"]
