@@ -11,10 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import hypothesis
 import pytest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+# A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
+hypothesis.settings.register_profile("crashhunt", deadline=None)
+hypothesis.settings.load_profile("crashhunt")
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
