@@ -130,6 +130,7 @@ class Hunt:
             done_before=len(finished),
             heartbeat=time.time(),
             planned=settings.trials,
+            hunt_seed=settings.seed,
         )
         stopped: StoppedBecause | None = None
         if progress.crashes and not settings.run.keep_going:

@@ -1,17 +1,33 @@
-"""The ledger: facts about trials in one SQLite file; one writer, any number of readers, also while the hunt runs."""
+"""The ledger: facts about trials in one SQLite file; one writer, any number of readers, also while the hunt runs.
+
+Every row has a digest of its content, which whoever reads the row checks. A writer that closes the file *seals* it: it
+writes down how many trials ended how and a digest over what counts and ranks them, so that those who read no whole rows
+see a change too, and that a row that is gone is missed. While a hunt runs, and after it was killed, there is no seal.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 import sqlite3
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._ledger_file import (
+    COLUMNS,
+    PROTECTED,
+    checked,
+    create,
+    damaged,
+    explained,
+    migrate,
+    plain_trial,
+    version_of,
+)
 from crashhunt.errors import HuntDirectoryError
+from crashhunt.integrity import digest_of_row
 from crashhunt.trial import TrialResult
-from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -19,27 +35,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Ledger", "has_begun"]
 
-_VERSION = 1  # of the tables, as PRAGMA user_version
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS trials (
-    number INTEGER PRIMARY KEY,
-    seed INTEGER NOT NULL,
-    outcome TEXT NOT NULL,
-    steps INTEGER NOT NULL,
-    time_to_collision_s REAL,
-    gap_m REAL,
-    required_deceleration REAL,
-    wall_s REAL NOT NULL,
-    ended_at REAL NOT NULL,
-    snapshot TEXT NOT NULL,
-    result TEXT NOT NULL
-) STRICT;
--- What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
-CREATE INDEX IF NOT EXISTS trials_by_outcome ON trials (outcome, time_to_collision_s, number, steps, seed);
-CREATE TABLE IF NOT EXISTS replaced (number INTEGER, replaced_at REAL, result TEXT NOT NULL) STRICT;
-CREATE TABLE IF NOT EXISTS events (at REAL NOT NULL, state TEXT NOT NULL, detail TEXT NOT NULL) STRICT;
-CREATE TABLE IF NOT EXISTS hunt (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID;
-"""
+_SEAL = "seal"
+_CHUNK = 4096
 
 
 def has_begun(path: Path) -> bool:
@@ -52,14 +49,15 @@ class Ledger:
 
     Args:
         path: of ``ledger.sqlite``.
-        writable: the one writer; creates the file.
+        writable: the one writer; creates the file, and brings one of an earlier version to this one.
 
     Raises:
-        HuntDirectoryError: the file cannot be opened, or is not a ledger.
+        HuntDirectoryError: the file cannot be opened, is not a ledger, or is damaged.
     """
 
     def __init__(self, path: Path, *, writable: bool = False) -> None:
         self._path = path
+        self._writable = False
         if not writable and not path.exists():
             raise HuntDirectoryError(
                 f"{str(path.parent)!r} is not the directory of a hunt: it has no ledger.sqlite",
@@ -67,7 +65,7 @@ class Ledger:
             )
         try:
             if writable and not has_begun(path):
-                _create(path)
+                create(path)
             self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
             with ExitStack() as failed:
                 failed.callback(self._database.close)
@@ -75,10 +73,23 @@ class Ledger:
                     # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
                     self._database.execute("PRAGMA journal_mode = WAL")
                     self._database.execute("PRAGMA synchronous = NORMAL")
-                self._check()
+                self._version = version_of(self._database, path)
+                if writable:
+                    self._break_seal()
+                    self._writable = True
                 failed.pop_all()
         except sqlite3.Error as error:
-            raise self._explained(error) from error
+            raise explained(path, error) from error
+
+    @property
+    def protected(self) -> bool:
+        """Whether every row has a digest; the earliest ledgers had none."""
+        return self._version >= PROTECTED
+
+    @property
+    def sealed(self) -> bool:
+        """Whether whoever wrote last has closed it."""
+        return self._seal() is not None
 
     def record(self, result: TrialResult, *, snapshot: str) -> None:
         """Add a trial that has ended; one that ran again replaces its row.
@@ -92,64 +103,77 @@ class Ledger:
             result.spec.seed,
             str(result.outcome),
             result.steps,
-            closest["time_to_collision_s"],
-            closest["gap_m"],
-            closest["required_deceleration"],
-            result.wall_s,
+            _real(closest["time_to_collision_s"]),
+            _real(closest["gap_m"]),
+            _real(closest["required_deceleration"]),
+            float(result.wall_s),
             time.time(),
             snapshot,
             json.dumps(result.to_json()),
         )
-        try:
-            self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
-        except sqlite3.Error as error:
-            raise self._explained(error) from error
+        self._insert(row)
+
+    def copy(self, row: tuple[Any, ...]) -> None:
+        """Add a row that `intact_rows` of another ledger has yielded."""
+        self._insert(row)
 
     def note(self, **facts: Any) -> None:
-        """Set facts about the hunt itself, such as its state; None removes one."""
+        """Set facts about the hunt itself, such as its state; None removes one.
+
+        When this returns, everything that was recorded so far is on the disk, and stays there if the power goes. It is
+        called about once a second; after every trial it would cost more than the trials.
+        """
         try:
-            for key, value in facts.items():
-                if value is None:
-                    self._database.execute("DELETE FROM hunt WHERE key = ?", (key,))
-                else:
-                    self._database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?)", (key, json.dumps(value)))
+            with self._lasting():
+                for key, value in facts.items():
+                    self._note(key, value)
         except sqlite3.Error as error:
-            raise self._explained(error) from error
+            raise explained(self._path, error) from error
 
     def enter(self, state: str, detail: str = "", **facts: Any) -> None:
         """Set the state of the hunt, and write down when it got there and why."""
         self.note(state=state, detail=detail or None, **facts)
+        event = (time.time(), state, detail)
         try:
-            self._database.execute("INSERT INTO events VALUES (?, ?, ?)", (time.time(), state, detail))
+            with self._lasting():
+                self._database.execute("INSERT INTO events VALUES (?, ?, ?, ?)", (*event, digest_of_row(event)))
         except sqlite3.Error as error:
-            raise self._explained(error) from error
+            raise explained(self._path, error) from error
 
     def events(self) -> list[tuple[float, str, str]]:
         """Return when the hunt got into which state, and why."""
-        return list(self._select("SELECT at, state, detail FROM events ORDER BY rowid"))
+        rows = self._select(f"SELECT at, state, detail{self._digest} FROM events ORDER BY rowid")
+        return [self._checked(row, "what it says of its states")[:3] for row in rows]
 
     def replace(self, numbers: Iterable[int]) -> int:
         """Move trials out of the way so that they run again; return how many there were."""
-        rows = [(number, time.time(), number) for number in numbers]
+        gone = 0
         try:
             with self._database:
                 self._database.execute("BEGIN")
-                self._database.executemany(
-                    "INSERT INTO replaced SELECT ?, ?, result FROM trials WHERE number = ?", rows
-                )
-                gone = self._database.executemany("DELETE FROM trials WHERE number = ?", [row[:1] for row in rows])
+                for number in numbers:
+                    found = self.result_text(number)
+                    if found is not None:
+                        row = (number, time.time(), found)
+                        self._database.execute("INSERT INTO replaced VALUES (?, ?, ?, ?)", (*row, digest_of_row(row)))
+                        self._database.execute("DELETE FROM trials WHERE number = ?", (number,))
+                        gone += 1
         except sqlite3.Error as error:
-            raise self._explained(error) from error
-        return gone.rowcount
+            raise explained(self._path, error) from error
+        return gone
 
     def replaced(self) -> list[TrialResult]:
         """Return the trials that ran again, as they were."""
-        rows = self._select("SELECT result FROM replaced ORDER BY rowid")
-        return [TrialResult.from_json(json.loads(text)) for (text,) in rows]
+        rows = self._select(f"SELECT number, replaced_at, result{self._digest} FROM replaced ORDER BY rowid")
+        return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
 
     def facts(self) -> dict[str, Any]:
         """Return the facts about the hunt itself."""
-        return {key: json.loads(value) for key, value in self._select("SELECT key, value FROM hunt")}
+        rows = [self._checked(row, "a fact") for row in self._select(f"SELECT key, value{self._digest} FROM hunt")]
+        try:
+            return {row[0]: json.loads(row[1]) for row in rows if row[0] != _SEAL}
+        except (ValueError, TypeError, RecursionError) as error:
+            raise damaged(self._path, f"a fact cannot be read: {error}") from None
 
     def finished(self) -> set[int]:
         """Return the numbers of the trials that have ended."""
@@ -157,31 +181,66 @@ class Ledger:
 
     def outcomes(self) -> dict[str, int]:
         """Return how many trials ended how."""
-        return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+        seal = self._seal()
+        found = self._outcomes()
+        self._compare_seal(seal, "outcomes", found)
+        return found
 
     def steps_total(self) -> int:
         """Return how many steps were run in all."""
-        return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
+        seal = self._seal()
+        found = self._steps()
+        self._compare_seal(seal, "steps", found)
+        return found
 
     def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
         """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
-        return map(TrialResult.from_json, self.plain_results(outcomes=outcomes))
+        return map(self._result, self.plain_results(outcomes=outcomes))
 
     def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
-        """Yield the same as plain data, which takes a third of the time."""
+        """Yield the same as plain data, which takes a third of the time.
+
+        Raises:
+            HuntDirectoryError: a trial is not as it was written, or one is missing; those before were yielded.
+        """
         where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
-        for (text,) in self._select(f"SELECT result FROM trials {where} ORDER BY number", outcomes):
-            yield json.loads(text)
+        seal, count = self._seal(), 0
+        for row in self._select(f"SELECT {COLUMNS}{self._digest} FROM trials {where} ORDER BY number", outcomes):
+            count += 1
+            yield self._plain(row)
+        if seal is not None:
+            said = {name: number for name, number in seal["outcomes"].items() if not outcomes or name in outcomes}
+            if count != sum(said.values()) and self._seal() == seal:
+                raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
+
+    def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, tuple[Any, ...] | None]]:
+        """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
+        for number in numbers:
+            try:
+                row = self._row(number)
+                if row is not None:
+                    self._plain(row)
+                    yield number, row[:11]
+            except HuntDirectoryError:
+                yield number, None
 
     def result(self, number: int) -> TrialResult | None:
         """Return one trial, or None where it has not ended."""
-        row = next(self._select("SELECT result FROM trials WHERE number = ?", (number,)), None)
-        return TrialResult.from_json(json.loads(row[0])) if row else None
+        row = self._row(number)
+        if row is None:
+            self.outcomes()  # which finds out whether one is missing
+            return None
+        return self._result(self._plain(row))
+
+    def result_text(self, number: int) -> str | None:
+        """Return one trial as it is written, or None where it has not ended."""
+        row = self._row(number)
+        return None if row is None else str(self._plain(row) and row[10])
 
     def snapshot_of(self, number: int) -> str:
         """Return the digest of the snapshot that a trial ran from."""
-        row = next(self._select("SELECT snapshot FROM trials WHERE number = ?", (number,)), None)
-        return str(row[0]) if row else ""
+        row = self._row(number)
+        return str(self._plain(row) and row[9]) if row else ""
 
     def nearest_miss(self) -> TrialResult | None:
         """Return the trial that did not crash and came nearest to it, by time to collision."""
@@ -197,51 +256,141 @@ class Ledger:
         return self.result(min(least)[1]) if least else None
 
     def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
-        """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order."""
-        yield from self._select(
-            "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome"
-        )
+        """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.
+
+        Raises:
+            HuntDirectoryError: they are not as they were written; they were yielded all the same.
+        """
+        seal = self._seal()
+        if seal is None:  # without one, only the whole rows say whether they are as they were written
+            for row in self._select(f"SELECT {COLUMNS}{self._digest} FROM trials ORDER BY number"):
+                self._plain(row)
+                yield row[:5]
+            return
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+            yield from rows
+        self._compare_seal(seal, "table", said.hexdigest())
 
     def last_ended_at(self) -> float | None:
         """Return when the last trial ended, in s since the epoch; None where none has."""
-        row = next(self._select("SELECT ended_at FROM trials ORDER BY number DESC LIMIT 1"), None)
-        return float(row[0]) if row else None
+        row = next(self._select(f"SELECT {COLUMNS}{self._digest} FROM trials ORDER BY number DESC LIMIT 1"), None)
+        return float(row[8]) if row and self._plain(row) else None
+
+    def close(self) -> None:
+        """Close the file; a writer seals it before."""
+        if self._writable:
+            with suppress(sqlite3.Error, HuntDirectoryError):  # on a full disk it stays without
+                self._note(_SEAL, self._make_seal())
+            self._writable = False
+        self._database.close()
+
+    @property
+    def _digest(self) -> str:
+        return ", digest" if self.protected else ""
+
+    def _insert(self, row: tuple[Any, ...]) -> None:
+        values = (*row, digest_of_row(row))
+        try:
+            self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+        except sqlite3.Error as error:
+            raise explained(self._path, error) from error
+
+    def _note(self, key: str, value: Any) -> None:
+        if value is None:
+            self._database.execute("DELETE FROM hunt WHERE key = ?", (key,))
+        else:
+            row = (key, json.dumps(value))
+            self._database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
+
+    @contextmanager
+    def _lasting(self) -> Iterator[None]:
+        """Have one commit wait for the disk, which takes along all those before that did not."""
+        self._database.execute("PRAGMA synchronous = FULL")
+        try:
+            with self._database:
+                self._database.execute("BEGIN")
+                yield
+        finally:
+            self._database.execute("PRAGMA synchronous = NORMAL")
 
     def _select(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         try:
-            yield from self._database.execute(query, values)
+            for row in self._database.execute(query, values):  # noqa: UP028 - it would close the cursor, maybe too late
+                yield row
         except sqlite3.Error as error:  # also in the middle of a file that is damaged
-            raise self._explained(error) from error
+            raise explained(self._path, error) from error
 
-    def _check(self) -> None:
-        found = int(self._database.execute("PRAGMA user_version").fetchone()[0])
-        self._database.execute("SELECT count(*) FROM hunt").fetchone()
-        if found != _VERSION:
-            raise HuntDirectoryError(
-                f"a ledger of version {found}, and this crashhunt reads version {_VERSION}",
-                fix="use the crashhunt that made it, or run with --overwrite to begin anew",
-                where=str(self._path),
+    def _row(self, number: int) -> tuple[Any, ...] | None:
+        return next(self._select(f"SELECT {COLUMNS}{self._digest} FROM trials WHERE number = ?", (number,)), None)
+
+    def _checked(self, row: tuple[Any, ...], what: str) -> tuple[Any, ...]:
+        return checked(row, what, self._path) if self.protected else row
+
+    def _plain(self, row: tuple[Any, ...]) -> dict[str, Any]:
+        return plain_trial(self._checked(row, f"trial {row[0]}"), self._path, trusted=self.protected)
+
+    def _result(self, data: dict[str, Any]) -> TrialResult:
+        try:
+            return TrialResult.from_json(data)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(self._path, f"a trial cannot be read: {type(error).__name__}: {error}") from None
+
+    def _seal(self) -> dict[str, Any] | None:
+        if not self.protected:
+            return None
+        row = next(self._select("SELECT key, value, digest FROM hunt WHERE key = ?", (_SEAL,)), None)
+        if row is None:
+            return None
+        found: dict[str, Any] = json.loads(self._checked(row, "its seal")[1])
+        return found
+
+    def _make_seal(self) -> dict[str, Any]:
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+        return {"outcomes": self._outcomes(), "steps": self._steps(), "table": said.hexdigest()}
+
+    def _break_seal(self) -> None:
+        """See that what is there is as it was written before anything is added to it."""
+        if not self.protected or not self.sealed:
+            for _ in self.plain_results():
+                pass
+        elif self._seal() != self._make_seal():
+            raise damaged(self._path, "trials are missing or have changed")
+        if not self.protected:
+            migrate(self._database)
+            self._version = version_of(self._database, self._path)
+        if self.sealed:
+            self._note(_SEAL, None)
+
+    def _compare_seal(self, seal: dict[str, Any] | None, name: str, found: object) -> None:
+        # A writer may have come meanwhile; then it is another seal, or none.
+        if seal is not None and found != seal[name] and self._seal() == seal:
+            raise damaged(self._path, "trials are missing or have changed")
+
+    def _outcomes(self) -> dict[str, int]:
+        return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+
+    def _steps(self) -> int:
+        return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
+
+    def _chunks(self) -> Iterator[list[tuple[Any, ...]]]:
+        try:
+            cursor = self._database.execute(
+                "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
+                "ORDER BY outcome, time_to_collision_s, number"
             )
-
-    def close(self) -> None:
-        """Close the file."""
-        self._database.close()
-
-    def _explained(self, error: sqlite3.Error) -> HuntDirectoryError:
-        where = str(self._path)
-        text = str(error)
-        if "full" in text or "disk I/O" in text:
-            return HuntDirectoryError(
-                f"the disk is full ({text})", fix="free some space and run the same command again", where=where
-            )
-        if "unable to open" in text or "readonly" in text:
-            reason = "is not writable" if os.path.exists(self._path.parent) else "does not exist"  # noqa: PTH110
-            return HuntDirectoryError(f"the folder {reason} ({text})", fix="choose another", where=where)
-        return HuntDirectoryError(f"not a ledger of crashhunt ({text})", fix="choose another directory", where=where)
+            while rows := cursor.fetchmany(_CHUNK):
+                yield rows
+        except sqlite3.Error as error:
+            raise explained(self._path, error) from error
 
 
-def _create(path: Path) -> None:
-    """Make an empty ledger, as a whole: whoever sees the file can read it."""
-    path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
-    with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
-        database.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {_VERSION}; COMMIT;")
+def _real(value: float | None) -> float | None:
+    return None if value is None else float(value)  # as SQLite gives it back
+
+
+def _as_text(rows: list[tuple[Any, ...]]) -> bytes:
+    return "".join(map(repr, rows)).encode()

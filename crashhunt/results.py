@@ -15,7 +15,7 @@ from crashhunt._names import one_of
 from crashhunt.bundle import Bundle, list_bundles
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.executors import Parts, WorkerSettings
-from crashhunt.ledger import Ledger
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plan import with_settings
 from crashhunt.settings import HuntSettings, read_settings
 from crashhunt.snapshot import Snapshot, latest_snapshot
@@ -65,8 +65,23 @@ class HuntResults:
 
     @cached_property
     def settings(self) -> HuntSettings:
-        """What was asked."""
-        return read_settings(self.directory / "hunt.toml")
+        """What was asked.
+
+        Raises:
+            HuntDirectoryError: hunt.toml is missing or damaged, or the ledger is that of another hunt.
+        """
+        settings = read_settings(self.directory / "hunt.toml")
+        if not has_begun(self.directory / "ledger.sqlite"):
+            return settings
+        with closing(self._ledger()) as ledger:
+            seed = ledger.facts().get("hunt_seed", settings.seed)
+        if seed != settings.seed:
+            raise HuntDirectoryError(
+                f"hunt.toml says seed {settings.seed}, and the trials are those of seed {seed}",
+                fix="put the files of one hunt together, or write back the seed",
+                where=str(self.directory),
+            )
+        return settings
 
     @property
     def crashes(self) -> list[Bundle]:
@@ -80,13 +95,13 @@ class HuntResults:
 
     def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
         """Yield the trials in order of their numbers, all or those that ended in one of some ways."""
-        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
+        with closing(self._ledger()) as ledger:
             yield from ledger.results(outcomes=tuple(outcomes))
 
     def rows(self, *, outcomes: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
         """Yield the trials as rows of the table that `trials` returns."""
         names = columns_of(self.settings)
-        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
+        with closing(self._ledger()) as ledger:
             for data in ledger.plain_results(outcomes=tuple(outcomes)):
                 yield _row(data, names)
 
@@ -96,7 +111,7 @@ class HuntResults:
         Raises:
             UsageError: it has not ended.
         """
-        with closing(Ledger(self.directory / "ledger.sqlite")) as ledger:
+        with closing(self._ledger()) as ledger:
             found = ledger.result(number)
         if found is None:
             raise UsageError(f"trial {number} has not ended", fix=f"{self.state.trials_run} trials have")
@@ -151,6 +166,9 @@ class HuntResults:
             settings = WorkerSettings(scenario=self.scenario, oracles=(), crash_on=(), scratch=Path(folder))
             parts = Parts(settings)
             return parts.agent(name, parts.simulator(), arguments[name])
+
+    def _ledger(self) -> Ledger:
+        return Ledger(self.directory / "ledger.sqlite")
 
     def _snapshot(self) -> Snapshot:
         found = latest_snapshot(self.directory)

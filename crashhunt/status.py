@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from crashhunt._ledger_file import damaged
 from crashhunt._names import near_path
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger, has_begun
@@ -46,6 +47,7 @@ class HuntState:
         rate_per_s: trials a second, in its last run.
         seconds_left: to the last trial, at that rate; None where it does not run.
         owner_alive: whether its process is there.
+        damaged: whether its ledger cannot be read, so that the counts say nothing.
     """
 
     dir: str
@@ -59,6 +61,7 @@ class HuntState:
     rate_per_s: float = 0.0
     seconds_left: float | None = None
     owner_alive: bool = False
+    damaged: bool = False
 
     @property
     def failed(self) -> bool:
@@ -114,10 +117,18 @@ def hunt_state(directory: Path) -> HuntState:
     try:
         with closing(Ledger(directory / "ledger.sqlite")) as ledger:
             facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
+            return _state(directory, facts, outcomes, last)
     except HuntDirectoryError as error:
         if not (directory / "ledger.sqlite").exists():
             raise
-        return HuntState(str(directory), "error", error.message)  # one that cannot be read hides no other
+        # One that cannot be read hides no other.
+        return HuntState(str(directory), "error", str(error), damaged=True)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:  # facts of an early ledger
+        wrong = damaged(directory / "ledger.sqlite", f"a fact cannot be read: {type(error).__name__}: {error}")
+        return HuntState(str(directory), "error", str(wrong), damaged=True)
+
+
+def _state(directory: Path, facts: dict[str, Any], outcomes: dict[str, int], last: float | None) -> HuntState:
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))

@@ -7,12 +7,25 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.integrity import typed
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.space import Value
 
-__all__ = ["CRASHES", "ClosestApproach", "Collision", "Failure", "Outcome", "TrialResult", "TrialSpec", "finite"]
+__all__ = [
+    "CRASHES",
+    "ClosestApproach",
+    "Collision",
+    "Failure",
+    "Outcome",
+    "TrialResult",
+    "TrialSpec",
+    "check_parts",
+    "check_plain",
+    "finite",
+]
 
 
 class Outcome(StrEnum):
@@ -256,3 +269,47 @@ def finite(data: dict[str, Any]) -> dict[str, Any]:
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in data.items()
     }
+
+
+_TEXT_OR_NUMBER = bool | float | str | None
+_SPEC = {
+    "number": int,
+    "seed": int,
+    "max_steps": int,
+    "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
+    "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
+}
+_CLOSEST = dict.fromkeys(("time_to_collision_s", "gap_m", "required_deceleration"), float | None)
+_COLLISION: dict[str, Any] = {
+    **dict.fromkeys(("agent", "role", "collider", "victim", "kind", "lane"), str),
+    **dict.fromkeys(("x", "y", "collider_speed", "victim_speed"), float | None),
+    "seen_by": list[str],
+}
+_FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
+
+
+def check_plain(data: Mapping[str, Any]) -> None:
+    """See that plain data has the types that `TrialResult.from_json` takes for granted.
+
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    typed(data, {"outcome": str, "steps": int, "sim_time_s": float, "digest": str, "wall_s": float, "spec": dict})
+    typed(data["spec"], _SPEC)
+    check_parts(data["closest"], data["collision"], data["failure"])
+    if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
+        raise ValueError("a number is below 0")
+
+
+def check_parts(closest: Any, collision: Any, failure: Any) -> None:
+    """See the same of what a trial ended with, where anything is there.
+
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    for name, part, types in (
+        ("closest", closest, _CLOSEST), ("collision", collision, _COLLISION), ("failure", failure, _FAILURE)
+    ):  # fmt: skip
+        typed({name: part}, {name: dict if name == "closest" else dict | None})
+        if part is not None:
+            typed(part, types)

@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import shutil
-import sqlite3
 import statistics
 import subprocess
 import sys
@@ -401,19 +400,15 @@ def bench_replay() -> Iterator[Figure]:
 
 def _large_ledger(directory: Path, trials: int) -> None:
     """Grow a hunt to so many trials, by copying those that it has."""
-    with closing(sqlite3.connect(directory / "ledger.sqlite")) as database:
-        names = [name for _, name, *_ in database.execute("PRAGMA table_info(trials)") if name != "number"]
-        columns = ", ".join(names)
-        (have,) = database.execute("SELECT count(*) FROM trials").fetchone()
-        while have < trials:
-            take = min(have, trials - have)
-            database.execute(
-                f"INSERT INTO trials (number, {columns}) "
-                f"SELECT number + {have}, {columns} FROM trials WHERE number < {take}"
-            )
-            have += take
-        database.execute(f"UPDATE hunt SET value = '{trials}' WHERE key = 'planned'")
-        database.commit()
+    from crashhunt.ledger import Ledger
+
+    with closing(Ledger(directory / "ledger.sqlite", writable=True)) as ledger:
+        rows = [row for _, row in ledger.intact_rows(range(trials)) if row is not None]
+        ledger._database.execute("BEGIN")
+        for number in range(len(rows), trials):
+            ledger.copy((number, *rows[number % len(rows)][1:]))
+        ledger._database.execute("COMMIT")
+        ledger.note(planned=trials)
 
 
 def bench_scale() -> Iterator[Figure]:

@@ -40,13 +40,14 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
     from rich.live import Live
 
     if options.json:
-        print(json.dumps({"hunts": [state.to_json() for state in _states(options.directories)]}))
-        return 0
+        states = _states(options.directories)
+        print(json.dumps({"hunts": [state.to_json() for state in states]}))
+        return _exit_code(states)
     console = states_console()
     states = _states(options.directories)
     if not options.watch:
         show_states(states, console)
-        return 0
+        return _exit_code(states)
     with Live(states_table(states), console=console, auto_refresh=False) as live:
         while any(state.state in ("running", "queued") for state in states):
             time.sleep(1.0)
@@ -104,3 +105,7 @@ def show_states(states: list[HuntState], console: Console) -> None:
     for state in states:
         if state.detail:
             console.print(f"{state.dir}: {state.detail.splitlines()[0]}", markup=False, soft_wrap=True)
+
+
+def _exit_code(states: list[HuntState]) -> int:
+    return 2 if any(state.damaged for state in states) else 0

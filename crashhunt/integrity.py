@@ -1,0 +1,111 @@
+"""Digests by which whoever reads something sees that it is what was written.
+
+They keep nobody out, for there is no key: they find accidents and edits, whichever program made them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from typing import TYPE_CHECKING, Any, get_args, get_origin
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+__all__ = ["digest_of_data", "digest_of_file", "digest_of_row", "parse_object", "read_object", "typed"]
+
+
+def digest_of_row(values: tuple[Any, ...]) -> int:
+    """Return the digest of a row of a table: 64 bits, with a sign, as SQLite keeps them in the least space."""
+    text = "\0".join(map(str, values))  # a trial's cost is counted in microseconds, and JSON would take twice as long
+    digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=8).digest()
+    return int.from_bytes(digest, "little", signed=True)
+
+
+def digest_of_data(data: Mapping[str, Any]) -> str:
+    """Return the digest of a JSON object, in hexadecimal, however it is laid out and ordered."""
+    text = json.dumps(data, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def digest_of_file(path: Path) -> str:
+    """Return the digest of a file's content, in hexadecimal.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is not one, with the reason in one line.
+    """
+    return parse_object(path.read_bytes())
+
+
+def parse_object(text: bytes) -> dict[str, Any]:
+    """Return the JSON object that a text is.
+
+    Raises:
+        ValueError: it is not one, with the reason in one line.
+    """
+
+    def refuse(name: str) -> Any:
+        raise ValueError(f"{name} is no JSON")
+
+    try:
+        # JSON has no NaN, which would make two equal objects differ. A number that is no number of ours is none either.
+        found = json.loads(text, parse_constant=refuse)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"it holds {type(found).__name__}, not an object")
+    return found
+
+
+def typed(data: Mapping[str, Any], types: Mapping[str, Any]) -> None:
+    """See that an object has some keys, and of which types their values are.
+
+    Args:
+        data: the object.
+        types: key to type: a class, a union of classes, ``list[...]`` or ``dict[str, ...]``. An int is a float too.
+
+    Raises:
+        ValueError: with the key, its value and the type.
+    """
+    for key, kind in types.items():
+        if key not in data:
+            raise ValueError(f"{key!r} is missing")
+        if not _is(data[key], kind):
+            raise ValueError(f"{key} is {_short(data[key])}, not {_words(kind)}")
+
+
+def _is(value: Any, kind: Any) -> bool:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is list:
+        return isinstance(value, list) and all(_is(item, inner[0]) for item in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(_is(item, inner[1]) for item in value.values())
+    if inner:  # a union
+        return any(_is(value, choice) for choice in inner)
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+    return isinstance(value, kind)
+
+
+def _words(kind: Any) -> str:
+    return re.sub(r"<class '([^']+)'>", r"\1", str(kind))
+
+
+def _short(value: Any) -> str:
+    text = repr(value) if not isinstance(value, int) or abs(value) < 2**64 else "a number that is too large"
+    return text if len(text) <= 60 else f"{text[:57]}…"
