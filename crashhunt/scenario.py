@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 from crashhunt._names import did_you_mean, listed, near_path
 from crashhunt.errors import ArgumentError, ScenarioError
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
-from crashhunt.simulators._sumo_files import RESERVED
+from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true
+from crashhunt.simulators._sumo_xml import nested_files, read_xml
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from crashhunt.space import Argument, Value
 
@@ -26,6 +27,7 @@ __all__ = [
     "Scenario",
     "argument_values",
     "asked_for",
+    "check_options",
     "load_scenario",
     "scenario_from_dict",
     "shipped_folder",
@@ -84,11 +86,28 @@ class Scenario:
         return str(self.folder / self.file)
 
     def files(self) -> Iterator[str]:
-        """Yield the files that an episode reads, relative to the folder."""
+        """Yield the files that an episode reads, relative to the folder.
+
+        Raises:
+            ScenarioError: one of them names a file that is not there.
+        """
         if self.sumo is not None:
             yield self.sumo.net
-            yield from self.sumo.routes
-            yield from self.sumo.additional
+            yield from self.texts()
+            for option, value in self.sumo.options.items():
+                if canonical(option) in INPUTS:
+                    yield from (name.strip() for name in str(value).split(",") if name.strip())
+
+    def texts(self) -> Iterator[str]:
+        """Yield those of the files that may say ``${NAME}``: routes, additional ones, and what these have SUMO read.
+
+        Raises:
+            ScenarioError: one of them names a file that is not there.
+        """
+        if self.sumo is not None:
+            named = (*self.sumo.routes, *self.sumo.additional)
+            yield from named
+            yield from nested_files(self.folder, named)
 
     def modules(self) -> Iterator[str]:
         """Yield the modules that the simulator imports besides the agents': those of environments and crash rules."""
@@ -262,9 +281,10 @@ def _check_arguments(scenario: Scenario, *, kept: bool) -> None:
 
 
 def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:
-    for option in sumo.options:
-        if option in RESERVED:
-            _refuse(where, "sumo.options", option, "is an option that crashhunt sets itself", "remove it")
+    check_options(sumo.options, where)
+    for name, argument in scenario.arguments.items():
+        if argument.option:
+            check_options({argument.option: ""}, f"{where}: arguments.{name}")
     for file in scenario.files():
         path = Path(os.path.normpath(scenario.folder / file))
         if not path.is_file():
@@ -272,8 +292,10 @@ def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:
         if not path.is_relative_to(scenario.folder):
             fix = "move it inside, so that it can be archived"
             _refuse(where, "sumo", file, "lies outside the scenario's folder", fix)
-    for file in (*sumo.routes, *sumo.additional):
-        for name in asked_for((scenario.folder / file).read_bytes()):
+        if "," in path.name:
+            _refuse(where, "sumo", file, "has a comma, at which SUMO begins another file", "rename it")
+    for file in () if sumo.literal else scenario.texts():
+        for name in asked_for(read_xml(scenario.folder / file)):
             if name not in scenario.arguments:
                 message = f"has no {name!r}, which {file} asks for"
                 _refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
@@ -285,6 +307,28 @@ def _check_sumo(scenario: Scenario, sumo: SumoSetup, where: str) -> None:
         speeds = setup.target_speeds
         if not speeds or list(speeds) != sorted(set(speeds)):
             _refuse(where, f"agents.{agent}.target_speeds", speeds, "does not rise", "list speeds from low to high")
+
+
+def check_options(options: Mapping[str, object], where: str) -> None:
+    """Refuse options of SUMO with which a trial would mean something else.
+
+    Raises:
+        ScenarioError: with the option.
+    """
+    seen: dict[str, str] = {}
+    for option, value in options.items():
+        name = canonical(option)
+        if name in RESERVED:
+            _refuse(where, "sumo.options", option, "is an option that crashhunt sets itself", "remove it")
+        if name == "mesosim" and (value == "" or is_true(value)):
+            message = "simulates queues: vehicles jump from one to the next, and none can be driven"
+            _refuse(where, f"sumo.options.{option}", value, message, "remove it, to simulate every vehicle")
+        if name in ("configuration-file", "load-state"):
+            message = "names a file that says more than a trial may take over"
+            _refuse(where, "sumo.options", option, message, "write its options here instead, and begin at a time")
+        if name in seen:
+            _refuse(where, "sumo.options", option, f"is another name of {seen[name]!r}", "give it once")
+        seen[name] = option
 
 
 def _check_environment(scenario: Scenario, where: str) -> None:

@@ -15,6 +15,7 @@ from crashhunt.environment import environment
 from crashhunt.errors import BundleError, SnapshotError
 from crashhunt.scenario import Scenario, load_scenario
 from crashhunt.settings import HuntSettings, read_settings, write_settings
+from crashhunt.simulators._sumo_xml import movable
 from crashhunt.sources import Sources, find_sources, git
 from crashhunt.space import Choice, Constant
 
@@ -281,9 +282,14 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
     import tomli_w
 
     entries: dict[str, Any] = {}
+    texts = set(scenario.texts())
     for name in scenario.files():
         place = f"scenario/{name}"
         entries[place] = _store(scenario.folder / name, building / place)
+        moved = movable(scenario.folder / name) if name in texts else None
+        if moved is not None:
+            (building / place).write_bytes(moved)
+            entries[place] = {"size": len(moved), "blake2b": _hash(building / place)}
     (building / "scenario").mkdir(exist_ok=True)
     resolved = building / "scenario" / "scenario.toml"
     text = "# The scenario as it was resolved for this hunt.\n" + tomli_w.dumps(_as_dict(scenario))

@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-import gzip
+import io
 import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crashhunt.errors import ScenarioError
-from crashhunt.scenario import Scenario
+from crashhunt.scenario import Scenario, check_options
 from crashhunt.setups import AgentSetup, ArgumentSetup, ObservationSetup, SumoSetup
-from crashhunt.simulators._sumo_files import RESERVED
+from crashhunt.simulators._sumo_config import changes, is_left_out, read_config, split_names
+from crashhunt.simulators._sumo_options import INPUTS, RESERVED
+from crashhunt.simulators._sumo_xml import nested_files, read_xml, references
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 __all__ = ["load_sumocfg"]
 
-_SYNONYMS = {
-    "net": "net-file",
-    "n": "net-file",
-    "route": "route-files",
-    "r": "route-files",
-    "additional": "additional-files",
-}
-_SYNONYMS |= {"a": "additional-files", "b": "begin", "e": "end", "routes": "route-files"}
-# Sections whose options concern files written, windows and remote control, none of which a trial has.
-_DROPPED_SECTIONS = {"output", "gui_only", "traci_server", "report", "random_number"}
-# What a trial decides itself, and what would be written by every worker at once.
-_DROPPED = {"seed", "random", "threads", "remote-port", "num-clients", "begin", "end", "step-length", "scale"}
-_DROPPED |= {"gui-settings-file", "registry-viewport", "save-configuration", "load-state", "quit-on-end", "start"}
-_FILE_OPTIONS = {"net-file", "route-files", "additional-files"}
+_FILES = ("net-file", "route-files", "additional-files")
+_TAKEN = {"begin", "step-length", "scale"}  # a scenario has a key of its own for each of them
+_TELEPORT_S = "300"  # SUMO's own
 # A flow is not punctual, and a full road lets nobody in.
 _PATIENCE_S = 300.0
 
@@ -44,8 +39,9 @@ class _Departure:
 def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     """Turn a SUMO configuration into a scenario.
 
-    Its network, routes, additional files and options are kept; what it would write is dropped, as is what a trial
-    decides itself (the seed, the number of threads). The demand becomes the scenario argument ``scale``.
+    Its network, routes, additional files and options are kept. What it would write is not written, and what a trial
+    decides itself is left out (the seed, the number of threads); the notes say so. The demand becomes the scenario
+    argument ``scale``.
 
     Args:
         path: the configuration.
@@ -54,31 +50,23 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     Raises:
         ScenarioError: the configuration is not one, or names no vehicle and no route.
     """
-    options = _read_options(path)
+    options, notes = read_config(path)
     if "net-file" not in options:
         raise ScenarioError("the configuration names no net-file", fix="add <net-file value=…/>", where=str(path))
-    base = path.resolve().parent
-    files = {key: _split(options.pop(key, "")) for key in _FILE_OPTIONS}
-    for key in sorted(key for key in options if key.endswith(("-file", "-files"))):
-        raise ScenarioError(
-            f"the option {key} = {options[key]!r} names a file that a trial would not archive",
-            fix="move what it needs into the additional-files, or remove it",
-            where=str(path),
-        )
-    everything = [Path(os.path.normpath(base / file)) for group in files.values() for file in group]
-    for file in everything:
-        if not file.is_file():
-            raise ScenarioError(f"the file {str(file)!r} does not exist", fix="mend the path", where=str(path))
-    folder = Path(os.path.commonpath([base, *(str(file.parent) for file in everything)]))
-    net, routes, additional = (
-        tuple(os.path.relpath(os.path.normpath(base / file), folder) for file in files[key])
-        for key in ("net-file", "route-files", "additional-files")
-    )
-    begin = _seconds(options.get("begin", "0"), path)
-    step_length = _seconds(options.get("step-length", "1"), path)
-    kept = {key: value for key, value in options.items() if key not in _DROPPED | RESERVED}
-    agent, setup, note = _choose_ego(ego, [folder / file for file in (*routes, *additional)], path)
+    changed = changes(options)
+    options = {key: value for key, value in options.items() if not is_left_out(key)}
+    folder, files = _files(options, path)
+    (net, *_), routes, additional = (files[key] for key in _FILES)
+    begin, step_length = _times(options, path)
+    agent, setup, note = _choose_ego(ego, [folder / file for file in (*routes, *additional)], begin, path)
     scale = _number(options.get("scale", "1"), "scale", path)
+    kept = {key: value for key, value in options.items() if key not in _TAKEN | RESERVED}
+    check_options(kept, str(path))
+    kept |= {key: ",".join(files[key]) for key in INPUTS & files.keys()}
+    changed += _written(folder, (*routes, *additional))
+    if changed:
+        notes.append(f"of {path.name}, a trial does not take over: {'; '.join(changed)}")
+    literal = any(b"${" in read_xml(folder / file) for file in (*routes, *additional))
     return Scenario(
         title=f"{path.name}, as it is",
         name=path.name.removesuffix(".sumocfg"),
@@ -90,32 +78,67 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         observation=ObservationSetup(),
         agents={agent: setup},
         arguments={"scale": ArgumentSetup(default=scale, help="scales the traffic demand", option="scale")},
-        sumo=SumoSetup(net=net[0], routes=routes, additional=additional, options={"begin": begin, **kept}),
-        notes=(note,),
+        sumo=SumoSetup(
+            net=net,
+            routes=routes,
+            additional=additional,
+            options={"begin": begin, "time-to-teleport": _TELEPORT_S, **kept},
+            literal=literal or None,
+        ),
+        notes=(note, *notes),
     )
 
 
-def _read_options(path: Path) -> dict[str, str]:
-    try:
-        root = ET.parse(path).getroot()
-    except (ET.ParseError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(path)) from None
-    except OSError as error:
-        raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None
-    options: dict[str, str] = {}
-    for element in root.iter():
-        value = element.get("value", element.get("v"))
-        if value is not None:
-            options[_SYNONYMS.get(element.tag, element.tag)] = value
-    for section in root:
-        if section.tag in _DROPPED_SECTIONS:
-            for element in section.iter():
-                options.pop(_SYNONYMS.get(element.tag, element.tag), None)
-    return {key: value for key, value in options.items() if not key.endswith(("-output", ".output"))}
+def _files(options: dict[str, str], path: Path) -> tuple[Path, dict[str, tuple[str, ...]]]:
+    """Return the folder that holds all files of the configuration, and their names in it by option."""
+    base = path.resolve().parent
+    named: dict[str, list[str]] = {key: [] for key in _FILES}
+    for key in [key for key in options if key in _FILES or key in INPUTS]:
+        for name in split_names(options.pop(key)):
+            file = os.path.normpath(base / name)
+            if not os.path.isfile(file):  # noqa: PTH113
+                raise ScenarioError(f"{key}: the file {file!r} does not exist", fix="mend the path", where=str(path))
+            named.setdefault(key, []).append(file)
+    for key in sorted(key for key in options if key.endswith(("-file", "-files"))):
+        raise ScenarioError(
+            f"the option {key} = {options[key]!r} names a file that a trial would not archive",
+            fix="move what it needs into the additional-files, or remove it",
+            where=str(path),
+        )
+    if len(named["net-file"]) != 1:
+        raise ScenarioError("the configuration names several net-files", fix="name one", where=str(path))
+    everything = [file for files in named.values() for file in files]
+    read = [file for key in ("route-files", "additional-files") for file in named[key]]
+    everything += [os.path.normpath(base / file) for file in nested_files(base, tuple(read))]
+    folder = Path(os.path.commonpath([base, *map(os.path.dirname, everything)]))
+    return folder, {key: tuple(os.path.relpath(file, folder) for file in files) for key, files in named.items()}
 
 
-def _split(value: str) -> list[str]:
-    return [part for part in value.replace(" ", ",").split(",") if part]
+def _times(options: dict[str, str], path: Path) -> tuple[float, float]:
+    """Return when the simulation begins, and its step length, in s."""
+    begin = _seconds(options.get("begin", "0"), path)
+    end = _seconds(options.get("end", "-1"), path)
+    if 0 <= end < begin:
+        raise ScenarioError(f"end = {end:g} is before begin = {begin:g}", fix="mend one of the two", where=str(path))
+    # SUMO counts in whole milliseconds.
+    step_length = round(_seconds(options.get("step-length", "1"), path), 3)
+    if not 0 < step_length < float("inf"):
+        raise ScenarioError(
+            f"step-length = {options['step-length']!r} is no time step", fix="give at least 0.001", where=str(path)
+        )
+    return begin, step_length
+
+
+def _written(folder: Path, names: Iterable[str]) -> list[str]:
+    """What the files would have SUMO write, in words."""
+    found = [
+        f"{name}: {reference}"
+        for name in dict.fromkeys((*names, *nested_files(folder, tuple(names))))
+        for reference in references(read_xml(folder / name), str(folder / name))
+        if reference.kind == "written"
+    ]
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return [f"{found[0]}{more} (nothing is written)"] if found else []
 
 
 def _number(text: str, option: str, path: Path) -> float:
@@ -133,7 +156,7 @@ def _seconds(text: str, path: Path) -> float:
     return sum((part * 60.0**power for power, part in enumerate(reversed(parts))), 0.0)
 
 
-def _choose_ego(ego: str, files: list[Path], path: Path) -> tuple[str, AgentSetup, str]:
+def _choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> tuple[str, AgentSetup, str]:
     """Return the id of the controlled vehicle, how it gets there, and what to tell the user."""
     kind, _, value = ego.partition("=")
     if ego and not value:
@@ -150,7 +173,9 @@ def _choose_ego(ego: str, files: list[Path], path: Path) -> tuple[str, AgentSetu
         raise ScenarioError(
             f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID or edges=FROM,TO", where=str(path)
         )
-    first = min(_departures(files), key=lambda departure: departure.depart_s, default=None)
+    # Who would have departed before the simulation begins never does.
+    departures = [departure for departure in _departures(files) if departure.depart_s >= begin]
+    first = min(departures, key=lambda departure: departure.depart_s, default=None)
     if first is not None:
         note = f"no --ego was given: the controlled vehicle is {first.vehicle!r}, the first to depart"
         return first.vehicle, AgentSetup(existing=True, depart_s=first.depart_s), note
@@ -168,6 +193,8 @@ def _departures(files: list[Path]) -> list[_Departure]:
     found = []
     for element in _elements(files, "vehicle", "trip", "flow"):
         name, begin = element.get("id", ""), element.get("depart", element.get("begin", "0"))
+        if not name:  # the flow of a calibrator
+            continue
         try:
             depart = _seconds(begin, Path())
         except ScenarioError:  # "triggered" and the like: nobody knows when
@@ -209,15 +236,22 @@ def _interval(flow: ET.Element, begin: float) -> float:
 
 def _elements(files: list[Path], *tags: str) -> list[ET.Element]:
     found = []
-    for file in files:
-        opened = gzip.open if file.suffix == ".gz" else open
+    for file in (*files, *_nested(files)):
         try:
-            with opened(file, "rb") as content:
-                for _, element in ET.iterparse(content):
-                    if element.tag in tags:
-                        found.append(element)
-                    elif element.tag not in ("routes", "additional"):
-                        element.clear()
-        except (ET.ParseError, gzip.BadGzipFile, EOFError) as error:
+            for _, element in ET.iterparse(io.BytesIO(read_xml(file))):
+                if element.tag in tags:
+                    found.append(element)
+                elif element.tag not in ("routes", "additional"):
+                    element.clear()
+        except (ET.ParseError, LookupError, ValueError) as error:
             raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(file)) from None
     return found
+
+
+def _nested(files: list[Path]) -> list[Path]:
+    if not files:
+        return []
+    folder = files[0].parent
+    names = tuple(os.path.relpath(file, folder) for file in files)
+    # Vehicles come with <include> only; what else is read is small, and may be no XML at all.
+    return [path for name in nested_files(folder, names) if (path := folder / name).suffix in (".xml", ".gz")]

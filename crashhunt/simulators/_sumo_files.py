@@ -2,42 +2,33 @@
 
 from __future__ import annotations
 
+import os
 import string
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import InvalidEpisodeError
+from crashhunt.errors import CrashhuntError, InvalidEpisodeError
+from crashhunt.simulators._sumo_options import ALWAYS, INPUTS, canonical, is_output, is_shown
+from crashhunt.simulators._sumo_xml import read_xml, references, rewritten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
     from crashhunt.scenario import Scenario
+    from crashhunt.simulators._sumo_xml import Reference
     from crashhunt.space import Value
 
-__all__ = ["RESERVED", "StagedFiles"]
+__all__ = ["StagedFiles"]
 
-_ALWAYS = {
-    "random": "false",
-    "threads": "1",  # results depend on it
-    "device.rerouting.threads": "0",
-    "collision.action": "warn",  # keeps the vehicles and the list; the default teleports
-    "collision.check-junctions": "true",  # otherwise crossing traffic never collides
-    "collision.mingap-factor": "0",  # otherwise a gap below minGap counts as a crash
-    "time-to-teleport": "-1",  # otherwise a jam removes vehicles
-    "no-step-log": "true",
-    "duration-log.disable": "true",
-    "xml-validation": "never",
-}
-RESERVED = frozenset({*_ALWAYS, "seed", "step-length", "net-file", "route-files", "additional-files"})
-"""The options that crashhunt sets itself, because a trial means something else with other values."""
+_NOWHERE = "/dev/null"
 
 
 class StagedFiles:
     """The scenario's files, as one worker reads them.
 
-    Every file is linked into a folder of the worker's own, so that whatever SUMO writes beside an input file (SUMO
-    resolves detector outputs so) stays apart from other workers and from the scenario. A route or additional file
-    that says ``${NAME}`` is filled in per trial.
+    Every file is linked into a folder of the worker's own. One that says what SUMO is to write is copied there, and
+    writes nothing: nobody would find the files of a thousand trials, and two workers would write the same one. A route
+    or additional file that says ``${NAME}`` is filled in per trial.
 
     Args:
         scenario: whose files.
@@ -52,14 +43,19 @@ class StagedFiles:
         self._folder = folder
         self._templates: dict[Path, string.Template] = {}
         self._rendered: dict[Path, str] = {}
+        self._opened: dict[str, int] = {}
+        texts = set(scenario.texts())
         for name in scenario.files():
             source, staged = scenario.folder / name, folder / name
             staged.parent.mkdir(parents=True, exist_ok=True)
-            text = source.read_bytes() if name != self._sumo.net else b""
-            if b"${" in text:
-                self._templates[staged] = string.Template(text.decode())
-            elif not staged.exists():
+            said = name in texts or name == self._sumo.net
+            if not (said and self._stage(source, staged)) and not staged.exists():
                 staged.symlink_to(source.resolve())
+
+    def __del__(self) -> None:
+        """Close the folders that had to be opened to be named."""
+        for opened in self._opened.values():
+            os.close(opened)
 
     def arguments(self, seed: int, values: Mapping[str, Value]) -> list[str]:
         """Render the files for one trial and return SUMO's command line without the program.
@@ -77,18 +73,65 @@ class StagedFiles:
                     where=self._scenario.origin,
                 ) from None
             if self._rendered.get(path) != text:
-                path.write_text(text)
+                try:
+                    path.write_bytes(self._own(text.encode(), path))
+                except CrashhuntError as error:
+                    raise InvalidEpisodeError(error.message, fix=error.fix, where=path.name) from None
                 self._rendered[path] = text
-        options: dict[str, str] = {name: _text(value) for name, value in self._sumo.options.items()}
+        options = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
+        options |= {canonical(name): _text(value) for name, value in self._sumo.options.items()}
         for name, setup in self._scenario.arguments.items():
             if setup.option and name in values:
-                options[setup.option] = _text(values[name])
-        options |= {"seed": str(seed), "step-length": repr(self._scenario.step_length_s), **_ALWAYS}
-        options["net-file"] = str(self._folder / self._sumo.net)
+                options[canonical(setup.option)] = _text(values[name])
+        options = {
+            name: self._paths(value.split(",")) if name in INPUTS else value
+            for name, value in options.items()
+            if not is_output(name) and not is_shown(name)
+        }
+        options |= {"seed": str(seed), "step-length": repr(self._scenario.step_length_s), **ALWAYS}
+        options["net-file"] = self._paths([self._sumo.net])
         for option, names in (("route-files", self._sumo.routes), ("additional-files", self._sumo.additional)):
             if names:
-                options[option] = ",".join(str(self._folder / name) for name in names)
-        return [part for name, value in options.items() for part in (f"--{name}", value)]
+                options[option] = self._paths(names)
+        # In one word each: a value that begins with a dash would be taken for the next option.
+        return [f"--{name}={value}" for name, value in options.items()]
+
+    def _stage(self, source: Path, staged: Path) -> bool:
+        """Copy a file that cannot be read where it is; False for one that can."""
+        content = read_xml(source)
+        is_net = staged == self._folder / self._sumo.net
+        if b"${" in content and not is_net and not self._sumo.literal:
+            self._templates[staged] = string.Template(content.decode())
+            return True
+        own = self._own(content, source)
+        if own == content:
+            return False
+        staged.write_bytes(own)
+        return True
+
+    def _own(self, content: bytes, path: Path) -> bytes:
+        """The content of a file that reads only what is staged, and writes nothing."""
+
+        def name(reference: Reference) -> str:
+            if reference.kind == "written":
+                return _NOWHERE
+            if not reference.value.startswith("/"):
+                return reference.value
+            return str(self._folder / os.path.relpath(reference.value, self._scenario.folder))
+
+        return rewritten(content, references(content, str(path)), name)
+
+    def _paths(self, names: list[str] | tuple[str, ...]) -> str:
+        return ",".join(self._path(self._folder / name.strip()) for name in names)
+
+    def _path(self, path: Path) -> str:
+        """The name of a staged file in an option, where SUMO takes a comma for the end and fills in ``${NAME}``."""
+        if not {",", "$"}.intersection(str(path)):
+            return str(path)
+        parent = str(path.parent)
+        if parent not in self._opened:
+            self._opened[parent] = os.open(parent, os.O_RDONLY | os.O_DIRECTORY)
+        return f"/proc/self/fd/{self._opened[parent]}/{path.name}"
 
 
 def _text(value: Value) -> str:

@@ -196,7 +196,12 @@ def test_a_bare_sumocfg_is_a_scenario(town):
     assert scenario.agents["odd name #1"].existing
     assert scenario.step_length_s == 0.5
     assert scenario.sumo is not None
-    assert scenario.sumo.options == {"begin": 5.0, "lateral-resolution": "0.8"}
+    assert scenario.sumo.options == {
+        "begin": 5.0,
+        "end": "100",
+        "lateral-resolution": "0.8",
+        "time-to-teleport": "300",
+    }
     assert scenario.arguments["scale"].option == "scale"
     assert "odd name #1" in scenario.notes[0]
 

@@ -1,0 +1,204 @@
+"""What SUMO's XML files say about other files: those that they read, and those that they write."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import re
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from crashhunt.errors import ScenarioError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+__all__ = ["Reference", "movable", "nested_files", "read_xml", "references", "rewritten"]
+
+# Of every other element, `file` is what SUMO writes.
+_READ = {
+    ("include", "href"),
+    ("variableSpeedSign", "file"),
+    ("rerouter", "file"),
+    ("calibrator", "file"),
+    ("edgeData", "edgesFile"),
+    ("laneData", "edgesFile"),
+}
+_WRITTEN = {"file", "output", "dest"}
+_NOWHERE = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR"}
+"""What SUMO does not take for the name of a file."""
+
+# Whatever is not in a file's bytes, no attribute of it can be; most route files have none of these.
+_WORTH_PARSING = re.compile(rb"(?:file|edgesFile|output|dest|href)\s*=|[\"'.]file[\"']|<!DOCTYPE")
+_TAG = re.compile(rb"<[^\s/>]+")
+_ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """An attribute of an XML file that names another file.
+
+    Args:
+        tag: of the element.
+        attribute: of it.
+        value: the name, as it is there.
+        kind: whether SUMO reads or writes it.
+        offset: of the element in the file, in bytes.
+    """
+
+    tag: str
+    attribute: str
+    value: str
+    kind: Literal["read", "written"]
+    offset: int
+
+    def __str__(self) -> str:
+        """How it stands in the file."""
+        return f'<{self.tag} {self.attribute}="{self.value}">'
+
+
+def read_xml(path: Path) -> bytes:
+    """Return the content of a file as SUMO reads it: unpacked where it is compressed, whatever it is called.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+        if content.startswith(b"\x1f\x8b"):
+            content = gzip.decompress(content)
+    except (OSError, EOFError, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ScenarioError(f"cannot be read: {reason}", fix="mend the file", where=str(path)) from None
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = re.sub(r"(<\?xml[^>]*?)\s+encoding\s*=\s*(\"[^\"]*\"|'[^']*')", r"\1", content.decode("utf-16"), count=1)
+        return text.encode()
+    return content
+
+
+def references(content: bytes, where: str) -> list[Reference]:
+    """Return what an XML file says about other files.
+
+    Raises:
+        ScenarioError: it is no valid XML.
+    """
+    if not _WORTH_PARSING.search(content):
+        return []
+    found: list[Reference] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        for name, value in attributes.items():
+            if (tag, name) in _READ:
+                if value:
+                    found.append(Reference(tag, name, value, "read", parser.CurrentByteIndex))
+            elif name in _WRITTEN and value not in _NOWHERE:
+                found.append(Reference(tag, name, value, "written", parser.CurrentByteIndex))
+        if tag == "param" and _is_written(attributes.get("key", "")) and attributes.get("value", "") not in _NOWHERE:
+            found.append(Reference(tag, "value", attributes["value"], "written", parser.CurrentByteIndex))
+
+    parser.StartElementHandler = start
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, ValueError) as error:
+        raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=where) from None
+    return found
+
+
+def _is_written(key: str) -> bool:
+    """Whether the parameter of a vehicle, a type or a traffic light is a file that SUMO writes."""
+    return key == "file" or (key.endswith(".file") and key != "device.fcd-replay.file")
+
+
+def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference], str]) -> bytes:
+    """Return an XML file in which attributes name other files; all else stays as it is.
+
+    Args:
+        content: of the file.
+        found: what `references` has found in it.
+        name: what each is to name; what it does already changes nothing.
+    """
+    parts, end = [], 0
+    for reference in found:
+        value = name(reference)
+        place = _place(content, reference)
+        if value != reference.value and place is not None:
+            parts += [content[end : place[0]], quoteattr(value).encode("ascii", "xmlcharrefreplace")]
+            end = place[1]
+    return b"".join([*parts, content[end:]])
+
+
+def _place(content: bytes, reference: Reference) -> tuple[int, int] | None:
+    """Where the value of an attribute is, with its quotes; None for one that the document type gives by default."""
+    wanted = reference.attribute.encode()
+    match = _TAG.match(content, reference.offset)
+    while match is not None and (match := _ATTRIBUTE.match(content, match.end())) is not None:
+        if match[1] == wanted:
+            return match.span(2)
+    return None
+
+
+def movable(path: Path) -> bytes | None:
+    """Return the content of a file as it is right wherever its folder goes; None where it is so already.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    content = read_xml(path)
+
+    def beside(reference: Reference) -> str:
+        is_absolute = reference.kind == "read" and reference.value.startswith("/")
+        return os.path.relpath(reference.value, path.parent) if is_absolute else reference.value
+
+    moved = rewritten(content, references(content, str(path)), beside)
+    return None if moved == content else moved
+
+
+def nested_files(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the files that some files have SUMO read, and those that these do, relative to the folder.
+
+    Args:
+        folder: of the scenario.
+        names: files in it.
+
+    Raises:
+        ScenarioError: one does not exist, or is named by an argument.
+    """
+    found: dict[str, None] = {}
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop(0)
+        for nested in _named_by(folder, name):
+            if nested not in found and nested not in names:
+                found[nested] = None
+                waiting.append(nested)
+    return tuple(found)
+
+
+def _named_by(folder: Path, name: str) -> list[str]:
+    path = folder / name
+    try:
+        stat = path.stat()
+    except OSError:
+        return []  # whoever checks the scenario says so
+    return [os.path.relpath(target, folder) for target in _targets(path, stat.st_mtime_ns, stat.st_size)]
+
+
+@lru_cache(maxsize=256)
+def _targets(path: Path, _mtime_ns: int, _size: int) -> tuple[str, ...]:
+    targets = []
+    for reference in references(read_xml(path), str(path)):
+        if reference.kind == "written":
+            continue
+        # As SUMO does it: beside the file that names it, and ${NAME} is no variable here.
+        target = os.path.normpath(path.parent / reference.value)
+        if not os.path.isfile(target):  # noqa: PTH113
+            fix = "name one file; an argument cannot choose it" if "${" in target else "mend the path"
+            raise ScenarioError(f"{reference}: there is no file {target!r}", fix=fix, where=str(path))
+        targets.append(target)
+    return tuple(targets)
