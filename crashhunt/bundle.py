@@ -13,7 +13,7 @@ from crashhunt.environment import versions
 from crashhunt.errors import BundleError
 from crashhunt.executors import BLACK_BOX, OUTPUT
 from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
-from crashhunt.trial import ClosestApproach, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import ClosestApproach, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -107,6 +107,7 @@ class Bundle:
             "sim_time_s": result.sim_time_s,
             "collision": result.to_json()["collision"],
             "failure": result.to_json()["failure"],
+            "escape": result.to_json()["escape"],
             "closest_approach": result.closest.to_json(),
             "digest": result.digest,
             "snapshot": self.snapshot,
@@ -132,7 +133,7 @@ def read_bundle(path: Path) -> Bundle:
             raise BundleError(
                 f"schema {data['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(file)
             )
-        hit, failure = data["collision"], data["failure"]
+        hit, failure, escape = data["collision"], data["failure"], data.get("escape")
         result = TrialResult(
             TrialSpec(
                 data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
@@ -144,6 +145,7 @@ def read_bundle(path: Path) -> Bundle:
             closest=ClosestApproach.from_json(data["closest_approach"]),
             collision=Collision.from_json(hit) if hit else None,
             failure=Failure(**failure) if failure else None,
+            escape=Escape(**escape) if escape else None,
         )
         return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"])
     except OSError as error:

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-    from crashhunt.scene import Scene
 
 __all__ = ["Encounter", "Manner", "Moment", "last_escape"]
+
+_LOOKS_BACK_S = 30.0
+_PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
 
 Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "crossing from the right", "left", "right"]
 
@@ -33,7 +35,7 @@ class Moment:
         gap_m: between the outlines.
         closing_speed: at which their centres come nearer, in m/s; negative when they part.
         time_to_collision_s: at constant velocities; infinite where they would miss each other.
-        required_deceleration: that the agent would need, v² / (2 gap) with v the closing speed, in m/s².
+        required_deceleration: that the agent would need, v / (2 TTC) with v the relative speed, in m/s².
     """
 
     step: int
@@ -112,7 +114,7 @@ class Encounter:
         turn = other_heading - heading
         gap = rectangle_gap(_turned(offset, heading), turn, half_own, half_other)
         contact = time_to_contact(_turned(offset, heading), _turned(velocity, heading), turn, half_own, half_other)
-        needed = np.where((gap > 0) & (closing > 0), closing**2 / (2 * np.maximum(gap, 1e-9)), 0.0)
+        needed = np.where(contact > 0, np.hypot(*velocity.T) / (2 * np.maximum(contact, 1e-9)), 0.0)
         return [
             Moment(number, scene.time_s, *map(float, values))
             for (number, scene), *values in zip(
@@ -122,42 +124,91 @@ class Encounter:
 
 
 def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
-    """Return the last step after which full braking would have avoided the crash; None where there was none.
+    """Return the last step after which full braking would have avoided the crash, as calculated.
 
     The agent goes on along the path that it drove, braking from that step on; the other one does what it did, and
-    beyond the end of the recording goes on at its last velocity.
+    beyond the end of the recording goes on at its last velocity. That is not what would have happened, since others
+    react (see `crashhunt.escape`, which runs it).
 
     Args:
         recording: of the crash.
         agent: who brakes.
         other: whom it crashed into, or who crashed into it.
         braking: deceleration, in m/s².
+
+    Returns:
+        None where there was no such step, or where the calculation does not collide without braking either, so that
+        it says nothing.
     """
-    encounter = Encounter(recording, agent, other)
-    scenes = [scene for _, scene in encounter._scenes]
-    if len(scenes) < 2:
+    model = _Model(recording, agent, other)
+    if not model.collides_without_braking():
         return None
-    step_length = recording.prologue.step_length_s
-    own = [scene.roster.index[agent] for scene in scenes]
-    them = [scene.roster.index[other] for scene in scenes]
-    path = _Path([(*scene.points[row], scene.headings[row]) for scene, row in zip(scenes, own, strict=True)])
-    actor, second = scenes[-1].roster.actors[own[-1]], scenes[-1].roster.actors[them[-1]]
-    for start in range(len(scenes) - 1, -1, -1):
-        speed, driven = scenes[start].speeds[own[start]], path.distances[start]
-        index, hit = start, False
-        while speed > 0 and not hit:
-            slower = max(0.0, speed - braking * step_length)
-            driven += (speed + slower) / 2 * step_length
-            speed = slower
-            index += 1
-            hit = outlines_overlap(
-                (*path.at(driven), actor.length, actor.width),
-                (*_where_other(scenes, them, index, step_length), second.length, second.width),
-            )
+    last = len(model.steps) - 1
+    first = max(0, last - math.ceil(_LOOKS_BACK_S / recording.prologue.step_length_s))
+    return next((model.steps[start] for start in range(last - 1, first - 1, -1) if model.avoids(start, braking)), None)
+
+
+class _Model:
+    """The two of a crash, the other one moving as it did, the agent along the path that it drove."""
+
+    def __init__(self, recording: Recording, agent: str, other: str) -> None:
+        found = Encounter(recording, agent, other)._scenes
+        self.steps = [step for step, _ in found]
+        self._dt = recording.prologue.step_length_s
+        scenes = [scene for _, scene in found]
+        own = [scene.roster.index[agent] for scene in scenes]
+        them = [scene.roster.index[other] for scene in scenes]
+        self._speeds = [scene.speeds[row] for scene, row in zip(scenes, own, strict=True)]
+        self._path, self._others = (
+            _Path([(*scene.points[row], scene.headings[row]) for scene, row in zip(scenes, rows, strict=True)])
+            for rows in (own, them)
+        )
+        self._beyond = scenes[-1].speeds[them[-1]] if scenes else 0.0
+        self._sizes = [
+            (actor.length, actor.width)
+            for actor in (scenes[-1].roster.actors[own[-1]], scenes[-1].roster.actors[them[-1]])
+        ] if scenes else []  # fmt: skip
+
+    def collides_without_braking(self) -> bool:
+        """Whether what was recorded touches in its last step or on the way there, or would by the next."""
+        last = len(self.steps) - 1
+        if last < 1:
+            return False
+        before, end = self._path.distances[last - 1 :]
+        beyond = end + max(0.0, self._speeds[last]) * self._dt
+        return self._touch_on_the_way(last - 1, before, end) or self._touch_on_the_way(last, end, beyond)
+
+    def avoids(self, start: int, braking: float) -> bool:
+        """Whether braking from a scene on avoids any touch until the agent stands."""
+        speed, driven, index = max(0.0, self._speeds[start]), self._path.distances[start], start
+        if self._touch(driven, float(index)):
+            return False
+        while speed > 0:
+            slower = max(0.0, speed - braking * self._dt)
+            after = driven + (speed + slower) / 2 * self._dt
+            if self._touch_on_the_way(index, driven, after):
+                return False
+            speed, driven, index = slower, after, index + 1
         # The other one may still drive into somebody who stands; that is not for the agent's brakes to avoid.
-        if not hit:
-            return encounter._scenes[start][0]
-    return None
+        return True
+
+    def _touch_on_the_way(self, index: int, driven: float, after: float) -> bool:
+        """Whether they touch within a step, the beginning left out."""
+        (x, y, _), (x_after, y_after, _) = self._other(float(index)), self._other(float(index + 1))
+        way = after - driven + math.hypot(x_after - x, y_after - y)
+        parts = min(_MOST_PARTS, max(1, math.ceil(way / _PART_M)))
+        return any(
+            self._touch(driven + (after - driven) * part / parts, index + part / parts) for part in range(1, parts + 1)
+        )
+
+    def _touch(self, driven: float, index: float) -> bool:
+        return outlines_overlap((*self._path.at(driven), *self._sizes[0]), (*self._other(index), *self._sizes[1]))
+
+    def _other(self, index: float) -> tuple[float, float, float]:
+        distances, whole = self._others.distances, int(index)
+        if whole >= len(distances) - 1:
+            return self._others.at(distances[-1] + (index - len(distances) + 1) * self._dt * self._beyond)
+        return self._others.between(whole, index - whole)
 
 
 class _Path:
@@ -177,18 +228,15 @@ class _Path:
         if index == 0:
             x, y, heading = self._poses[0]
             return float(x), float(y), float(heading)
-        before, after = self._poses[index - 1], self._poses[index]
-        share = (distance - self.distances[index - 1]) / max(self.distances[index] - self.distances[index - 1], 1e-9)
+        length = self.distances[index] - self.distances[index - 1]
+        return self.between(index - 1, (distance - self.distances[index - 1]) / max(length, 1e-9))
+
+    def between(self, index: int, share: float) -> tuple[float, float, float]:
+        """The pose a share of the way from one recorded pose to the next."""
+        before, after = self._poses[index], self._poses[index + 1]
         x, y = before[:2] + share * (after[:2] - before[:2])
         heading = before[2] + share * math.remainder(after[2] - before[2], math.tau)
         return float(x), float(y), float(heading)
-
-
-def _where_other(scenes: list[Scene], rows: list[int], index: int, step_length: float) -> tuple[float, float, float]:
-    last = min(index, len(scenes) - 1)
-    (x, y), heading = scenes[last].points[rows[last]], scenes[last].headings[rows[last]]
-    beyond = (index - last) * step_length * scenes[last].speeds[rows[last]]
-    return x + beyond * math.cos(heading), y + beyond * math.sin(heading), heading
 
 
 def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -169,14 +169,17 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
 
 
 def confirm(bundle: Bundle) -> Bundle:
-    """Return the bundle with the verdict of a first replay."""
+    """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash."""
     try:
-        report = _run(prepare(bundle, ReplayOptions(force=True)))
+        rerun = prepare(bundle, ReplayOptions(force=True))
+        report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)))
     except CrashhuntError as error:
         failure = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure)
     divergence = report.divergence.to_json() if report.divergence else None
-    return replace(bundle, confirmed=report.verdict == "reproduced", divergence=divergence)
+    confirmed = report.verdict == "reproduced"
+    result = replace(bundle.result, escape=report.replayed.escape if confirmed else None)
+    return replace(bundle, result=result, confirmed=confirmed, divergence=divergence)
 
 
 def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:

@@ -18,8 +18,10 @@ __all__ = [
     "CRASHES",
     "ClosestApproach",
     "Collision",
+    "Escape",
     "Failure",
     "Outcome",
+    "Overruled",
     "TrialResult",
     "TrialSpec",
     "check_parts",
@@ -64,6 +66,19 @@ CRASHES = tuple(outcome for outcome in Outcome if outcome.is_traffic_crash or ou
 
 
 @dataclass(frozen=True, slots=True)
+class Overruled:
+    """A trial in which the code of an agent is no longer asked: its vehicle brakes as hard as it can.
+
+    Args:
+        agent: whose.
+        after: the step after which it brakes; its first decision that is not its own is the one of the next step.
+    """
+
+    agent: str
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
 class TrialSpec:
     """Everything that determines one trial.
 
@@ -73,6 +88,7 @@ class TrialSpec:
         arguments: agent id to argument name to value.
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
+        overruled: which agent is not asked any more, and from when on; None where all drive to the end.
     """
 
     number: int
@@ -80,6 +96,7 @@ class TrialSpec:
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     max_steps: int
+    overruled: Overruled | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts and numbers."""
@@ -89,13 +106,20 @@ class TrialSpec:
             "arguments": {agent: dict(values) for agent, values in self.arguments.items()},
             "scenario_arguments": dict(self.scenario_arguments),
             "max_steps": self.max_steps,
+            **({"overruled": asdict(self.overruled)} if self.overruled else {}),
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TrialSpec:
         """Rebuild what `to_json` returned."""
+        overruled = data.get("overruled")
         return cls(
-            data["number"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
+            data["number"],
+            data["seed"],
+            data["arguments"],
+            data["scenario_arguments"],
+            max_steps=data["max_steps"],
+            overruled=Overruled(**overruled) if overruled else None,
         )
 
 
@@ -105,7 +129,7 @@ class ClosestApproach:
 
     Args:
         time_to_collision_s: the least, at constant velocities; infinite where no course ever crossed.
-        gap_m: the least distance between two outlines; 0 where they touched.
+        gap_m: the least distance to the outline of any other actor, the nearest gap; 0 where they touched.
         required_deceleration: the greatest needed to avoid a collision, in m/s².
     """
 
@@ -164,6 +188,23 @@ class Collision:
 
 
 @dataclass(frozen=True, slots=True)
+class Escape:
+    """Until when the agent's brakes would have avoided a collision, found out by running the trial again.
+
+    Args:
+        step: braking as hard as it can after this step avoids the collision; None where no such step was found.
+        too_late: after this step it does not; it is the next one, unless there is no such step.
+        braking: the greatest deceleration of those runs, in m/s²; None where it never slowed down.
+        how: how it brakes, in words; one of `FullBraking`.
+    """
+
+    step: int | None
+    too_late: int | None
+    braking: float | None
+    how: str
+
+
+@dataclass(frozen=True, slots=True)
 class Failure:
     """What a program did wrong.
 
@@ -201,6 +242,7 @@ class TrialResult:
         setup_s: the part of it before the first step.
         worker: the process id.
         kept: whether the worker left its scratch folder for the hunt to collect.
+        escape: until when braking would have avoided it; None where nobody tried, or where it cannot be told.
     """
 
     spec: TrialSpec
@@ -215,6 +257,7 @@ class TrialResult:
     setup_s: float = 0.0
     worker: int = 0
     kept: bool = False
+    escape: Escape | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -226,18 +269,20 @@ class TrialResult:
             "closest": self.closest.to_json(),
             "collision": finite(asdict(self.collision)) if self.collision else None,
             "failure": asdict(self.failure) if self.failure else None,
+            "escape": asdict(self.escape) if self.escape else None,
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TrialResult:
         """Rebuild what `to_json` returned."""
-        hit, failure = data["collision"], data["failure"]
+        hit, failure, escape = data["collision"], data["failure"], data.get("escape")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=Outcome(data["outcome"]),
             closest=ClosestApproach.from_json(data["closest"]),
             collision=Collision.from_json(hit) if hit else None,
             failure=Failure(**failure) if failure else None,
+            escape=Escape(**escape) if escape else None,
             **{name: data[name] for name in _PLAIN},
         )
 
@@ -286,6 +331,7 @@ _COLLISION: dict[str, Any] = {
     "seen_by": list[str],
 }
 _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
+_ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
 
 
 def check_plain(data: Mapping[str, Any]) -> None:
@@ -296,19 +342,20 @@ def check_plain(data: Mapping[str, Any]) -> None:
     """
     typed(data, {"outcome": str, "steps": int, "sim_time_s": float, "digest": str, "wall_s": float, "spec": dict})
     typed(data["spec"], _SPEC)
-    check_parts(data["closest"], data["collision"], data["failure"])
+    check_parts(data["closest"], data["collision"], data["failure"], data.get("escape"))
     if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
         raise ValueError("a number is below 0")
 
 
-def check_parts(closest: Any, collision: Any, failure: Any) -> None:
+def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None) -> None:
     """See the same of what a trial ended with, where anything is there.
 
     Raises:
         ValueError: with what is not as it should be.
     """
     for name, part, types in (
-        ("closest", closest, _CLOSEST), ("collision", collision, _COLLISION), ("failure", failure, _FAILURE)
+        ("closest", closest, _CLOSEST), ("collision", collision, _COLLISION), ("failure", failure, _FAILURE),
+        ("escape", escape, _ESCAPE),
     ):  # fmt: skip
         typed({name: part}, {name: dict if name == "closest" else dict | None})
         if part is not None:

@@ -80,8 +80,9 @@ def add_replay(commands: Any) -> None:
     )  # fmt: skip
     look.add_argument(
         "--print", metavar="FIELD,…", default="", dest="fields",
-        help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m, "
-        "required_deceleration, action or its parts, observation[ROW,NAME]",
+        help="print a table of the steps: x, y, heading, speed, reward, time_to_collision_s, gap_m and "
+        "required_deceleration (to the nearest), gap_to_other_m, time_to_other_s, closing_speed, action or its parts, "
+        "observation[ROW,NAME]",
     )  # fmt: skip
     look.add_argument(
         "--gui", action="store_true",
@@ -166,6 +167,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
 def _replay_one(
     options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
 ) -> tuple[ReplayReport, dict[str, Any]]:
+    from crashhunt.escape import partner
     from crashhunt.replays import replay
     from crashhunt.report import describe_replay, format_table, steps_table
 
@@ -173,7 +175,7 @@ def _replay_one(
     answer = report.to_json()
     if options.fields:
         fields = re.split(r",(?![^\[]*\])", options.fields)  # not at the comma of observation[ROW,NAME]
-        table = steps_table(report.recording, fields, bundle.driver)
+        table = steps_table(report.recording, fields, bundle.driver, partner(bundle.result))
         say("\n".join([*format_table(table), ""]), as_json=options.json)
         answer["table"] = table
     say(describe_replay(report), as_json=options.json)

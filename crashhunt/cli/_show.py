@@ -20,12 +20,17 @@ def add_show(commands: Any) -> None:
         "show",
         help="tell the last seconds of a crash",
         description="Tell the last seconds of a crash in words and a table: who was where, how fast, closing how "
-        "quickly, what the agent decided, and until when full braking would have avoided it. Runs no code of the "
-        "bundle.",
+        "quickly, what the agent decided, and until when braking would have avoided it, as the hunt found out by "
+        "running it. Runs no code of the bundle.",
     )
     add_crash(show)
     show.add_argument("--last-seconds", metavar="S", type=float, default=5.0, help="how much of it; default: 5")
-    show.add_argument("--braking", metavar="A", type=float, default=8.0, help="full braking, in m/s²; default: 8")
+    show.add_argument(
+        "--braking",
+        metavar="A",
+        type=float,
+        help="calculate until when braking at so many m/s² would have helped, had the other one moved as it did",
+    )
     add_json(show)
     show.set_defaults(command=_show)
 
@@ -34,7 +39,7 @@ def _show(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import Story
 
     for name, value in (("--last-seconds", options.last_seconds), ("--braking", options.braking)):
-        if not 0 < value < float("inf"):
+        if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{name} is {value:g}", fix="give a number above 0")
     with opened_crash(options.directory, options.crash) as (bundle, _):
         story = Story(bundle, last_s=options.last_seconds, braking=options.braking)

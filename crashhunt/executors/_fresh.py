@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -10,25 +11,29 @@ import sys
 import time
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import BundleError, CrashhuntError
 from crashhunt.executors._parts import require_origin
-from crashhunt.executors._protocol import WorkerSettings
+from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.executors._remains import died, hung, where_it_is
-from crashhunt.executors._worker import Worker, worker_environment
+from crashhunt.executors._worker import BLACK_BOX, Worker, worker_environment
+from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from crashhunt.trial import Escape
+
 __all__ = ["FreshProcessExecutor", "fresh_environment"]
 
 _LOOK_EVERY_S = 0.01
 _LAST_WORDS_S = 0.2
 _START_UP_S = 60.0
+_ESCAPE_S = 60.0
 
 
 @dataclass(slots=True)
@@ -110,6 +115,8 @@ class FreshProcessExecutor:
             return self._result(running, exit_code)
         header = where_it_is(self._settings.scratch, number)
         limit = self._settings.timeout_s + _LAST_WORDS_S
+        if running.answer.exists():  # what is left to do is to find its escape, in trials that have limits of their own
+            limit = _ESCAPE_S + 2 * limit
         if now - header.started > limit if header else now - running.began > limit + _START_UP_S:
             running.killed = True
             _kill(running.process)
@@ -117,7 +124,7 @@ class FreshProcessExecutor:
 
     def _result(self, running: _Running, exit_code: int) -> TrialResult:
         scratch, spec = self._settings.scratch, running.spec
-        if running.killed:
+        if running.killed and not running.answer.exists():
             return hung(spec, scratch, self._settings.timeout_s)
         try:
             answer = json.loads(running.answer.read_text(encoding="utf-8"))
@@ -154,13 +161,47 @@ def main() -> None:
     try:
         settings = WorkerSettings.from_json(job["settings"])
         require_origin("crashhunt", settings.code)
-        answer = {"result": Worker(settings).run(TrialSpec.from_json(job["spec"])).to_json()}
+        worker = Worker(settings)
+        result = worker.run(TrialSpec.from_json(job["spec"]))
     except CrashhuntError as error:
-        answer = error.to_json()
-    temporary = f"{job['answer']}.part"
+        _answer(job["answer"], error.to_json())
+        return
+    _answer(job["answer"], {"result": result.to_json()})  # which counts, whatever becomes of what follows
+    escape = _escape(worker, settings, result) if settings.find_escapes else None
+    if escape is not None:
+        _answer(job["answer"], {"result": replace(result, escape=escape).to_json()})
+
+
+def _answer(path: str, answer: dict[str, Any]) -> None:
+    temporary = f"{path}.part"
     with open(temporary, "w", encoding="utf-8") as file:
         json.dump(answer, file)
-    os.replace(temporary, job["answer"])  # noqa: PTH105 - one rename
+    os.replace(temporary, path)  # noqa: PTH105 - one rename
+
+
+def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Escape | None:
+    """Until when braking would have avoided a crash, by trials in this process, whose simulator is warm."""
+    from crashhunt.escape import find_escape
+
+    if result.collision is None:
+        return None
+    braking = worker.full_braking(result.collision.agent)
+    if braking is None:
+        return None
+    numbers = itertools.count(result.spec.number + 1)  # folders of their own
+
+    def recording(number: int) -> Recording:
+        return Recording(read_black_box(scratch_of(settings.scratch, number) / BLACK_BOX))
+
+    def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
+        number = next(numbers)
+        done = worker.run(replace(spec, number=number))
+        return done, recording(number)
+
+    try:
+        return find_escape(result, recording(result.spec.number), braking, run)
+    except BundleError:
+        return None
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import CrashhuntError, InvalidEpisodeError
 from crashhunt.plugins import locate, signature_of
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
 
-__all__ = ["Parts", "require_origin"]
+__all__ = ["Braking", "Parts", "require_origin"]
 
 
 class Parts:
@@ -71,6 +71,44 @@ class Parts:
         }
         made: Agent = factory(**{**given, **values})
         return made
+
+
+class Braking:
+    """Lets an agent drive up to a step, and from then on brakes as hard as the vehicle can.
+
+    Args:
+        driver: the agent.
+        simulator: which knows how the vehicle brakes.
+        agent: the vehicle.
+        after: the step after which it brakes.
+
+    Raises:
+        InvalidEpisodeError: the simulator does not know.
+    """
+
+    def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int) -> None:
+        braking = simulator.full_braking(agent) if hasattr(simulator, "full_braking") else None
+        if braking is None:
+            raise InvalidEpisodeError(f"nobody knows how {agent} brakes as hard as it can")
+        self._driver, self._after = driver, after
+        self._action = braking.action
+        self._step = 0
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self._step = 0
+        self._driver.reset(seed)
+
+    def act(self, observation: Any) -> Any:
+        """Return the driver's action, or that of braking."""
+        step, self._step = self._step, self._step + 1
+        return self._driver.act(observation) if step < self._after else self._action
+
+    def close(self) -> None:
+        """Close the driver."""
+        close = getattr(self._driver, "close", None)
+        if close is not None:
+            close()
 
 
 def require_origin(module: str, code: tuple[str, ...]) -> None:

@@ -34,6 +34,8 @@ class WorkerSettings:
         argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
+        find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
+            few times more; only in a fresh process.
     """
 
     scenario: Scenario
@@ -44,6 +46,7 @@ class WorkerSettings:
     argument_files: dict[str, str] = field(default_factory=dict)
     timeout_s: float = 60.0
     keep_trials: bool = False
+    find_escapes: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers."""
@@ -80,6 +83,7 @@ class WorkerSettings:
             argument_files=data.get("argument_files", {}),
             timeout_s=data["timeout_s"],
             keep_trials=data["keep_trials"],
+            find_escapes=data.get("find_escapes", False),
         )
 
 

@@ -15,21 +15,23 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.episode import run_episode
-from crashhunt.executors._parts import Parts
+from crashhunt.executors._parts import Braking, Parts
 from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.recording import BlackBox
 from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from crashhunt.simulators import Simulator
-    from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.agents import Agent
+    from crashhunt.simulators import FullBraking, Simulator
+    from crashhunt.trial import Overruled, TrialResult, TrialSpec
 
 __all__ = [
     "BLACK_BOX",
@@ -108,7 +110,7 @@ class Worker:
         result = run_episode(
             spec,
             simulator=simulator,
-            make_agent=self._parts.agent,
+            make_agent=self._parts.agent if spec.overruled is None else partial(self._overruled, spec.overruled),
             box=box,
             oracles=self._parts.oracles,
             crash_on=self._settings.crash_on,
@@ -126,6 +128,16 @@ class Worker:
             if result.failure is not None and result.failure.traceback:
                 (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return result
+
+    def full_braking(self, agent: str) -> FullBraking | None:
+        """Return how a vehicle of the last trial brakes as hard as it can, where its simulator says."""
+        offered = getattr(self._simulator, "full_braking", None)
+        found: FullBraking | None = offered(agent) if offered is not None else None
+        return found
+
+    def _overruled(self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+        made = self._parts.agent(agent, simulator, arguments)
+        return Braking(made, simulator, agent, overruled.after) if agent == overruled.agent else made
 
     def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
         """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""

@@ -30,7 +30,8 @@ __all__ = ["FilmOptions", "Layout", "Shot", "check_places", "frames", "write_fra
 _PANEL = (240, 160)
 _PAPER = 255
 _SHOWN_S = 10.0  # of the built-in curves
-_BUILTIN = ("time to collision s", "gap m", "speed m/s", "action")
+_BUILTIN = ("time to collision s", "gap to the other m", "speed m/s", "action")
+_NEAREST = "nearest gap m"  # of a crash that has no other one
 _WITHOUT_SCENE = ("reward", "action")
 
 
@@ -157,7 +158,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
     labels: dict[str, None] = {}
     if options.panels:
         for shot in shots:
-            labels |= dict.fromkeys(_BUILTIN if shot.recording.actors else _WITHOUT_SCENE)
+            labels |= dict.fromkeys(_builtin_labels(shot) if shot.recording.actors else _WITHOUT_SCENE)
         for shot in shots:
             for panels in shot.panels.values():
                 labels |= dict.fromkeys(panels)
@@ -256,6 +257,10 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions) -> i
     return count
 
 
+def _builtin_labels(shot: Shot) -> tuple[str, ...]:
+    return _BUILTIN if shot.other else (_BUILTIN[0], _NEAREST, *_BUILTIN[2:])
+
+
 class _Builtin:
     """The panels that every agent has: how near it came, and what it decided."""
 
@@ -289,7 +294,7 @@ class _Builtin:
         times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
         found: list[tuple[str, Panel]] = [
             (_BUILTIN[0], Curve(times, x, low=0.0, high=10.0)),
-            (_BUILTIN[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
+            (_builtin_labels(self._shot)[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
             (_BUILTIN[2], Curve(self._speeds[part], x, low=0.0)),
         ]
         if not self._shot.recording.actors:

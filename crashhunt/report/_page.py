@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.bundle import Bundle
+    from crashhunt.encounter import Encounter
     from crashhunt.recording import Recording
 
 __all__ = ["report_data", "write_report"]
@@ -132,6 +133,7 @@ def _crash(bundle: Bundle) -> dict[str, Any]:
         "agents": list(recording.agents),
         "dt": recording.prologue.step_length_s,
         **_scenes(recording, story.agent),
+        **({} if story.encounter is None else {"gap": _gap_to_other(story.encounter, recording)}),
         "lanes": _lanes(bundle, recording),
     }
 
@@ -171,6 +173,13 @@ def _scenes(recording: Recording, agent: str) -> dict[str, Any]:
         "actionNames": action_names,
         "actions": _packed(actions),
     }
+
+
+def _gap_to_other(encounter: Encounter, recording: Recording) -> str:
+    """The gap to the one that it crashed with, instead of that to the nearest."""
+    moments = {moment.step: moment.gap_m for moment in encounter.moments}
+    steps = [step.step for step in recording.all_steps if step.scene is not None]
+    return _packed(np.array([moments.get(step, np.nan) for step in steps]))
 
 
 def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:

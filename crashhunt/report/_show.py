@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.encounter import Encounter, last_escape
 from crashhunt.report._screen import format_arguments
-from crashhunt.report._table import aligned
+from crashhunt.report._table import NEAREST, aligned, steps_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.bundle import Bundle
-    from crashhunt.encounter import Manner
+    from crashhunt.encounter import Manner, Moment
 
 __all__ = ["Story"]
 
@@ -36,10 +36,11 @@ class Story:
     Args:
         bundle: the crash.
         last_s: how much of it, in s.
-        braking: what counts as full braking, in m/s².
+        braking: a deceleration, in m/s²; it is calculated until when that would have helped. Without one it is told
+            what the hunt found out by running it.
     """
 
-    def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float = 8.0) -> None:
+    def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float | None = None) -> None:
         self.bundle = bundle
         self.recording = bundle.recording()
         self._last_s = last_s
@@ -48,27 +49,33 @@ class Story:
         self.agent = bundle.driver
         self.other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
-        self.escape = (
-            last_escape(self.recording, self.agent, self.other, braking=braking)
-            if hit is not None and hit.role == "collider"
-            else None
-        )
+        tried = bundle.result.escape
+        self.escape = tried.step if tried is not None else None
+        if braking is not None:
+            drove_into = hit is not None and hit.role == "collider"
+            self.escape = last_escape(self.recording, self.agent, self.other, braking=braking) if drove_into else None
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``show --json`` prints."""
-        moments = self.encounter.moments if self.encounter else []
+        nearest = steps_table(self.recording, NEAREST, self.agent) if self.encounter else []
+        moments, tried = self.encounter.moments if self.encounter else [], self.bundle.result.escape
         return {
             "crash": self.bundle.id,
             "summary": self.bundle.result.summary,
             "agent": self.agent,
             "other": self.other,
             "words": self.words(),
-            "full_braking": self._braking,
+            "full_braking": self._braking or (tried.braking if tried else None),
             "last_escape_step": self.escape,
+            "braking": {
+                "by": "calculation" if self._braking else "running it" if tried else None,
+                "how": tried.how if tried and not self._braking else None,
+                "too_late_step": tried.too_late if tried and not self._braking else None,
+            },
             "moments": [
                 {
                     name: None if isinstance(value, float) and not math.isfinite(value) else value
-                    for name, value in asdict(moment).items()
+                    for name, value in _named(moment, nearest[moment.step]).items()
                 }
                 | {"action": self._action(moment.step)}
                 for moment in moments
@@ -104,7 +111,7 @@ class Story:
         names = self._names()
         header = ["step", "time s", f"{self.agent} m/s", *names]
         if self.encounter is not None:
-            header += [f"{self.other} m/s", "gap m", "closing m/s", "TTC s", "needs m/s²"]
+            header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s", "needs m/s²"]
         moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
         rows = []
         steps = [step for step in self.recording.all_steps if step.step >= self._first_step()]
@@ -127,7 +134,7 @@ class Story:
                         f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
                     ]
                 )
-            mark = "" if step.step != self.escape else f"<- the last step from which braking at {self._braking:g} helps"
+            mark = "" if step.step != self.escape else "<- the last step after which braking helps"
             rows.append([*cells, mark])
         return aligned([header, *rows])
 
@@ -155,19 +162,38 @@ class Story:
         if changed is not None:
             step, side = changed
             sentences.append(f"{agent} decided to change lanes to the {side} at step {step}.")
-        hit = self.bundle.result.collision
-        if hit is not None and hit.role == "collider":
-            sentences.append(self._about_escape(last.step, last.time_s))
-        return sentences
+        return [*sentences, *self._about_escape(last.step)]
 
-    def _about_escape(self, end: int, end_s: float) -> str:
-        braking = f"Braking at {self._braking:g} m/s²"
+    def _about_escape(self, end: int) -> list[str]:
+        """Until when braking would have helped; nothing where nobody knows."""
+        tried = self.bundle.result.escape
+        if self._braking is not None:
+            return [self._calculated(end, self._braking)]
+        if tried is None:
+            return []
+        braking = f"Braking {tried.how}"
+        if tried.step is None:
+            assert tried.too_late is not None
+            return [f"{braking} would not have avoided it even {self._ago(end, tried.too_late)}; that was run."]
+        if tried.too_late is None:
+            return [f"{braking} would have avoided it until {self._ago(end, tried.step)}; that was run."]
+        until = self._ago(end, tried.step)
+        return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run."]
+
+    def _calculated(self, end: int, braking: float) -> str:
         if self.escape is None:
-            return f"{braking} would not have avoided it at any step in which both were there."
-        ago = (end - self.escape) * self.recording.prologue.step_length_s
-        if self.escape == end:
-            return f"{braking} would have avoided it until the end."
-        return f"{braking} would have avoided it until {ago:.1f} s before, at step {self.escape}; after that, nothing."
+            return f"Until when braking at {braking:g} m/s² would have helped cannot be calculated."
+        tried = self.bundle.result.escape
+        can = ""
+        if tried is not None and tried.braking is not None and braking > 1.01 * tried.braking:
+            can = f" ({tried.braking:.1f} is all that it did when that was run)"
+        return (
+            f"Braking at {braking:g} m/s²{can} would have avoided it until {self._ago(end, self.escape)}, had "
+            f"{self.other} moved as it did; that is calculated, not run."
+        )
+
+    def _ago(self, end: int, step: int) -> str:
+        return f"{(end - step) * self.recording.prologue.step_length_s:.1f} s before, after step {step}"
 
     def _last_lane_change(self) -> tuple[int, str] | None:
         names = self._names()
@@ -216,6 +242,17 @@ class Story:
     def _decision(self, step: int) -> list[str]:
         action = self._action(step)
         return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
+
+
+def _named(moment: Moment, nearest: dict[str, Any]) -> dict[str, Any]:
+    """A moment under names that mean the same everywhere: some are about the nearest one, some about the other one."""
+    facts = asdict(moment)
+    return {
+        **{name: facts[name] for name in ("step", "time_s", "speed", "other_speed", "closing_speed")},
+        "gap_to_other_m": moment.gap_m,
+        "time_to_other_s": moment.time_to_collision_s,
+        **{name: nearest[name] for name in NEAREST},
+    }
 
 
 def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:

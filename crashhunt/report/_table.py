@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from crashhunt._names import did_you_mean
+from crashhunt.encounter import Encounter
 from crashhunt.errors import UsageError
 from crashhunt.oracles import approaches
 
@@ -14,21 +15,26 @@ if TYPE_CHECKING:
 
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
-__all__ = ["aligned", "format_table", "steps_table"]
+__all__ = ["NEAREST", "aligned", "format_table", "steps_table"]
 
 _SCENE = ("x", "y", "heading", "speed")
-_MEASURED = ("time_to_collision_s", "gap_m", "required_deceleration")
+NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
+"""What is measured to whoever is the nearest, as of every trial."""
+
+_TO_OTHER = {"gap_to_other_m": "gap_m", "time_to_other_s": "time_to_collision_s", "closing_speed": "closing_speed"}
 
 
-def steps_table(recording: Recording, fields: Sequence[str], agent: str) -> list[dict[str, Any]]:
+def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[dict[str, Any]]:
     """Return one row a step: the step, the time and the fields; None where there is no value.
 
     Args:
         recording: of the episode.
         fields: ``x``, ``y``, ``heading``, ``speed``, ``reward``, ``time_to_collision_s``, ``gap_m``,
-            ``required_deceleration``, the parts of the action by name, ``observation[ROW,NAME]``; ``action`` for all
-            parts of the action.
+            ``required_deceleration`` (these three to whoever is the nearest), ``gap_to_other_m``, ``time_to_other_s``,
+            ``closing_speed`` (these three to the other one of the crash), the parts of the action by name,
+            ``observation[ROW,NAME]``; ``action`` for all parts of the action.
         agent: whose.
+        other: the one that it crashed with.
 
     Raises:
         UsageError: a field does not exist, with those that do.
@@ -36,24 +42,27 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str) -> list
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions = channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
     observed = _observed(channel)
-    known = [*_SCENE, "reward", *_MEASURED, *actions, *observed]
+    known = [*_SCENE, "reward", *NEAREST, *_TO_OTHER, *actions, *observed]
     names: list[str] = []
     for field in fields:
         name = field.replace(" ", "")
         if name != "action" and name not in known:
             hint = did_you_mean(name, known)
-            shown = ", ".join([*_SCENE, "reward", *_MEASURED, "action", *actions, *list(observed)[:3]])
+            shown = ", ".join([*_SCENE, "reward", *NEAREST, *_TO_OTHER, "action", *actions, *list(observed)[:3]])
             raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
         names += actions if name == "action" else (name,)
     measured: dict[str, Any] = {}
-    if set(names) & set(_MEASURED):
+    if set(names) & set(NEAREST):
         frames = [step.scene.frame for step in recording.all_steps if step.scene is not None]
-        measured = dict(zip(_MEASURED, approaches(frames, agent), strict=True))
+        measured = dict(zip(NEAREST, approaches(frames, agent), strict=True))
+    moments = {moment.step: moment for moment in Encounter(recording, agent, other).moments} if other else {}
     rows = []
     for number, step in enumerate(recording.all_steps):
         row: dict[str, Any] = {"step": step.step, "time_s": step.scene.time_s if step.scene is not None else None}
         for name in names:
-            if name in _MEASURED:
+            if name in _TO_OTHER:
+                row[name] = getattr(moments.get(step.step), _TO_OTHER[name], None)
+            elif name in NEAREST:
                 row[name] = float(measured[name][number]) if step.scene is not None else None
             elif name in actions:
                 array = step.actions.get(agent)

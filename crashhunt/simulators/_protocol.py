@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
@@ -14,10 +15,25 @@ if TYPE_CHECKING:
 
     from crashhunt.scene import Scene
 
-__all__ = ["ActionForm", "Observations", "Simulator", "StepResult"]
+__all__ = ["ActionForm", "FullBraking", "Observations", "Simulator", "StepResult"]
 
 Observations = dict[str, NDArray[Any]]
 StepResult = tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class FullBraking:
+    """How a vehicle brakes as hard as it can without leaving its lane.
+
+    Args:
+        action: what the agent answers, in every step.
+        how: in words that follow "Braking …".
+        deceleration: what that amounts to, in m/s², where the simulator says so.
+    """
+
+    action: Any
+    how: str
+    deceleration: float | None = None
 
 
 class ActionForm(Protocol):
@@ -48,7 +64,9 @@ class Simulator(Protocol):
     agent the Dict or Tuple space into which its observations are unflattened before the agent is shown them.
     A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`. One that
     has a window of its own offers ``open_window()``, called before the first `reset`, ``follow(agent, other)``, which
-    marks the two and keeps the agent in view, and ``window_open``; none of them changes what is simulated.
+    marks the two and keeps the agent in view, and ``window_open``; none of them changes what is simulated. One that
+    knows how a vehicle brakes as hard as it can offers ``full_braking(agent) -> FullBraking | None``, callable after
+    `reset`: with it, a hunt finds out until when a crash could have been avoided.
     """
 
     @property

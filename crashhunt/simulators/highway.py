@@ -33,6 +33,7 @@ from crashhunt.simulators._accelerator import accelerate, decelerate
 from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._highway_config import configured, mistake, restore_classes
 from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
 
 if TYPE_CHECKING:
@@ -158,6 +159,13 @@ class HighwaySimulator:
             shape = tuple((float(x), -float(y)) for x, y in points)
             found.append(Lane(self._lane_name((start, end, number)), float(lane.width_at(lane.length / 2)), shape))
         return found
+
+    def full_braking(self, agent: str) -> FullBraking | None:
+        """Return how a vehicle brakes as hard as its actions allow; None where they do not keep it in its lane."""
+        kind = self._kinds[agent]
+        if isinstance(kind, DiscreteMetaAction) and "SLOWER" in kind.actions_indexes:
+            return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
+        return None
 
     def close(self) -> None:
         """Close the environment."""

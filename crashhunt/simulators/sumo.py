@@ -17,6 +17,7 @@ from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
 from crashhunt.setups import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._sumo_files import StagedFiles
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ lane of each vehicle: a string each is too dear for every step."""
 _SIGHT_SQUARED = SIGHT_M**2
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _SEEN_M = 150.0  # of the network, in a window that follows a vehicle
+_KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
 _RADIANS = math.pi / 180.0
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
@@ -167,6 +169,15 @@ class SumoSimulator:
                 for lane in sumo.lane_getIDList()
             ]
         return self._lanes
+
+    def full_braking(self, agent: str) -> FullBraking:
+        """Return how a vehicle brakes as hard as it can: as its speed mode allows."""
+        setup = self._scenario.agents[agent]
+        if setup.action == "meta":
+            return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
+        if setup.speed_mode & _KEEPS_DECELERATION:
+            return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
+        return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
     def close(self) -> None:
         """End the simulation, unless another simulator of this process has begun one since."""

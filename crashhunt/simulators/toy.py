@@ -16,8 +16,9 @@ import numpy as np
 from crashhunt.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
 from crashhunt.setups import ObservationSetup
-from crashhunt.simulators._actions import MetaAction, SpeedAndLaneChange
+from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._protocol import FullBraking
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -114,6 +115,12 @@ class ToySimulator:
     def lanes(self) -> list[Lane]:
         """Return the one lane."""
         return [Lane("road_0", 3.5, ((0.0, 0.0), (float(self._argument("road_m", 1000.0)), 0.0)))]
+
+    def full_braking(self, agent: str) -> FullBraking:
+        """Return how a vehicle brakes as hard as it can."""
+        if self._setups[agent].action == "meta":
+            return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
+        return FullBraking((0.0, 0), "all that it can do", _BRAKING)
 
     def close(self) -> None:
         """Nothing to let go of."""

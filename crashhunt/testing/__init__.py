@@ -11,8 +11,16 @@ Needs pytest.
 """
 
 from crashhunt.testing._agents import AgentContract
+from crashhunt.testing._escapes import EscapeCheck, check_escape
 from crashhunt.testing._executors import ExecutorContract
 from crashhunt.testing._samplers import SamplerContract
 from crashhunt.testing._simulators import SimulatorContract
 
-__all__ = ["AgentContract", "ExecutorContract", "SamplerContract", "SimulatorContract"]
+__all__ = [
+    "AgentContract",
+    "EscapeCheck",
+    "ExecutorContract",
+    "SamplerContract",
+    "SimulatorContract",
+    "check_escape",
+]

@@ -20,7 +20,7 @@ COMMANDS = ("run", "replay", "show", "report", "export", "status", "logs", "reru
 SAYS = {
     "run": ("confirmed: a fresh process", "150 of 150 trials"),
     "replay": ("reproduced: ", "fixed: no crash"),
-    "show": ("Braking at 8 m/s² would have avoided it", "could not have avoided it"),
+    "show": ("When they touched, ",),
     "export": ("crash.zip (",),
     "suite": ("nightly/town/1",),
     "rerun": ("firm: finished",),

@@ -25,16 +25,19 @@ def test_a_collision_is_told_in_words_and_a_table(crash):
     assert f"ego drove {last['speed']:.1f} m/s and {facts['other']} {last['other_speed']:.1f} m/s" in text
     (marked,) = (line for line in text.splitlines() if "<- the last step" in line)
     assert int(marked.split()[0]) == facts["last_escape_step"]
-    assert f"at step {facts['last_escape_step']}; after that, nothing" in text
+    assert f"after step {facts['last_escape_step']}; one step later it was too late. Both were run." in text
     # The rows of the table are the moments.
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d+  ", line)]
     by_step = {moment["step"]: moment for moment in facts["moments"]}
     for row in rows:
         moment = by_step[int(row[0])]
         assert float(row[2]) == pytest.approx(moment["speed"], abs=0.06)
-        assert float(row[6]) == pytest.approx(moment["gap_m"], abs=0.06)
-    harder = crash.crashhunt("show", "h", "--braking", "4", "--json").json
-    assert harder["last_escape_step"] is None or harder["last_escape_step"] < facts["last_escape_step"]
+        assert float(row[6]) == pytest.approx(moment["gap_to_other_m"], abs=0.06)
+    softer = crash.crashhunt("show", "h", "--braking", "4", "--json").json
+    assert softer["braking"]["by"] == "calculation"
+    assert softer["last_escape_step"] is None or softer["last_escape_step"] < facts["last_escape_step"]
+    harder = crash.crashhunt("show", "h", "--braking", "20").out
+    assert "Braking at 20 m/s² (8.0 is all that it did when that was run) would have avoided it" in harder
 
 
 def test_bad_numbers_are_refused(crash):
@@ -56,5 +59,5 @@ def test_software_faults_are_told_too(shell, agent, says):
 
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):
     crash.environment["PYTHONIOENCODING"] = "ascii"
-    assert "Braking at 8 m/s\\xb2 would have avoided it" in crash.crashhunt("show", "h").out
+    assert "Braking at 8 m/s\\xb2, all that its type can do, would have avoided it" in crash.crashhunt("show", "h").out
     assert "m/s\\xb2" in crash.crashhunt("agents").out

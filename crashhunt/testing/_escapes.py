@@ -1,0 +1,112 @@
+"""Whether what a crash says about braking is so: tried by driving its recorded actions, and braking from a step on."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashhunt.escape import partner
+from crashhunt.executors import FreshProcessExecutor
+from crashhunt.recording import read_log
+from crashhunt.replays import ReplayOptions, prepare
+
+if TYPE_CHECKING:
+    from crashhunt.bundle import Bundle
+    from crashhunt.replays import Rerun
+
+__all__ = ["EscapeCheck", "RecordedThenBrakes", "check_escape"]
+
+_NEVER = 10**9
+_AFTERWARDS_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class EscapeCheck:
+    """What came of trying what a crash says about braking.
+
+    Args:
+        crash: its id.
+        step: the last step after which braking helps, as the crash says it.
+        too_late: a step after which it does not, likewise.
+        avoided: whether braking after ``step`` avoided the collision; None where nothing is said.
+        avoided_later: whether braking after ``too_late`` did.
+    """
+
+    crash: str
+    step: int | None = None
+    too_late: int | None = None
+    avoided: bool | None = None
+    avoided_later: bool | None = None
+
+    @property
+    def verdict(self) -> Literal["right", "silent", "wrong"]:
+        """What to think of it."""
+        if self.step is None and self.too_late is None:
+            return "silent"
+        return "wrong" if self.avoided is False or self.avoided_later else "right"
+
+
+class RecordedThenBrakes:
+    """Plays the recorded actions of an agent up to a step; then brakes: target speed 0, or SLOWER.
+
+    Args:
+        log: the path of a ``log.mcap``.
+        agent: whose actions.
+        after: the step; an agent that is not overruled repeats its last action when the log is exhausted.
+        action_space: of the vehicle.
+    """
+
+    def __init__(self, log: str, agent: str, after: int, action_space: Any) -> None:
+        self._actions = read_log(Path(log)).actions(agent)
+        self._after = after
+        meanings = getattr(action_space, "meanings", None)
+        self._brake: Any = (0.0, 0) if meanings is None else meanings.index("SLOWER")
+        self._step = 0
+
+    def reset(self, seed: int) -> None:
+        """Begin at the first action."""
+        self._step = 0
+
+    def act(self, observation: Any) -> Any:
+        """Return the next action."""
+        step, self._step = self._step, self._step + 1
+        return self._brake if step >= self._after else self._actions[min(step, len(self._actions) - 1)]
+
+
+def check_escape(bundle: Bundle) -> EscapeCheck:
+    """Try what a crash says about braking, each step in a fresh process.
+
+    This is another way than the one by which a hunt finds it out: no code of the agents is run.
+    """
+    said = bundle.result.escape
+    if said is None:
+        return EscapeCheck(bundle.id)
+    rerun = prepare(bundle, ReplayOptions(code="log"))
+    avoided, later = (
+        None if step is None else _avoids(rerun, step, _AFTERWARDS_S) for step in (said.step, said.too_late)
+    )
+    return EscapeCheck(bundle.id, said.step, said.too_late, avoided, later)
+
+
+def _avoids(rerun: Rerun, after: int, afterwards_s: float) -> bool:
+    scenario = rerun.worker.scenario
+    name = f"{__name__}:{RecordedThenBrakes.__name__}"
+    arguments = {
+        agent: {**given, "after": after if agent == rerun.bundle.driver else _NEVER}
+        for agent, given in rerun.spec.arguments.items()
+    }
+    steps = rerun.recorded.steps + round(afterwards_s / rerun.recorded.prologue.step_length_s)
+    with tempfile.TemporaryDirectory(prefix="crashhunt-escape-") as folder:
+        worker = replace(
+            rerun.worker, scenario=scenario.with_agents(dict.fromkeys(scenario.agents, name)), scratch=Path(folder)
+        )
+        executor = FreshProcessExecutor(worker)
+        try:
+            executor.submit(replace(rerun.spec, arguments=arguments, max_steps=steps))
+            result = next(result for _ in iter(int, 1) for result in executor.completed(1.0))
+        finally:
+            executor.close()
+    other = partner(rerun.bundle.result)
+    return partner(result) != other or result.collision is None or result.collision.agent != rerun.bundle.driver

@@ -1,0 +1,74 @@
+"""Until when braking would have avoided a crash: what is said is tried, by driving the recorded actions and braking."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from crashhunt.bundle import list_bundles
+from crashhunt.scenario import shipped_folder
+from crashhunt.testing import check_escape
+
+KEEP = ("--keep-going", "--deterministic", "--seed", "1")
+
+
+def told(folder: Path) -> Counter[str]:
+    return Counter(check_escape(bundle).verdict for bundle in list_bundles(folder))
+
+
+def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_told(toy):
+    toy.crashhunt("run", "h", "2", "6", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
+    assert told(toy.folder / "h")["wrong"] == 0
+    bundles = list_bundles(toy.folder / "h")
+    assert sum(bundle.result.escape is not None for bundle in bundles) >= 3
+    for bundle in bundles:
+        escape = bundle.result.escape
+        assert escape is None or escape.step is None or escape.step < bundle.result.steps
+        assert escape is None or escape.how == "at 8 m/s², all that it can do,"
+
+
+def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
+    shell.crashhunt("run", "h", "2", "4", "600", "--arg", "speed=20:25", *KEEP)
+    told_of = told(shell.folder / "h")
+    assert told_of["wrong"] == 0
+    assert told_of["right"] >= 2
+    facts = shell.crashhunt("show", "h", "--json").json
+    assert facts["braking"]["by"] == "running it"
+    assert facts["full_braking"] == pytest.approx(8.0, abs=0.01)
+    assert "Braking at 8 m/s², all that its type can do, would have avoided it" in shell.crashhunt("show", "h").out
+
+
+@pytest.mark.parametrize("length", ["0.5", "1.0"])
+def test_long_steps(shell, length):
+    folder = shell.folder / "slow"
+    shutil.copytree(shipped_folder() / "loop", folder)
+    text = (folder / "scenario.toml").read_text()
+    assert "step_length_s = 0.1" in text
+    (folder / "scenario.toml").write_text(text.replace("step_length_s = 0.1", f"step_length_s = {length}"))
+    words = ("--arg", "speed=15:25", "--set", "vehicles=35", *KEEP)
+    shell.crashhunt("run", "h", "2", "3", "200", "--scenario", "slow", *words)
+    assert told(shell.folder / "h")["wrong"] == 0
+
+
+def test_a_crash_from_before_says_nothing(toy):
+    toy.crashhunt("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
+    (file,) = (toy.folder / "h" / "crashes").glob("*/crash.json")
+    data = json.loads(file.read_text())
+    del data["escape"]
+    file.write_text(json.dumps(data))
+    assert "Braking" not in toy.crashhunt("show", "h").out
+    assert "calculated, not run" in toy.crashhunt("show", "h", "--braking", "6").out
+
+
+@pytest.mark.skipif("CRASHHUNT_ESCAPE_STUDY" not in os.environ, reason="needs the directories of many hunts")
+def test_whatever_has_been_hunted():
+    """``CRASHHUNT_ESCAPE_STUDY=FOLDER``: tries every crash of every hunt in the folder."""
+    folder = Path(os.environ["CRASHHUNT_ESCAPE_STUDY"])
+    checks = [check_escape(bundle) for hunt in sorted(folder.iterdir()) for bundle in list_bundles(hunt)]
+    print(Counter(check.verdict for check in checks))
+    assert [check for check in checks if check.verdict == "wrong"] == []
