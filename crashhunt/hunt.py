@@ -19,6 +19,7 @@ from crashhunt.plan import spec_of, with_settings
 from crashhunt.plugins import locate
 from crashhunt.progress import HuntReport, HuntStatus, Progress, StoppedBecause
 from crashhunt.replays import confirm
+from crashhunt.simulators._sumo_says import explained
 from crashhunt.snapshot import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.status import this_process
 from crashhunt.trial import Outcome, TrialResult
@@ -142,7 +143,7 @@ class Hunt:
         watch(self._status(progress, "done"))
         reason = ""
         if stopped == "no_valid_trial" and progress.last_invalid is not None:
-            reason = _why_invalid(progress.last_invalid)
+            reason = _why_invalid(progress.last_invalid, self.scenario)
         ledger.enter(stopped, reason, heartbeat=time.time())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
@@ -326,8 +327,12 @@ class Hunt:
                 signal.signal(number, handler)
 
 
-def _why_invalid(result: TrialResult) -> str:
+def _why_invalid(result: TrialResult, scenario: Scenario) -> str:
     """Why a trial could not be set up, with what the simulator said about it last."""
+    if scenario.sumo is not None and result.failure is not None:
+        error = explained(result.summary, result.failure.last_output, scenario)
+        if error is not None:
+            return str(error)
     said = result.failure.last_output.strip().splitlines() if result.failure else []
     last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
     return f"{result.summary}\n  last output: {last}" if last else result.summary

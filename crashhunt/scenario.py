@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 from crashhunt._names import did_you_mean, listed, near_path
 from crashhunt.errors import ArgumentError, ScenarioError
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
+from crashhunt.simulators._sumo_names import check_names
 from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true
 from crashhunt.simulators._sumo_xml import nested_files, read_xml
 
@@ -179,14 +180,18 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
             raise ScenarioError(
                 f"--ego {ego!r} is for a bare .sumocfg", fix="set the vehicle under [agents] instead", where=str(path)
             )
-        return _load_toml(path, kept=kept)
-    if path.name.endswith(_ENDINGS):
+        scenario = _load_toml(path, kept=kept)
+    elif path.name.endswith(_ENDINGS):
         from crashhunt.sumocfg import load_sumocfg
 
-        return load_sumocfg(path, ego=ego)
-    raise ScenarioError(
-        f"{path.name!r} is neither a scenario.toml nor a .sumocfg", fix="give one of the two", where=str(path)
-    )
+        scenario = load_sumocfg(path, ego=ego)
+    else:
+        raise ScenarioError(
+            f"{path.name!r} is neither a scenario.toml nor a .sumocfg", fix="give one of the two", where=str(path)
+        )
+    if not kept:
+        check_names(scenario, ego)
+    return scenario
 
 
 def _load_toml(path: Path, *, kept: bool) -> Scenario:
