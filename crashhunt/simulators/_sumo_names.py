@@ -7,13 +7,13 @@ parsed, as a network may have hundreds of megabytes.
 
 from __future__ import annotations
 
-import gzip
 import re
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape, unescape
 
 from crashhunt._names import did_you_mean, listed
 from crashhunt.errors import ScenarioError
+from crashhunt.simulators._sumo_xml import read_xml
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -42,7 +42,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
     """
     if scenario.sumo is None:
         return
-    demand = [_content(scenario.folder / name) for name in (*scenario.sumo.routes, *scenario.sumo.additional)]
+    demand = [read_xml(scenario.folder / name) for name in (*scenario.sumo.routes, *scenario.sumo.additional)]
     open_ended = any(_SECRETIVE.search(text) for text in demand)
     for agent, setup in scenario.agents.items():
         key = f"agents.{agent}"
@@ -59,7 +59,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
 def line_of(name: str, files: Iterable[Path]) -> str:
     """Return ``FILE, line N`` of the first definition of an id; empty where there is none."""
     for file in files:
-        text = _content(file)
+        text = read_xml(file)
         found = _definition(name).search(text)
         if found is not None:
             line = text.count(b"\n", 0, found.start()) + 1
@@ -69,7 +69,7 @@ def line_of(name: str, files: Iterable[Path]) -> str:
 
 def _check_edges(scenario: Scenario, setup: AgentSetup, key: str) -> None:
     if setup.edges and scenario.sumo is not None:
-        net = [_content(scenario.folder / scenario.sumo.net)]
+        net = [read_xml(scenario.folder / scenario.sumo.net)]
         for edge in setup.edges:
             _check(key, "edge", edge, net, scenario.origin)
 
@@ -112,12 +112,3 @@ def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
     found = re.compile(rb"""<(?:%b)\s[^<>]*?\bid\s*=\s*["']([^"']*)["']""" % tags)
     names = (name.decode(errors="replace") for text in texts for name in found.findall(text))
     return list(dict.fromkeys(unescape(name, {"&quot;": '"', "&apos;": "'"}) for name in names))
-
-
-def _content(file: Path) -> bytes:
-    if file.suffix != ".gz":
-        return file.read_bytes()
-    try:
-        return gzip.decompress(file.read_bytes())
-    except (OSError, EOFError):  # what is no gzip, SUMO says
-        return b""
