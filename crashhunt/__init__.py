@@ -1,6 +1,7 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
-``crashhunt.run``, ``prepare``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does.
+``crashhunt.run``, ``prepare``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does;
+``accelerate`` speeds highway-env up in a process of your own.
 """
 
 import sys
@@ -8,15 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from crashhunt.api import Hunt, Suite, compare, load, prepare, replay, run
+    from crashhunt.simulators.acceleration import accelerate
 
 __version__ = "0.1.0"
-__all__ = ["Hunt", "Suite", "__version__", "compare", "load", "prepare", "replay", "run"]
+__all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run"]
 
 
 def __getattr__(name: str) -> Any:
     """Import the functions when they are first asked for: a worker needs none of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "accelerate":
+        from crashhunt.simulators.acceleration import accelerate
+
+        return accelerate
     from crashhunt import api
 
     return getattr(api, name)

@@ -14,7 +14,7 @@ import time
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -482,12 +482,17 @@ def bench_panels() -> Iterator[Figure]:
     yield Figure("panels_vs_matplotlib", ratio, "x", "higher", 20.0, note)
 
 
-def child_accelerator(name: str, vehicles: str, rounds: str) -> dict[str, float]:
-    """Steps a second on highway-env without and with the accelerator, in turns; IDLE or random actions."""
+def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> dict[str, float]:
+    """Steps a second on highway-env without and with the accelerator, in turns; IDLE or random actions.
+
+    ``how`` is ``episodes`` (of five steps, with their resets), ``road`` or ``neighbours`` (a class of roads of a user's
+    own, which overrides nothing of interest, or the search for neighbours), or nothing.
+    """
     import warnings
 
     import gymnasium
     import highway_env
+    from highway_env.road.road import Road
 
     from crashhunt.simulators._accelerator import accelerate, decelerate
 
@@ -495,9 +500,30 @@ def child_accelerator(name: str, vehicles: str, rounds: str) -> dict[str, float]
     assert highway_env
     config = {"duration": float("inf")} | ({"vehicles_count": int(vehicles)} if int(vehicles) else {})
 
+    class Own(Road):  # type: ignore[misc]
+        pass
+
+    class OwnNeighbours(Road):  # type: ignore[misc]
+        def neighbour_vehicles(self, vehicle: Any, lane_index: Any = None) -> Any:
+            return super().neighbour_vehicles(vehicle, lane_index)
+
+    def episodes(env: Any, seed: int) -> float:
+        spent, steps = 0.0, 0
+        while spent < 0.6 or steps < 10:
+            began = time.perf_counter()
+            env.reset(seed=seed + steps, options={"config": config})
+            for _ in range(5):
+                env.step(1)
+            spent, steps = spent + time.perf_counter() - began, steps + 5
+        return steps / spent
+
     def rate(seed: int) -> float:
-        env = gymnasium.make(name, disable_env_checker=True).unwrapped
+        env: Any = gymnasium.make(name, disable_env_checker=True).unwrapped
+        if how == "episodes":
+            return episodes(env, seed)
         env.reset(seed=seed, options={"config": config})
+        if how:
+            env.road.__class__ = {"road": Own, "neighbours": OwnNeighbours}[how]
         env.action_space.seed(seed)
         spent, steps = 0.0, 0
         while spent < 0.6 or steps < 2:
@@ -531,6 +557,13 @@ def bench_accelerator() -> Iterator[Figure]:
         found = in_child("child_accelerator", name, "0", "5")
         note = f"{found['slow']:.1f} steps a second become {found['fast']:.0f}"
         yield Figure(f"accelerated_{name}", found["ratio"], "x", "higher", target, note)
+    for name, how in (
+        ("highway-v0", "episodes"), ("highway-fast-v0", "episodes"), ("merge-v0", "episodes"),
+        ("highway-v0", "road"), ("highway-v0", "neighbours"),
+    ):  # fmt: skip
+        found = in_child("child_accelerator", name, "0", "3", how)
+        note = f"{found['slow']:.1f} steps a second become {found['fast']:.1f}"
+        yield Figure(f"accelerated_{name}_{how}", found["ratio"], "x", "higher", None, note)
     names = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env")]
     ratios = {name: in_child("child_accelerator", name, "0", "3")["ratio"] for name in sorted(names)}
     worst = min(ratios, key=ratios.__getitem__)

@@ -6,6 +6,7 @@ know, such as a class that overrides what it speeds up, is left to highway-env's
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
@@ -14,15 +15,17 @@ from highway_env.road.road import Road
 
 from crashhunt.simulators._accelerator._drive import decide
 from crashhunt.simulators._accelerator._frame import Frame
-from crashhunt.simulators._accelerator._known import reason_against, replaced
+from crashhunt.simulators._accelerator._known import Own, left_alone, originals, reason_against
 from crashhunt.simulators._accelerator._move import collide, enforce, move
 from crashhunt.simulators._accelerator._network import Network
 from crashhunt.simulators._accelerator._observe import close_objects, fill_lanes, observe
+from crashhunt.simulators._accelerator._watch import Watch, is_plain
 
-__all__ = ["accelerate", "decelerate"]
+__all__ = ["accelerate", "decelerate", "is_on", "left_alone", "why_not"]
 
 _ROADS = 16  # that are remembered: those of several environments in one process
 _roads: dict[int, _Prepared] = {}
+_state: dict[str, Any] = {}  # "roads" and "observations": the watches, while it is fast
 
 
 def accelerate() -> str:
@@ -31,22 +34,37 @@ def accelerate() -> str:
     Returns:
         Why not; empty where it is faster now.
     """
-    if replaced:
-        return ""
+    if _state:
+        return why_not()
     reason = reason_against()
     if not reason:
         for owner, name, faster in _REPLACED:
-            replaced[name] = getattr(owner, name)
+            originals[name] = getattr(owner, name)
             setattr(owner, name, faster)
+        # Whoever replaces one of ours has it called; but vehicles that decide together ask nobody for neighbours.
+        ours = {f"{owner.__qualname__}.{name}" for owner, name, _ in _REPLACED}
+        _state["roads"] = Watch.of_roads(ours - {"Road.neighbour_vehicles"})
+        _state["observations"] = Watch.of_observations(ours)
     return reason
 
 
 def decelerate() -> None:
-    """Have highway-env as it was."""
+    """Have highway-env as it was; what somebody else has replaced meanwhile stays, and does without us."""
     _roads.clear()
-    for owner, name, _ in _REPLACED:
-        if name in replaced:
-            setattr(owner, name, replaced.pop(name))
+    _state.clear()
+    for owner, name, faster in _REPLACED:
+        if vars(owner).get(name) is faster:
+            setattr(owner, name, originals[name])
+
+
+def is_on() -> bool:
+    """Whether somebody has asked for it, and it could be done."""
+    return bool(_state)
+
+
+def why_not() -> str:
+    """Say why it is not fast at this moment; empty where it is, or where nobody has asked for it."""
+    return next((watch.reason for watch in _state.values() if watch.reason), "")
 
 
 class _Prepared:
@@ -59,8 +77,8 @@ class _Prepared:
 
 
 def _prepared(road: Road) -> _Prepared | None:
-    """What is known about a road; None where it has lanes that are not known."""
-    if type(road) not in (Road, RegulatedRoad):
+    """What is known about a road; None where it, its lanes or highway-env itself are not what is known."""
+    if not _is_known(road):
         return None
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
@@ -68,6 +86,35 @@ def _prepared(road: Road) -> _Prepared | None:
         while len(_roads) > _ROADS:  # an episode has one road, which nobody needs afterwards
             del _roads[next(iter(_roads))]
     return found if found.network.plain else None
+
+
+class _RoadKind:
+    """What is known about a class of roads; those that have no method in the way are as good as highway-env's own."""
+
+    def __init__(self, kind: type[Road]) -> None:
+        base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
+        self.own = Own(kind, base, _READ)
+        self.plain = self.own.plain and not any(map(self.own.has, _BYPASSED))
+
+
+_READ = ("network", "vehicles", "objects", "np_random", "record_history", "neighbour_vehicles_connected_lanes")
+_BYPASSED = ("neighbour_vehicles", "is_conflict_possible")
+"""The methods of a road that are not called where it is sped up; all others are."""
+_CALLED = {"act", "step"}  # one road may have its own, which call the class's
+_road_kinds: dict[type, _RoadKind] = {}
+
+
+def _is_known(road: Road) -> bool:
+    if not _state or not _state["roads"].intact:
+        return False
+    kind = type(road)
+    if kind not in (Road, RegulatedRoad):
+        found = _road_kinds.get(kind)
+        if found is None or not found.own.current:
+            found = _road_kinds[kind] = _RoadKind(kind)
+        if not found.plain:
+            return False
+    return type(road.vehicles) is list and type(road.objects) is list and _ROAD_METHODS.isdisjoint(vars(road))
 
 
 def _network_of(road: Road) -> Network | None:
@@ -82,18 +129,18 @@ def _frame_of(road: Road) -> Frame | None:
         return None
     if found.frame is None or not found.frame.is_of(road):
         found.frame = Frame(found.network, road)
-    return found.frame
+    return found.frame if found.frame.plain else None
 
 
 def _act(self: Road) -> None:
     frame = _frame_of(self) if len(self.vehicles) > 1 else None
     if frame is None or not decide(self, frame):
-        replaced["act"](self)
+        originals["act"](self)
 
 
 def _step(self: Road, dt: float) -> None:
-    if len(self.vehicles) + len(self.objects) < 2:
-        replaced["step"](self, dt)
+    if len(self.vehicles) + len(self.objects) < 2 or not _is_known(self):
+        originals["step"](self, dt)
         return
     found = _prepared(self)
     frame = move(self, found.network, dt) if found is not None else None
@@ -113,7 +160,7 @@ def _neighbour_vehicles(self: Road, vehicle: Any, lane_index: Any = None) -> Any
         found = frame.neighbours(vehicle, row, key)
         if found is not None:
             return found
-    return replaced["neighbour_vehicles"](self, vehicle, lane_index)
+    return originals["neighbour_vehicles"](self, vehicle, lane_index)
 
 
 def _close_objects_to(
@@ -132,33 +179,49 @@ def _close_objects_to(
         )
         if found is not None:
             return found
-    return replaced["close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
+    return originals["close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
-    if type(self) is not RegulatedRoad or not enforce(self):
-        replaced["enforce_road_rules"](self)
+    if _prepared(self) is None or not enforce(self):
+        originals["enforce_road_rules"](self)
 
 
 def _observe(self: KinematicObservation) -> Any:
-    road = self.env.road
-    if type(self) is KinematicObservation and road:
-        found = observe(self, _frame_of(road))
+    if _is_plain(self, KinematicObservation):
+        found = observe(self, _frame_of(self.env.road))
         if found is not None:
             return found
-    return replaced["observe"](self)
+    return originals["observe"](self)
 
 
 def _fill_road_layer_by_lanes(
     self: OccupancyGridObservation, layer_index: int, lane_perception_distance: float = 100
 ) -> None:
-    network = _network_of(self.env.road)
-    if network is not None and type(self) is OccupancyGridObservation:
+    network = _network_of(self.env.road) if _is_plain(self, OccupancyGridObservation) else None
+    if network is not None:
         fill_lanes(self, network, layer_index, lane_perception_distance)
     else:
-        replaced["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
+        originals["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
+def _is_plain(observation: Any, kind: Any) -> bool:
+    """Whether an observation of a road is of a class that is known, and nobody has replaced a part of it."""
+    return bool(
+        type(observation) is kind
+        and _state
+        and _state["observations"].intact
+        and isinstance(observation.env.road, Road)
+        and _SHOWN[kind].isdisjoint(vars(observation))
+    )
+
+
+def _methods(kind: Any) -> frozenset[str]:
+    return frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
+
+
+_SHOWN = {kind: _methods(kind) for kind in (KinematicObservation, OccupancyGridObservation)}
+_ROAD_METHODS = _methods(RegulatedRoad) - _CALLED
 _REPLACED: tuple[tuple[Any, str, Any], ...] = (
     (Road, "act", _act),
     (Road, "step", _step),

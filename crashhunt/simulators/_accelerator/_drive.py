@@ -7,6 +7,7 @@ their order. Steering and acceleration depend on nothing that changes meanwhile.
 from __future__ import annotations
 
 import math
+from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from highway_env.utils import not_zero
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.simulators._accelerator._known import kind_of, replaced
+from crashhunt.simulators._accelerator._known import are_numbers, kinds_of, originals
 from crashhunt.simulators._accelerator._network import wrap_to_pi
 
 if TYPE_CHECKING:
@@ -27,16 +28,26 @@ __all__ = ["decide"]
 
 _STEERING = attrgetter("speed", "heading", "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "LENGTH", "MAX_STEERING_ANGLE")
 _FOLLOWING = attrgetter("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DELTA", "DISTANCE_WANTED", "TIME_WANTED")
+_THINKING = attrgetter(
+    "ACC_MAX", "POLITENESS", "LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED", "timer"
+)
 
 
 def decide(road: Road, frame: Frame) -> bool:
     """Let all vehicles decide; False where one of them is not known, and nothing was done."""
-    kinds = [kind_of(type(vehicle)) for vehicle in road.vehicles]
-    if not all(
-        kind.drives and kind.is_of(vehicle) for kind, vehicle in zip(kinds, road.vehicles, strict=True)
-    ) or not all(kind_of(type(thing)).collides for thing in road.objects):
+    vehicles = road.vehicles
+    kinds, others = kinds_of(vehicles), kinds_of(road.objects)
+    if not all(kind.drives and kind.is_of(vehicle) for kind, vehicle in zip(kinds, vehicles, strict=True)):
         return False
-    _Decisions(road, frame, [kind.drives for kind in kinds]).take()
+    if not all(kind.collides and kind.is_of(thing) for kind, thing in zip(others, road.objects, strict=True)):
+        return False
+    try:
+        decisions = _Decisions(road, frame, [kind.drives for kind in kinds])
+    except AttributeError:  # highway-env may never ask for what somebody's vehicle lacks
+        return False
+    if not decisions.are_usual:
+        return False
+    decisions.take()
     return True
 
 
@@ -46,6 +57,19 @@ class _Decisions:
         self.frame = frame
         self.network = frame.network
         self.drives = drives
+        drivers = [(vehicle, how) for vehicle, how in zip(road.vehicles, drives, strict=True) if how != "nothing"]
+        self.steering = {id(vehicle): _STEERING(vehicle) for vehicle, _ in drivers}
+        self.following = {id(vehicle): _FOLLOWING(vehicle) for vehicle, how in drivers if how == "idm"}
+        read = [*self.steering.values(), *self.following.values()]
+        read += [_THINKING(vehicle) for vehicle, how in drivers if how == "idm"]
+        read += [(vehicle.target_speed, vehicle.KP_A) for vehicle, _ in drivers]
+        read += [(thing.heading, thing.speed) for thing in frame.things]
+        #: whether all that they reckon with are numbers of the usual kinds, whose road is this one
+        self.are_usual = are_numbers(chain.from_iterable(read)) and all(
+            vehicle.road is road for vehicle in road.vehicles
+        )
+        if not self.are_usual:
+            return
         self.headings = np.array([thing.heading for thing in frame.things], float)
         self.speeds = np.array([thing.speed for thing in frame.things], float)
         self.directions = np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
@@ -99,7 +123,7 @@ class _Decisions:
     def _neighbours(self, row: int, vehicle: Any, key: Any) -> Any:
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
-            found = replaced["neighbour_vehicles"](self.road, vehicle, key)
+            found = originals["neighbour_vehicles"](self.road, vehicle, key)
         return found
 
     def _follow_road(self, row: int, vehicle: Any) -> None:
@@ -191,7 +215,7 @@ class _Decisions:
 
     def _accelerate_all(self, following: list[tuple[int, Any, Any]]) -> list[float]:
         """The same for many who follow for themselves."""
-        table = np.array([_FOLLOWING(vehicle) for _, vehicle, _ in following], float).T
+        table = np.array([self.following[id(vehicle)] for _, vehicle, _ in following], float).T
         comfort, braking, delta, distance_wanted, time_wanted = table
         rows = np.array([row for row, _, _ in following])
         speed = self.speeds[rows]
@@ -217,7 +241,7 @@ class _Decisions:
         """`ControlledVehicle.steering_control` of many."""
         vehicles = self.road.vehicles
         places, ahead = [], []
-        table = np.array([_STEERING(vehicles[row]) for row, _ in steering], float).T
+        table = np.array([self.steering[id(vehicles[row])] for row, _ in steering], float).T
         speed, heading, pursuit, lateral, turning, length, most = table
         for (row, lane), v, tau in zip(steering, speed.tolist(), pursuit.tolist(), strict=True):
             if lane is None:

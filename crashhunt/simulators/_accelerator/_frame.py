@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from highway_env.vehicle.objects import Landmark
 
+from crashhunt.simulators._accelerator._known import kinds_of
+
 if TYPE_CHECKING:
     from highway_env.road.road import Road
     from highway_env.vehicle.objects import RoadObject
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
     from crashhunt.simulators._accelerator._network import Network
 
-__all__ = ["Frame"]
+__all__ = ["Frame", "are_plain"]
 
 
 class Frame:
@@ -25,6 +27,9 @@ class Frame:
     Args:
         network: of the road.
         road: with its vehicles and objects.
+
+    Attributes:
+        plain: whether all have a place of the usual kind; otherwise nothing here may be used.
     """
 
     def __init__(self, network: Network, road: Road) -> None:
@@ -32,8 +37,11 @@ class Frame:
         self.road = road
         self.things: list[RoadObject] = road.vehicles + road.objects
         self._looks_further = road.neighbour_vehicles_connected_lanes
-        self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
         self.row = {id(thing): row for row, thing in enumerate(self.things)}
+        self.plain = are_plain(self.things)
+        if not self.plain:
+            return
+        self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
         self._columns: dict[int, tuple[list[float], list[float]]] = {}
         self._single: dict[tuple[int, int], tuple[float, float]] = {}
         self._queues: dict[Any, tuple[list[float], list[RoadObject]]] = {}
@@ -43,6 +51,8 @@ class Frame:
         things = road.vehicles + road.objects
         # By identity: a class of somebody's may call two vehicles equal.
         if list(map(id, things)) != list(self.row) or self._looks_further != road.neighbour_vehicles_connected_lanes:
+            return False
+        if not self.plain or not are_plain(things):
             return False
         return np.array_equal(np.array([thing.position for thing in things], float).reshape(-1, 2), self.places)
 
@@ -146,3 +156,18 @@ class Frame:
                 chosen = network.index[before, start, number if number < len(lanes) else 0]
                 found.append((chosen, -network.lanes[chosen].length))
         return found
+
+
+def are_plain(things: list[RoadObject]) -> bool:
+    """Whether all have a place of the usual kind, which nobody else has; nobody is on the road twice."""
+    if not all(kind.plain for kind in kinds_of(things)):
+        return False
+    positions = [thing.position for thing in things]
+    return (
+        len(set(map(id, things))) == len(set(map(id, positions))) == len(things)
+        and all(type(position) is np.ndarray and position.dtype is _FLOAT for position in positions)
+        and all(position.shape == (2,) for position in positions)
+    )
+
+
+_FLOAT = np.dtype(np.float64)

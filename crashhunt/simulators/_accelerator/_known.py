@@ -11,26 +11,37 @@ from typing import TYPE_CHECKING, Any
 
 import highway_env
 import numpy as np
-from highway_env import utils
 from highway_env.envs.common import observation
-from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, kinematics, objects
 
+from crashhunt.simulators._accelerator._watch import MODULES, is_plain
 from crashhunt.simulators._versions import ACCELERATED
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
-__all__ = ["Kind", "kind_of", "reason_against", "replaced"]
+__all__ = ["Kind", "Own", "are_numbers", "kind_of", "kinds_of", "left_alone", "originals", "reason_against"]
 
-_MODULES = (utils, observation, lane, regulation, road, behavior, controller, kinematics, objects)
+_MODULES = (*MODULES[:1], observation, *MODULES[1:])  # in this order they are digested
 
 _COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
 _MOVES = ("step", "clip_actions", "on_state_update")
 _DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
 _DRIVES += ("change_lane_policy", "mobil")
 _PREDICTS = ("predict_trajectory_constant_speed",)
-_DESCRIBES = ("to_dict",)
+_DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
+_SPECIAL = (
+    "__bool__", "__len__", "__eq__", "__ne__", "__lt__", "__hash__", "__getattribute__", "__getattr__", "__setattr__",
+    "__delattr__", "__copy__", "__deepcopy__", "__reduce__", "__reduce_ex__", "__getstate__", "__setstate__",
+    "__class__", "__array__", "__float__", "__iter__", "__getitem__", "__contains__", "__add__", "__radd__",
+)  # fmt: skip
+"""A class with one of these of its own may do anything wherever highway-env touches it."""
+_VALUES = (
+    "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
+    "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
+    "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log",
+)  # fmt: skip
+"""What vehicles have, each its own: values, and read as often as is convenient."""
 _BASES = {
     behavior.IDMVehicle: "idm",
     controller.MDPVehicle: "controlled",
@@ -40,15 +51,50 @@ _BASES = {
     objects.Landmark: "",
     objects.RoadObject: "",
 }
+_METHODS = frozenset((*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
 _ORIGINALS = {
-    (owner, name): inspect.getattr_static(owner, name, None)
-    for owner in _BASES
-    for name in (*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES)
+    (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
 }
+_OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
+
+originals: dict[str, Any] = {}
+"""The methods of highway-env that are replaced, by name, as they were; nothing before the first time."""
 
 
-replaced: dict[str, Any] = {}
-"""The methods of highway-env that are replaced at the moment, by name; nothing where it is as it was."""
+class Own:
+    """What a class of somebody's has instead of what its base in highway-env has.
+
+    Args:
+        kind: the class.
+        base: in highway-env.
+        values: names that have to be mere values.
+    """
+
+    def __init__(self, kind: type, base: type, values: Iterable[str]) -> None:
+        self._kind, self._base = kind, base
+        self._mro = kind.__mro__
+        # Everything that a user can have changed since: highway-env's own classes are watched elsewhere.
+        self._members = [(vars(part), tuple(vars(part).items())) for part in self._mro if part.__module__ not in _OWN]
+        values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
+        self.names = [name for name in _SPECIAL if self.has(name)]
+        self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._of(name))]
+        self.plain = type(kind) is type(base) and not self.names
+
+    def has(self, name: str) -> bool:
+        """Whether it has another member of that name than its base."""
+        return self._of(name) is not inspect.getattr_static(self._base, name, None)
+
+    def _of(self, name: str) -> Any:
+        return inspect.getattr_static(self._kind, name, None)
+
+    @property
+    def current(self) -> bool:
+        """Whether the class is still what it was."""
+        return self._kind.__mro__ is self._mro and all(
+            len(space) == len(seen)
+            and all(a is b and v is w for (a, v), (b, w) in zip(space.items(), seen, strict=True))
+            for space, seen in self._members
+        )
 
 
 class Kind:
@@ -58,51 +104,77 @@ class Kind:
         kind: the class.
 
     Attributes:
+        plain: whether what it is made of is mere values, wherever they are read.
         collides: whether it collides as that does.
         moves: whether it moves so.
         times: whether it counts the time since it last thought of changing lanes.
         drives: how it decides: ``idm``, ``controlled``, ``nothing``; empty where that is not known.
         predicts: whether where it will be is foreseen so.
         describes: whether it describes itself so.
+        methods: all names that an object must not have of its own.
     """
 
     def __init__(self, kind: type) -> None:
-        base = next(base for base in kind.__mro__ if base in _BASES)
+        base = next((base for base in kind.__mro__ if base in _BASES), None)
+        self.own = Own(kind, base or kind, _VALUES)
+        self.plain = base is not None and self.own.plain
 
         def leaves(names: tuple[str, ...]) -> bool:
-            return all(inspect.getattr_static(kind, name, None) is _ORIGINALS[base, name] for name in names)
+            return self.plain and all(
+                inspect.getattr_static(kind, name, None) is _ORIGINALS[base, name] for name in names
+            )
 
         moving = issubclass(kind, kinematics.Vehicle)
         self.collides = leaves(_COLLIDES)
         self.moves = moving and self.collides and leaves(_MOVES)
         self.times = base is behavior.IDMVehicle
-        self.drives = _BASES[base] if self.collides and leaves(_DRIVES) else ""
-        self.predicts = moving and leaves(_PREDICTS)
-        self.describes = leaves(_DESCRIBES)
+        self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
+        self.predicts = moving and self.collides and leaves((*_PREDICTS, *_MOVES, *_DRIVES))
+        self.describes = self.collides and leaves(_DESCRIBES)
+        self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
         if moving and not (self.moves and self.drives):
-            own = [
-                name for name in sorted(_ALL) if inspect.getattr_static(kind, name, None) is not _ORIGINALS[base, name]
-            ]
+            own = self.own.names + [
+                name for name in sorted(_METHODS)
+                if base is not None and inspect.getattr_static(kind, name, None) is not _ORIGINALS[base, name]
+            ]  # fmt: skip
             name = f"{kind.__module__}.{kind.__qualname__}"
-            logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
+            if left_alone.get(name) != own:
+                left_alone[name] = own
+                logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
 
     def is_of(self, thing: Any) -> bool:
         """Whether an object has no method of its own instead of its class's."""
-        return _ALL.isdisjoint(vars(thing))
+        return self.methods.isdisjoint(vars(thing))
 
 
-_ALL = frozenset((*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
+left_alone: dict[str, list[str]] = {}
+"""The classes that have been met and are not sped up, or not wholly, with what they have of their own."""
 
 
 def kind_of(kind: type) -> Kind:
-    """Return what is known about a class."""
+    """Return what is known about a class, as it is now."""
     found = _kinds.get(kind)
-    if found is None:
+    if found is None or not found.own.current:
         found = _kinds[kind] = Kind(kind)
     return found
 
 
+def kinds_of(things: Iterable[Any]) -> list[Kind]:
+    """Return what is known about the class of each object."""
+    types = list(map(type, things))
+    known = {kind: kind_of(kind) for kind in set(types)}
+    return [known[kind] for kind in types]
+
+
 _kinds: dict[type, Kind] = {}
+
+
+def are_numbers(values: Iterable[Any]) -> bool:
+    """Whether arithmetic on all of these is that of Python's and NumPy's usual numbers."""
+    return _NUMBERS.issuperset(map(type, values))
+
+
+_NUMBERS = frozenset((float, int, np.float64))
 
 
 def reason_against() -> str:
@@ -119,6 +191,8 @@ def reason_against() -> str:
         place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
         if place not in _FILES:
             return f"{name} has been replaced by {place}"
+        if function.__qualname__ != name:  # such as another method of its own
+            return f"{name} has been replaced by {function.__qualname__}"
     if not hasattr(np, "vecdot"):
         return f"it needs NumPy 2.0, and {np.__version__} is installed"
     if not _arrays_equal_scalars():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from highway_env import utils
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
-from crashhunt.simulators._accelerator._frame import Frame
-from crashhunt.simulators._accelerator._known import kind_of
+from crashhunt.simulators._accelerator._frame import Frame, are_plain
+from crashhunt.simulators._accelerator._known import are_numbers, kinds_of
 from crashhunt.simulators._accelerator._network import wrap_to_pi
 
 if TYPE_CHECKING:
@@ -21,25 +23,35 @@ if TYPE_CHECKING:
 
 __all__ = ["collide", "enforce", "move"]
 
+_OUTLINE = attrgetter("LENGTH", "WIDTH", "heading", "speed", "diagonal")
 _MARGIN = 1e-6  # m; what is nearer than this is left to the exact test
 
 
 def move(road: Road, network: Network, dt: float) -> Frame | None:
     """Move all vehicles; return where they are then, or None where one of them is not known and nothing was done."""
     vehicles = road.vehicles
-    kinds = [kind_of(type(vehicle)) for vehicle in vehicles]
-    if road.record_history or not vehicles:
+    kinds = kinds_of(vehicles)
+    if road.record_history or not vehicles or not are_plain(vehicles + road.objects):
         return None
-    if not all(kind.moves and kind.is_of(vehicle) for kind, vehicle in zip(kinds, vehicles, strict=True)):
+    if not all(
+        kind.moves and kind.is_of(vehicle) and vehicle.road is road and type(vehicle.action) is dict
+        for kind, vehicle in zip(kinds, vehicles, strict=True)
+    ):
+        return None
+    headings, speeds = [vehicle.heading for vehicle in vehicles], [vehicle.speed for vehicle in vehicles]
+    lengths = [vehicle.LENGTH for vehicle in vehicles]
+    acts = [vehicle.action.get(name) for vehicle in vehicles for name in ("steering", "acceleration")]
+    if not are_numbers((dt, *headings, *speeds, *lengths, *acts)) or 2 * len({id(v.action) for v in vehicles}) < len(
+        acts
+    ):
         return None
     for kind, vehicle in zip(kinds, vehicles, strict=True):
         if kind.times:
             vehicle.timer += dt
         _clip_actions(vehicle)
-    heading = np.array([vehicle.heading for vehicle in vehicles], float)
-    speed = np.array([vehicle.speed for vehicle in vehicles], float)
+    heading, speed = np.array(headings, float), np.array(speeds, float)
     steering = np.array([vehicle.action["steering"] for vehicle in vehicles])
-    half_length = np.array([vehicle.LENGTH for vehicle in vehicles]) / 2
+    half_length = np.array(lengths) / 2
     slip = np.arctan(1 / 2 * np.tan(steering))
     course = heading + slip
     dx, dy = ((speed * np.cos(course)) * dt).tolist(), ((speed * np.sin(course)) * dt).tolist()
@@ -116,9 +128,11 @@ def _distance(frame: Frame, row: int, lane: int, heading: float) -> float:
 def collide(road: Road, dt: float) -> None:
     """Let everybody collide with everybody, as `Road.step` does, but without the pairs that cannot touch."""
     vehicles, things = road.vehicles, road.vehicles + road.objects
-    if not all((kind := kind_of(type(thing))).collides and kind.is_of(thing) for thing in things):
-        for number, vehicle in enumerate(vehicles):
-            for other in things[number + 1 :]:
+    if not _can_collide(things):
+        for number, vehicle in enumerate(road.vehicles):
+            for other in road.vehicles[number + 1 :]:
+                vehicle.handle_collisions(other, dt)
+            for other in road.objects:
                 vehicle.handle_collisions(other, dt)
         return
     count = len(vehicles)
@@ -139,6 +153,16 @@ def collide(road: Road, dt: float) -> None:
         one, two = vehicles[first[number]], things[second[number]]
         if not _stay_apart(one, two, dt):
             one.handle_collisions(two, dt)
+
+
+def _can_collide(things: list[Any]) -> bool:
+    """Whether all collide as highway-env has it, and all that this depends on are numbers of the usual kinds."""
+    if not all(kind.collides and kind.is_of(thing) for kind, thing in zip(kinds_of(things), things, strict=True)):
+        return False
+    try:
+        return are_plain(things) and are_numbers(chain.from_iterable(map(_OUTLINE, things)))
+    except AttributeError:  # highway-env may never ask for what somebody's object lacks
+        return False
 
 
 def _stay_apart(one: Any, two: Any, dt: float) -> bool:
@@ -167,7 +191,9 @@ def _stay_apart(one: Any, two: Any, dt: float) -> bool:
 def enforce(road: RegulatedRoad) -> bool:
     """`RegulatedRoad.enforce_road_rules`, foreseeing each vehicle once; False where one is not known."""
     vehicles = road.vehicles
-    if not all((kind := kind_of(type(vehicle))).predicts and kind.is_of(vehicle) for vehicle in vehicles):
+    if not all(
+        kind.predicts and kind.is_of(vehicle) for kind, vehicle in zip(kinds_of(vehicles), vehicles, strict=True)
+    ):
         return False
     for vehicle in vehicles:
         if getattr(vehicle, "is_yielding", False):

@@ -7,14 +7,18 @@ only where the bounding box of the lane says that they can matter.
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
+from highway_env.road.road import RoadNetwork
+
+from crashhunt.simulators._accelerator._known import are_numbers
+from crashhunt.simulators._accelerator._watch import is_plain
 
 if TYPE_CHECKING:
-    from highway_env.road.road import RoadNetwork
     from numpy.typing import NDArray
 
 __all__ = ["Network", "wrap_to_pi"]
@@ -22,7 +26,6 @@ __all__ = ["Network", "wrap_to_pi"]
 _SAMPLES = 65  # of a bend, for its bounding box
 _TAU = 2 * np.pi
 _ON_LANE_MARGIN = 1  # m, with which a road looks for neighbours
-_METHODS = ("distance_with_heading", "local_angle", "on_lane", "is_reachable_from", "after_end", "distance")
 
 
 def wrap_to_pi(x: float) -> float:
@@ -42,16 +45,15 @@ class Network:
     """
 
     def __init__(self, network: RoadNetwork) -> None:
-        self.keys = [
-            (start, end, number)
-            for start, ends in network.graph.items()
-            for end, lanes in ends.items()
-            for number in range(len(lanes))
-        ]
-        self.lanes: list[AbstractLane] = network.lanes_list()
+        self.network = network
+        self.keys, self.lanes = _laid_out(network)
+        self._seen = _values(self.lanes)
+        self._arrays = [value for values in self._seen for value in values if isinstance(value, np.ndarray)]
+        self._contents = [array.tobytes() for array in self._arrays]
+        self._reach = _reach()
         self.index = {key: number for number, key in enumerate(self.keys)}
         self.number = {id(lane): number for number, lane in enumerate(self.lanes)}
-        self.plain = all(map(_is_known, self.lanes)) and bool(self.lanes)
+        self.plain = type(network) is RoadNetwork and all(map(_is_known, self.lanes)) and bool(self.lanes)
         if not self.plain:
             return
         straight = [type(lane) is StraightLane and 0.0 in lane.direction.tolist() for lane in self.lanes]
@@ -82,8 +84,15 @@ class Network:
         self.column |= {number: column for column, number in enumerate(self.others)}
 
     def is_of(self, network: RoadNetwork) -> bool:
-        """Whether the network still has these very lanes."""
-        return bool(self.lanes == network.lanes_list())  # lanes are compared by identity
+        """Whether the network still has these very lanes, in these places, and they are what they were."""
+        keys, lanes = _laid_out(network)
+        if network is not self.network or keys != self.keys or list(map(id, lanes)) != list(map(id, self.lanes)):
+            return False
+        try:  # of arrays that are not the very same, Python cannot say whether they are equal
+            same = _values(lanes) == self._seen and self._reach == _reach()
+        except ValueError:
+            return False
+        return same and [array.tobytes() for array in self._arrays] == self._contents
 
     def on_axis(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Any, Any]:
         """Longitudinal and lateral coordinates on the lanes along an axis, each of shape (points, lanes)."""
@@ -136,11 +145,58 @@ class Network:
         )
 
 
+def _laid_out(network: RoadNetwork) -> tuple[list[tuple[Any, Any, int]], list[AbstractLane]]:
+    """All keys and lanes, in the order in which highway-env compares lanes; nothing where it has methods of its own."""
+    keys, lanes = [], []
+    if type(network) is RoadNetwork and vars(network).keys() == {"graph"}:
+        for start, ends in network.graph.items():
+            for end, row in ends.items():
+                for number, lane in enumerate(row):
+                    keys.append((start, end, number))
+                    lanes.append(lane)
+    return keys, lanes
+
+
+def _values(lanes: list[AbstractLane]) -> list[tuple[Any, ...]]:
+    return [tuple(vars(lane).values()) if type(lane) in _KNOWN else () for lane in lanes]
+
+
+def _reach() -> list[float]:
+    """How far beyond its end a lane of each kind counts, in m."""
+    return [kind.VEHICLE_LENGTH for kind in _KNOWN]
+
+
 def _is_known(lane: AbstractLane) -> bool:
     kind = type(lane)
-    if kind not in (StraightLane, SineLane, CircularLane):
+    if kind not in _KNOWN:
         return False
-    return AbstractLane.VEHICLE_LENGTH == 5 and not set(_METHODS) & set(vars(lane))
+    values = vars(lane)
+    if "VEHICLE_LENGTH" in values or kind.VEHICLE_LENGTH != 5 or not _KNOWN[kind].isdisjoint(values):
+        return False
+    arrays = [values.get(name) for name in _ARRAYS[kind]]
+    return (
+        are_numbers(values.get(name) for name in _NUMBERS[kind])
+        and (values.get("speed_limit") is None or are_numbers([values["speed_limit"]]))
+        and "forbidden" in values
+        and all(type(array) is np.ndarray and array.shape == (2,) and array.dtype in _DTYPES for array in arrays)
+    )
+
+
+_KNOWN = {
+    kind: frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
+    for kind in (StraightLane, SineLane, CircularLane)
+}
+_NUMBERS = {
+    StraightLane: ("length", "width", "heading"),
+    SineLane: ("length", "width", "heading", "amplitude", "pulsation", "phase"),
+    CircularLane: ("length", "width", "radius", "start_phase", "direction"),
+}
+_ARRAYS = {
+    StraightLane: ("start", "direction", "direction_lateral"),
+    SineLane: ("start", "direction", "direction_lateral"),
+    CircularLane: ("center",),
+}
+_DTYPES = (np.dtype(np.float64), np.dtype(np.int64))
 
 
 def _box(lane: AbstractLane) -> tuple[float, float, float, float]:

@@ -10,7 +10,7 @@ from highway_env import utils
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.simulators._accelerator._known import kind_of
+from crashhunt.simulators._accelerator._known import are_numbers, kind_of
 
 if TYPE_CHECKING:
     from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
@@ -32,7 +32,8 @@ def close_objects(
     """`Road.close_objects_to`; None where that must be asked."""
     lane = frame.network.number.get(id(vehicle.lane))
     row = frame.row.get(id(vehicle))
-    if lane is None or row is None or not kind_of(type(vehicle)).collides:
+    kind = kind_of(type(vehicle))
+    if lane is None or row is None or not kind.collides or not kind.is_of(vehicle):
         return None
     road: Road = frame.road
     total = len(road.vehicles) if vehicles_only else len(frame.things)
@@ -57,7 +58,7 @@ def close_objects(
 def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[Any] | None:
     """`KinematicObservation.observe`; None where that must be asked."""
     env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
-    if frame is None or not _KNOWN.issuperset(features) or not kind_of(type(vehicle)).collides:
+    if frame is None or not _KNOWN.issuperset(features) or not _is_plain(vehicle, features):
         return None
     close = env.road.close_objects_to(
         vehicle,
@@ -126,7 +127,8 @@ def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _is_plain(thing: Any, features: list[str]) -> bool:
-    if not kind_of(type(thing)).describes or "to_dict" in vars(thing):
+    kind = kind_of(type(thing))
+    if not kind.describes or not kind.is_of(thing) or not are_numbers((thing.heading, thing.speed)):
         return False
     return isinstance(thing, Vehicle) or _OF_OBJECTS.issuperset(features)
 
