@@ -119,10 +119,13 @@ def run_episode(
                 _quietly(close)
     run.meter.measure(box.take_frames())
     box.mark(Phase.DONE)
+    closest = run.meter.closest
+    if result.collision is not None and "overlap" in result.collision.seen_by:
+        closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
     return replace(
         result,
         digest=digest_of(box.committed()) if result.outcome is not Outcome.INVALID else "",
-        closest=run.meter.closest,
+        closest=closest,
         setup_s=setup_s,
         wall_s=time.monotonic() - began,
     )

@@ -5,16 +5,32 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["Actor", "Contact", "Frame", "Lane", "Roster", "Scene", "corners"]
+__all__ = [
+    "PERSON",
+    "Actor",
+    "Contact",
+    "Frame",
+    "Lane",
+    "Roster",
+    "Scene",
+    "Spine",
+    "is_person",
+]
+
+PERSON = "person "
+"""What an id of a person begins with: vehicles and persons may have the same name, and no name has a blank."""
+
+Spine = tuple[tuple[float, float, float], ...]
+"""The centre line of a long vehicle in a bend, as (x, y, z) in m, from the front bumper to the back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,16 +38,18 @@ class Actor:
     """What does not change about an actor.
 
     Args:
-        id: unique within the episode.
-        kind: the simulator's word for it, such as SUMO's vehicle class (``passenger``, ``truck``).
+        id: unique within the episode; that of a person is ``person`` and its name, with a blank between.
+        kind: the simulator's word for it, such as SUMO's class (``passenger``, ``truck``, ``pedestrian``).
         length: in m.
         width: in m.
+        height: in m; 0 where the map is flat and nobody needs it.
     """
 
     id: str
     kind: str
     length: float
     width: float
+    height: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,17 +114,33 @@ class Roster:
         return [math.hypot(actor.length, actor.width / 2) for actor in self.actors]
 
     @cached_property
-    def touch_distance_squared(self) -> float:
-        """No two outlines touch whose front bumpers are further apart than the root of this, in m²."""
-        return (2 * max(self.reaches, default=0.0)) ** 2
+    def touch_distance(self) -> float:
+        """No two outlines touch whose front bumpers are further apart than this, in m."""
+        return 2 * max(self.reaches, default=0.0)
 
     def __len__(self) -> int:
         return len(self.actors)
 
 
-Frame = tuple[Roster, "NDArray[np.float64]"]
-"""Successive scenes of the same actors, as bare columns: float64, shape (scenes, 4 n): x and y alternating, then all
-headings, then all speeds."""
+class Frame(NamedTuple):
+    """Successive scenes of the same actors, as bare columns.
+
+    Args:
+        roster: the actors.
+        columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
+        heights: of each scene, as in `Scene`; None where all is flat.
+        grades: likewise.
+        spines: of each scene, as in `Scene`; None where nobody long is in a bend.
+    """
+
+    roster: Roster
+    columns: NDArray[np.float64]
+    heights: Sequence[Sequence[float]] | None = None
+    grades: Sequence[Sequence[float]] | None = None
+    spines: Sequence[Mapping[int, Spine]] | None = None
+
+
+_NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
 
 
 class Scene:
@@ -121,6 +155,11 @@ class Scene:
         contacts: the collisions that the simulator reports for this step.
         off_road: the controlled vehicles that left the road in this step.
         lanes: the lane of each actor, or empty where this step did not look.
+        heights: z of each front bumper, in m; empty where the map is flat.
+        grades: how far the road rises a metre where each of them is, ahead of it; empty where the map is flat.
+        spines: row to centre line, of the long vehicles that are bent.
+        swept: whether everybody has driven here from the previous scene along the way that the headings say, so that
+            contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
 
     Attributes:
         agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
@@ -131,13 +170,17 @@ class Scene:
         "_neighbors",
         "agent_lanes",
         "contacts",
+        "grades",
         "headings",
+        "heights",
         "lanes",
         "off_road",
         "points",
         "previous",
         "roster",
         "speeds",
+        "spines",
+        "swept",
         "time_s",
     )
 
@@ -151,6 +194,11 @@ class Scene:
         contacts: tuple[Contact, ...] = (),
         off_road: tuple[str, ...] = (),
         lanes: tuple[str, ...] = (),
+        heights: Sequence[float] = (),
+        grades: Sequence[float] = (),
+        spines: Mapping[int, Spine] = _NO_SPINES,
+        *,
+        swept: bool = False,
     ) -> None:
         self.time_s = time_s
         self.roster = roster
@@ -160,6 +208,10 @@ class Scene:
         self.contacts = contacts
         self.off_road = off_road
         self.lanes = lanes
+        self.heights = heights
+        self.grades = grades
+        self.spines = spines
+        self.swept = swept
         self.agent_lanes: dict[str, str] = {}
         self.previous: Scene | None = None
         self._neighbors: dict[int, list[tuple[float, int]]] = {}
@@ -176,7 +228,13 @@ class Scene:
     def frame(self) -> Frame:
         """The scene as bare columns."""
         flat = [value for point in self.points for value in point]
-        return self.roster, np.array([[*flat, *self.headings, *self.speeds]])
+        return Frame(
+            self.roster,
+            np.array([[*flat, *self.headings, *self.speeds]]),
+            [self.heights] if self.heights else None,
+            [self.grades] if self.heights else None,
+            [self.spines] if self.spines else None,
+        )
 
     @property
     def data(self) -> NDArray[np.float64]:
@@ -207,12 +265,6 @@ class Scene:
         return found
 
 
-def corners(scene: Scene, row: int) -> NDArray[np.float64]:
-    """Return the outline of an actor: shape (4, 2), counter-clockwise from the front left, in m."""
-    actor = scene.roster.actors[row]
-    heading = scene.headings[row]
-    forward = np.array([math.cos(heading), math.sin(heading)])
-    left = np.array([-forward[1], forward[0]]) * (actor.width / 2)
-    front = np.array(scene.points[row])
-    back = front - actor.length * forward
-    return np.array([front + left, back + left, back - left, front - left])
+def is_person(actor: str) -> bool:
+    """Whether an actor's id is that of a person."""
+    return actor.startswith(PERSON)

@@ -1,6 +1,7 @@
 """Oracles: whether a step is a crash, and how near to one it came."""
 
 from crashhunt.oracles._approach import ApproachMeter, approaches, closest_approach
+from crashhunt.oracles._contact import Touch, first_contact
 from crashhunt.oracles._crashes import OffRoad, Overlap, ReportedCollision
 from crashhunt.oracles._geometry import outlines_overlap, rectangle_gap, time_to_contact
 from crashhunt.oracles._protocol import Finding, Oracle, merge_findings
@@ -12,8 +13,10 @@ __all__ = [
     "Oracle",
     "Overlap",
     "ReportedCollision",
+    "Touch",
     "approaches",
     "closest_approach",
+    "first_contact",
     "merge_findings",
     "outlines_overlap",
     "rectangle_gap",

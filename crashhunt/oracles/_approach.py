@@ -71,11 +71,11 @@ def approaches(
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
         and times of more than 10 s do not count.
     """
-    count = sum(len(columns) for _, columns in frames)
+    count = sum(len(columns) for _, columns, *_ in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
     xs, ys, headings, speeds, halves, steps, owns = [], [], [], [], [], [], []
     step = first = 0
-    for roster, columns in frames:
+    for roster, columns, *_ in frames:
         scenes, actors = len(columns), len(roster)
         row = roster.index.get(agent)
         if row is not None:

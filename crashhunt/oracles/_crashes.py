@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from math import cos, sin
+import math
+from math import cos, sin, sqrt
 from typing import TYPE_CHECKING
 
+from crashhunt.oracles._contact import first_contact, reachable_m
 from crashhunt.oracles._geometry import outlines_overlap
 from crashhunt.oracles._protocol import Finding
 from crashhunt.trial import Collision, Outcome
@@ -12,13 +14,21 @@ from crashhunt.trial import Collision, Outcome
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.scene import Scene
+    from crashhunt.oracles._contact import Touch
+    from crashhunt.outlines import Rectangle
+    from crashhunt.scene import Contact, Scene
 
 __all__ = ["OffRoad", "Overlap", "ReportedCollision"]
 
+_HARDEST = 10.0  # m/s²; nobody has been faster in the previous scene than this explains
+
 
 class ReportedCollision:
-    """Believes the simulator's own list of collisions, where a controlled vehicle takes part."""
+    """Believes the simulator's own list of collisions, where a controlled vehicle takes part.
+
+    Who drove into whom, and when, is decided by the outlines, where these say so: after a long step the simulator may
+    have the two in the wrong order.
+    """
 
     name = "reported"
 
@@ -28,30 +38,39 @@ class ReportedCollision:
         for contact in scene.contacts:
             for agent in agents:
                 if agent in (contact.collider, contact.victim):
-                    x, y, lane = _where(scene, agent)
-                    collision = Collision(
-                        agent,
-                        "alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
-                        contact.collider,
-                        contact.victim,
-                        (self.name,),
-                        contact.kind,
-                        x,
-                        y,
-                        contact.lane or lane,
-                        contact.collider_speed,
-                        contact.victim_speed,
-                    )
-                    findings.append(Finding(Outcome.COLLISION, collision))
+                    findings.append(Finding(Outcome.COLLISION, self._collision(scene, agent, contact)))
                     break
         return findings
 
+    def _collision(self, scene: Scene, agent: str, contact: Contact) -> Collision:
+        x, y, lane = _where(scene, agent)
+        index = scene.roster.index
+        other = contact.victim if agent == contact.collider else contact.collider
+        if scene.swept and agent in index and other in index:
+            touch = first_contact(scene.previous, scene, index[agent], index[other])
+            if touch is not None:
+                return _touching(self.name, agent, other, touch, contact.kind, contact.lane or lane)
+        return Collision(
+            agent,
+            "alone" if not contact.victim else "collider" if agent == contact.collider else "victim",
+            contact.collider,
+            contact.victim,
+            (self.name,),
+            contact.kind,
+            x,
+            y,
+            contact.lane or lane,
+            contact.collider_speed,
+            contact.victim_speed,
+            scene.time_s,
+        )
+
 
 class Overlap:
-    """Sees a collision where the outlines of a controlled vehicle and another actor overlap.
+    """Sees a collision where the outlines of a controlled vehicle and another actor overlap, or did within the step.
 
-    Simulators miss some: SUMO compares vehicles of one lane only. Whoever has the other in front of it is the
-    collider.
+    Simulators miss some: SUMO compares vehicles of one lane only. Whoever has the other in front of it when they first
+    touch is the collider.
     """
 
     name = "overlap"
@@ -59,42 +78,19 @@ class Overlap:
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
         """Return the overlaps of the agents."""
         findings = []
+        previous = scene.previous if scene.swept else None
         for agent in agents:
             row = scene.roster.index.get(agent)
             if row is None:
                 continue
-            roster = scene.roster
-            limit = roster.touch_distance_squared
-            for squared, other in scene.neighbors(row):
-                if squared >= limit:
-                    break
-                if squared < (roster.reaches[row] + roster.reaches[other]) ** 2 and outlines_overlap(
-                    _rectangle(scene, row), _rectangle(scene, other)
-                ):
-                    findings.append(self._finding(scene, row, other))
+            for other in _within_reach(scene, previous, row):
+                touch = first_contact(previous, scene, row, other)
+                if touch is not None:
+                    name = scene.roster.actors[other].id
+                    lane = _where(scene, agent)[2]
+                    collision = _touching(self.name, agent, name, touch, "overlap", lane)
+                    findings.append(Finding(Outcome.COLLISION, collision))
         return findings
-
-    def _finding(self, scene: Scene, row: int, other: int) -> Finding:
-        agent, them = scene.roster.actors[row].id, scene.roster.actors[other].id
-        heading = scene.headings[row]
-        offset = (scene.centers[other] - scene.centers[row]).tolist()
-        ahead = offset[0] * cos(heading) + offset[1] * sin(heading) > 0
-        own_speed, other_speed = scene.speeds[row], scene.speeds[other]
-        x, y, lane = _where(scene, agent)
-        collision = Collision(
-            agent,
-            "collider" if ahead else "victim",
-            agent if ahead else them,
-            them if ahead else agent,
-            (self.name,),
-            "overlap",
-            x,
-            y,
-            lane,
-            own_speed if ahead else other_speed,
-            other_speed if ahead else own_speed,
-        )
-        return Finding(Outcome.COLLISION, collision)
 
 
 class OffRoad:
@@ -110,15 +106,108 @@ class OffRoad:
                 x, y, lane = _where(scene, agent)
                 row = scene.roster.index.get(agent)
                 speed = scene.speeds[row] if row is not None else float("nan")
-                collision = Collision(agent, "alone", agent, "", (self.name,), "off_road", x, y, lane, speed)
+                collision = Collision(
+                    agent, "alone", agent, "", (self.name,), "off_road", x, y, lane, speed, time_s=scene.time_s
+                )
                 findings.append(Finding(Outcome.OFF_ROAD, collision))
         return findings
 
 
-def _rectangle(scene: Scene, row: int) -> tuple[float, float, float, float, float]:
+def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
+    """Everybody who may touch an actor, or have touched it since the previous scene; nearest first, usually nobody.
+
+    Who is further away than the two have got relative to each other has not been there. This looks at every vehicle
+    nearby in every step, and so spares what it can.
+    """
+    roster, reaches = scene.roster, scene.roster.reaches
+    further = 0.0
+    if previous is not None:
+        step_s = scene.time_s - previous.time_s
+        further = 2 * reachable_m(max(scene.speeds) + _HARDEST * step_s, step_s)
+    limit = (roster.touch_distance + further) ** 2
+    moved = None
+    found = []
+    for squared, other in scene.neighbors(row):
+        if squared >= limit:
+            break
+        reach = reaches[row] + reaches[other]
+        margin = 0.0
+        if squared >= (reach + further) * (reach + further):
+            continue
+        if previous is not None:
+            if moved is None:
+                moved = _moved(previous, scene, row)
+            theirs = _moved(previous, scene, other)
+            rx, ry = moved[0] - theirs[0], moved[1] - theirs[1]
+            margin = sqrt(rx * rx + ry * ry) + moved[2] + theirs[2]
+        if squared < (reach + margin) * (reach + margin) and _may_touch(scene, previous, row, other, margin):
+            found.append(other)
+    return found
+
+
+def _may_touch(scene: Scene, previous: Scene | None, row: int, other: int, margin: float) -> bool:
+    """Whether two outlines overlap, or both scenes leave room for that within the step.
+
+    Args:
+        scene: the present one.
+        previous: the one before.
+        row: one actor.
+        other: another.
+        margin: what they have moved relative to each other, in m: they cannot have been further apart than this before
+            and after taken together.
+    """
+    if scene.spines or (previous is not None and previous.spines):
+        return True
+    one, two = _rectangle(scene, row), _rectangle(scene, other)
+    if previous is None:
+        return outlines_overlap(one, two)
+    if not outlines_overlap(one, two, margin=margin):
+        return False
+    return outlines_overlap(one, two, margin=margin / 2) or _were_near(previous, scene, row, other, margin / 2)
+
+
+def _were_near(previous: Scene, scene: Scene, row: int, other: int, margin: float) -> bool:
+    if previous.roster is not scene.roster:
+        actors, index = scene.roster.actors, previous.roster.index
+        was, other_was = index.get(actors[row].id), index.get(actors[other].id)
+        if was is None or other_was is None:
+            return True
+        row, other = was, other_was
+    return outlines_overlap(_rectangle(previous, row), _rectangle(previous, other), margin=margin)
+
+
+def _moved(previous: Scene, scene: Scene, row: int) -> tuple[float, float, float]:
+    """How far an actor moved (x, y), and how much further one of its corners may have been from there on the way."""
+    was = row
+    if previous.roster is not scene.roster:
+        found = previous.roster.index.get(scene.roster.actors[row].id)
+        if found is None:
+            return 0.0, 0.0, 0.0
+        was = found
+    x, y = scene.points[row]
+    old_x, old_y = previous.points[was]
+    heading = previous.headings[was]
+    dx, dy = x - old_x, y - old_y
+    aside = 2 * abs(dy * cos(heading) - dx * sin(heading))
+    turn = scene.headings[row] - heading
+    if turn:
+        aside += abs(math.remainder(turn, math.tau)) * (scene.roster.reaches[row] + abs(dx) + abs(dy))
+    if scene.spines or previous.spines:  # the back of a train does not move as its front does
+        aside += 2 * (abs(dx) + abs(dy))
+    return dx, dy, aside
+
+
+def _rectangle(scene: Scene, row: int) -> Rectangle:
     actor = scene.roster.actors[row]
     x, y = scene.points[row]
     return x, y, scene.headings[row], actor.length, actor.width
+
+
+def _touching(name: str, agent: str, other: str, touch: Touch, kind: str, lane: str) -> Collision:
+    collider, victim = (agent, other) if touch.drives_into else (other, agent)
+    speeds = (touch.speed, touch.other_speed) if touch.drives_into else (touch.other_speed, touch.speed)
+    role = "collider" if touch.drives_into else "victim"
+    return Collision(agent, role, collider, victim, (name,), kind, touch.x, touch.y, lane, *speeds, touch.time_s)
 
 
 def _where(scene: Scene, agent: str) -> tuple[float, float, str]:

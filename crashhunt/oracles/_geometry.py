@@ -10,28 +10,60 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["outlines_overlap", "rectangle_gap", "time_to_contact"]
+    from crashhunt.outlines import Rectangle
 
-Rectangle = tuple[float, float, float, float, float]
-"""x and y of the front bumper's centre (m), heading (rad), length and width (m)."""
+__all__ = ["outlines_overlap", "rectangle_gap", "separation", "time_to_contact"]
 
 _TOUCH = 1e-9  # m; less is rounding, not overlap
 
 
-def outlines_overlap(one: Rectangle, two: Rectangle) -> bool:
-    """Whether two outlines overlap, by the separating axis theorem."""
+def outlines_overlap(one: Rectangle, two: Rectangle, *, margin: float = 0.0) -> bool:
+    """Whether two outlines overlap, by the separating axis theorem.
+
+    Args:
+        one: an outline.
+        two: another.
+        margin: answer True for all that are nearer than this as well, and some that are a little further apart, in m.
+    """
     x1, y1, h1, l1, w1 = one
     x2, y2, h2, l2, w2 = two
     c1, s1, c2, s2 = cos(h1), sin(h1), cos(h2), sin(h2)
     dx, dy = (x2 - l2 / 2 * c2) - (x1 - l1 / 2 * c1), (y2 - l2 / 2 * s2) - (y1 - l1 / 2 * s1)
     along, across = abs(c1 * c2 + s1 * s2), abs(c1 * s2 - s1 * c2)
-    if abs(-dx * s1 + dy * c1) >= (w1 + l2 * across + w2 * along) / 2 - _TOUCH:
+    if abs(-dx * s1 + dy * c1) >= (w1 + l2 * across + w2 * along) / 2 - _TOUCH + margin:
         return False
-    if abs(dx * c1 + dy * s1) >= (l1 + l2 * along + w2 * across) / 2 - _TOUCH:
+    if abs(dx * c1 + dy * s1) >= (l1 + l2 * along + w2 * across) / 2 - _TOUCH + margin:
         return False
-    if abs(-dx * s2 + dy * c2) >= (w2 + l1 * across + w1 * along) / 2 - _TOUCH:
+    if abs(-dx * s2 + dy * c2) >= (w2 + l1 * across + w1 * along) / 2 - _TOUCH + margin:
         return False
-    return abs(dx * c2 + dy * s2) < (l2 + l1 * along + w1 * across) / 2 - _TOUCH
+    return abs(dx * c2 + dy * s2) < (l2 + l1 * along + w1 * across) / 2 - _TOUCH + margin
+
+
+def separation(one: Rectangle, two: Rectangle) -> tuple[float, float, float]:
+    """Return how far apart two rectangles are along the axis on which they are furthest apart, and that axis.
+
+    Returns:
+        The distance in m, negative where they overlap, never more than the real gap; and x and y of the unit vector
+        from the first to the second.
+    """
+    x1, y1, h1, l1, w1 = one
+    x2, y2, h2, l2, w2 = two
+    c1, s1, c2, s2 = cos(h1), sin(h1), cos(h2), sin(h2)
+    dx, dy = (x2 - l2 / 2 * c2) - (x1 - l1 / 2 * c1), (y2 - l2 / 2 * s2) - (y1 - l1 / 2 * s1)
+    along, across = abs(c1 * c2 + s1 * s2), abs(c1 * s2 - s1 * c2)
+    best, best_x, best_y = -1e300, 1.0, 0.0
+    for x, y, reach in (
+        (c1, s1, (l1 + l2 * along + w2 * across) / 2),
+        (-s1, c1, (w1 + l2 * across + w2 * along) / 2),
+        (c2, s2, (l2 + l1 * along + w1 * across) / 2),
+        (-s2, c2, (w2 + l1 * across + w1 * along) / 2),
+    ):
+        distance = dx * x + dy * y
+        apart = abs(distance) - reach
+        if apart > best:
+            sign = -1.0 if distance < 0 else 1.0
+            best, best_x, best_y = apart, sign * x, sign * y
+    return best, best_x, best_y
 
 
 def rectangle_gap(

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.errors import BundleError, RecorderError
+from crashhunt.scene import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.scene import Frame, Roster, Scene
+    from crashhunt.scene import Roster, Scene
 
 __all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
 
@@ -206,7 +207,7 @@ class BlackBox:
         for roster, run in groupby(self._trail, key=itemgetter(0)):
             size = 32 * len(roster)
             scenes = [self._map[offset : offset + size] for _, offset in run]
-            frames.append((roster, np.frombuffer(b"".join(scenes), "<f8").reshape(len(scenes), 4 * len(roster))))
+            frames.append(Frame(roster, np.frombuffer(b"".join(scenes), "<f8").reshape(len(scenes), 4 * len(roster))))
         self._trail.clear()
         return frames
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageDraw
 
+from crashhunt.outlines import corners
 from crashhunt.render._draw import FAINT, INK, as_array, font
-from crashhunt.scene import corners
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -316,6 +316,7 @@ class SumoSimulator:
             contacts,
             tuple(self._off_road),
             lanes,
+            swept=True,
         )
 
     def _look_around(self) -> None:

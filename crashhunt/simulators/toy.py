@@ -170,6 +170,7 @@ class ToySimulator:
             [self._v[name] for name in names],
             contacts,
             lanes=("road_0",) * len(names) if self._step % 10 == 0 or contacts else (),
+            swept=True,
         )
 
     def _observe(self, agent: str) -> NDArray[np.float32]:

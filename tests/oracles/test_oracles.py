@@ -20,7 +20,8 @@ from crashhunt.oracles import (
     rectangle_gap,
     time_to_contact,
 )
-from crashhunt.scene import Actor, Contact, Roster, Scene, corners
+from crashhunt.outlines import corners
+from crashhunt.scene import Actor, Contact, Roster, Scene
 from crashhunt.trial import Collision, Outcome
 
 rectangles = st.tuples(
