@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from crashhunt.recording import Recording
 
-__all__ = ["Encounter", "Manner", "Moment", "last_escape"]
+__all__ = ["Encounter", "Manner", "Moment", "Position", "last_escape"]
 
 _LOOKS_BACK_S = 30.0
 _PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
@@ -48,6 +48,28 @@ class Moment:
     required_deceleration: float
 
 
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where the other one is, as seen from the agent.
+
+    Args:
+        place: on which side of it.
+        turn: its heading less the agent's, in rad, within -pi and pi.
+    """
+
+    place: Literal["ahead", "behind", "left", "right"]
+    turn: float
+
+    @property
+    def faces(self) -> Literal["same", "other", "left", "right"]:
+        """Where it heads: the same way, the other way, or to the agent's left or right."""
+        if abs(self.turn) > math.radians(135):
+            return "other"
+        if abs(self.turn) > math.radians(45):
+            return "left" if self.turn > 0 else "right"
+        return "same"
+
+
 class Encounter:
     """The steps of a recording in which two actors were both there.
 
@@ -67,7 +89,7 @@ class Encounter:
         ]
         self.moments = self._measure()
 
-    def manner(self, step: int) -> Manner | None:
+    def position(self, step: int) -> Position | None:
         """Where the other one was after a step, as seen from the agent; None where one of them was not there."""
         scene = next((scene for number, scene in self._scenes if number == step), None)
         if scene is None:
@@ -75,16 +97,29 @@ class Encounter:
         own, other = scene.roster.index[self.agent], scene.roster.index[self.other]
         offset = scene.centers[other] - scene.centers[own]
         c, s = math.cos(scene.headings[own]), math.sin(scene.headings[own])
-        ahead, left = offset[0] * c + offset[1] * s, offset[1] * c - offset[0] * s
+        ahead, left = float(offset[0] * c + offset[1] * s), float(offset[1] * c - offset[0] * s)
         turn = math.remainder(scene.headings[other] - scene.headings[own], math.tau)
-        if abs(turn) > math.radians(135):
+        one, two = scene.roster.actors[own], scene.roster.actors[other]
+        along, across = abs(math.cos(turn)), abs(math.sin(turn))
+        # Beside: their lengths overlap, seen from the agent, and not by touching ends only.
+        beside = (
+            abs(ahead) < (one.length + two.length * along + two.width * across) / 2
+            and abs(left) > (one.width + two.width * along + two.length * across) / 3
+        )
+        if beside or abs(left) > abs(ahead):
+            return Position("left" if left > 0 else "right", turn)
+        return Position("ahead" if ahead > 0 else "behind", turn)
+
+    def manner(self, step: int) -> Manner | None:
+        """How they came together, as of a step; None where one of them was not there."""
+        found = self.position(step)
+        if found is None:
+            return None
+        if found.faces == "other":
             return "oncoming"
-        if abs(turn) > math.radians(45):
-            return "crossing from the right" if turn > 0 else "crossing from the left"
-        room = (scene.roster.actors[own].length + scene.roster.actors[other].length) / 2
-        if abs(ahead) < room and abs(left) > (scene.roster.actors[own].width + scene.roster.actors[other].width) / 3:
-            return "left" if left > 0 else "right"
-        return "ahead" if ahead > 0 else "behind"
+        if found.faces == "same":
+            return found.place
+        return "crossing from the right" if found.faces == "left" else "crossing from the left"
 
     def _measure(self) -> list[Moment]:
         if not self._scenes:

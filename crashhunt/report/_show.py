@@ -14,20 +14,24 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.bundle import Bundle
-    from crashhunt.encounter import Manner, Moment
+    from crashhunt.encounter import Moment, Position
 
 __all__ = ["Story"]
 
 _ROWS = 20  # of the table; longer stretches are thinned out
-_PLACES: dict[Manner, str] = {
-    "ahead": "{other} was ahead of {agent}, going the same way",
-    "behind": "{other} came from behind, going the same way",
-    "oncoming": "{other} came towards {agent}",
-    "crossing from the left": "{other} crossed from the left",
-    "crossing from the right": "{other} crossed from the right",
-    "left": "{other} was beside {agent}, to its left",
-    "right": "{other} was beside {agent}, to its right",
+_PLACES = {
+    "ahead": "ahead of {agent}",
+    "behind": "behind {agent}",
+    "left": "to the left of {agent}",
+    "right": "to the right of {agent}",
 }
+_WAYS = {
+    "same": "going the same way",
+    "other": "going the other way",
+    "left": "crossing from right to left",
+    "right": "crossing from left to right",
+}
+_STANDS = 0.05  # m/s; what is less is shown as 0
 
 
 class Story:
@@ -87,8 +91,9 @@ class Story:
         """Return what happened, a sentence each."""
         result, recording = self.bundle.result, self.recording
         end = recording.steps
-        began = "it had entered the road" if recording.actors else "the beginning"
-        sentences = [f"{result.summary}, {end * recording.prologue.step_length_s:.1f} s after {began}."]
+        scenes = recording.scenes()
+        lasted = self._end_s - scenes[0].time_s if scenes else 0.0
+        sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
         if self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
         hit = result.collision
@@ -109,9 +114,12 @@ class Story:
     def table(self) -> list[str]:
         """Return the last steps as a table."""
         names = self._names()
+        hit = self.bundle.result.collision
+        drives_into = hit is not None and hit.role == "collider"  # only then is it for the agent to brake
         header = ["step", "time s", f"{self.agent} m/s", *names]
         if self.encounter is not None:
-            header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s", "needs m/s²"]
+            header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s"]
+            header += ["needs m/s²"] if drives_into else []
         moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
         rows = []
         steps = [step for step in self.recording.all_steps if step.step >= self._first_step()]
@@ -123,64 +131,61 @@ class Story:
             cells = [str(step.step), time_s, speed, *self._decision(step.step)]
             if self.encounter is not None:
                 moment = moments.get(step.step)
-                cells += (
-                    ["-"] * 5
-                    if moment is None
-                    else [
-                        f"{moment.other_speed:.1f}",
-                        f"{moment.gap_m:.1f}",
-                        f"{moment.closing_speed:+.1f}",
-                        f"{moment.time_to_collision_s:.1f}" if math.isfinite(moment.time_to_collision_s) else "-",
-                        f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
-                    ]
-                )
+                cells += ["-"] * 5 if moment is None else _cells(moment)
+                cells = cells if drives_into else cells[:-1]
             mark = "" if step.step != self.escape else "<- the last step after which braking helps"
             rows.append([*cells, mark])
         return aligned([header, *rows])
 
     def _about_encounter(self, encounter: Encounter) -> list[str]:
-        moments = encounter.moments
-        last = moments[-1]
-        earlier = next(moment for moment in moments if moment.step >= self._first_step())
-        middle = next((moment for moment in reversed(moments) if last.time_s - moment.time_s >= 1.0), earlier)
         agent, other = encounter.agent, encounter.other
         sentences = []
-        manner = encounter.manner(middle.step)
-        if manner is not None:
-            ago = last.time_s - middle.time_s
-            sentences.append(f"{ago:.1f} s before, {_PLACES[manner].format(agent=agent, other=other)}.")
-        closing = "closing" if earlier.closing_speed > 0 else "parting"
-        sentences.append(
-            f"{last.time_s - earlier.time_s:.1f} s before, they were {earlier.gap_m:.1f} m apart, {closing} at "
-            f"{abs(earlier.closing_speed):.1f} m/s; {agent} at {earlier.speed:.1f} m/s, "
-            f"{other} at {earlier.other_speed:.1f} m/s."
-        )
-        sentences.append(
-            f"When they touched, {agent} drove {last.speed:.1f} m/s and {other} {last.other_speed:.1f} m/s."
-        )
+        # What is after the contact says nothing about how it came to it.
+        before = [moment for moment in encounter.moments if moment.time_s < self._end_s - 1e-9]
+        shown = [moment for moment in before if moment.step >= self._first_step()]
+        if shown:
+            earlier = shown[0]
+            middle = next((moment for moment in reversed(shown) if self._end_s - moment.time_s >= 1.0), earlier)
+            position = encounter.position(middle.step)
+            assert position is not None
+            where = f"{_PLACES[position.place].format(agent=agent)}, {_directions(position, middle.other_speed)}"
+            sentences = [
+                (
+                    f"{self._end_s - earlier.time_s:.1f} s before, they were {earlier.gap_m:.1f} m apart, "
+                    f"{_closing(earlier.closing_speed)}; {agent} at {earlier.speed:.1f} m/s, {other} at "
+                    f"{earlier.other_speed:.1f} m/s."
+                ),
+                f"{self._end_s - middle.time_s:.1f} s before, {other} was {where}.",
+            ]
+        hit = self.bundle.result.collision
+        assert hit is not None
+        speeds = [hit.collider_speed, hit.victim_speed]
+        if all(map(math.isfinite, speeds)):
+            own, its = speeds if hit.role == "collider" else reversed(speeds)
+            sentences.append(f"When they touched, {agent} drove {own:.1f} m/s and {other} {its:.1f} m/s.")
         changed = self._last_lane_change()
         if changed is not None:
             step, side = changed
             sentences.append(f"{agent} decided to change lanes to the {side} at step {step}.")
-        return [*sentences, *self._about_escape(last.step)]
+        return [*sentences, *self._about_escape()]
 
-    def _about_escape(self, end: int) -> list[str]:
+    def _about_escape(self) -> list[str]:
         """Until when braking would have helped; nothing where nobody knows."""
         tried = self.bundle.result.escape
         if self._braking is not None:
-            return [self._calculated(end, self._braking)]
+            return [self._calculated(self._braking)]
         if tried is None:
             return []
         braking = f"Braking {tried.how}"
         if tried.step is None:
             assert tried.too_late is not None
-            return [f"{braking} would not have avoided it even {self._ago(end, tried.too_late)}; that was run."]
+            return [f"{braking} would not have avoided it even {self._ago(tried.too_late)}; that was run."]
         if tried.too_late is None:
-            return [f"{braking} would have avoided it until {self._ago(end, tried.step)}; that was run."]
-        until = self._ago(end, tried.step)
+            return [f"{braking} would have avoided it until {self._ago(tried.step)}; that was run."]
+        until = self._ago(tried.step)
         return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run."]
 
-    def _calculated(self, end: int, braking: float) -> str:
+    def _calculated(self, braking: float) -> str:
         if self.escape is None:
             return f"Until when braking at {braking:g} m/s² would have helped cannot be calculated."
         tried = self.bundle.result.escape
@@ -188,12 +193,21 @@ class Story:
         if tried is not None and tried.braking is not None and braking > 1.01 * tried.braking:
             can = f" ({tried.braking:.1f} is all that it did when that was run)"
         return (
-            f"Braking at {braking:g} m/s²{can} would have avoided it until {self._ago(end, self.escape)}, had "
+            f"Braking at {braking:g} m/s²{can} would have avoided it until {self._ago(self.escape)}, had "
             f"{self.other} moved as it did; that is calculated, not run."
         )
 
-    def _ago(self, end: int, step: int) -> str:
-        return f"{(end - step) * self.recording.prologue.step_length_s:.1f} s before, after step {step}"
+    def _ago(self, step: int) -> str:
+        return f"{self._end_s - self.recording.scene(step).time_s:.1f} s before, after step {step}"
+
+    @property
+    def _end_s(self) -> float:
+        """Simulation time of the contact; where nobody knows, of the end of the step in which it was."""
+        hit = self.bundle.result.collision
+        if hit is not None and math.isfinite(hit.time_s):
+            return hit.time_s
+        scenes = self.recording.scenes()
+        return scenes[-1].time_s if scenes else self.bundle.result.sim_time_s
 
     def _last_lane_change(self) -> tuple[int, str] | None:
         names = self._names()
@@ -242,6 +256,27 @@ class Story:
     def _decision(self, step: int) -> list[str]:
         action = self._action(step)
         return ["-"] * len(self._names()) if action is None else [f"{value:.4g}" for value in action]
+
+
+def _cells(moment: Moment) -> list[str]:
+    time_s = moment.time_to_collision_s
+    return [
+        f"{moment.other_speed:.1f}",
+        f"{moment.gap_m:.1f}",
+        f"{moment.closing_speed:+.1f}",
+        f"{time_s:.1f}" if math.isfinite(time_s) else "-",
+        f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
+    ]
+
+
+def _directions(position: Position, speed: float) -> str:
+    return _WAYS[position.faces] if abs(speed) >= _STANDS else "standing"
+
+
+def _closing(speed: float) -> str:
+    if abs(speed) < _STANDS:
+        return "keeping their distance"
+    return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
 
 
 def _named(moment: Moment, nearest: dict[str, Any]) -> dict[str, Any]:
