@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.episode import run_episode
 from crashhunt.errors import CrashhuntError, UsageError
-from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment
+from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment, seal
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, labelled, save_panels, scope
 from crashhunt.trial import TrialResult, TrialSpec
@@ -248,6 +248,7 @@ def _main(folder: Path) -> None:
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
     try:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
+        seal(settings)
         parts = Parts(settings)
 
         def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:

@@ -14,6 +14,7 @@ from crashhunt.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, FreshProcessExecutor, WorkerSettings, scratch_of
 from crashhunt.plan import with_settings
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, read_black_box, values_around
+from crashhunt.sandbox import landlock_version
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.settings import read_settings
 from crashhunt.snapshot import Snapshot
@@ -221,7 +222,9 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
                 f"recorded actions belong to the recorded trial, and {edits[0]}", fix="replay with --code snapshot"
             )
         if not options.trusted:
-            refuse_side_effects(scenario, settings)
+            refuse_side_effects(scenario, settings, spec.scenario_arguments)
+            if not landlock_version():
+                warnings.append("this kernel has no Landlock, with which the simulator could write in its folder only")
         log = str((bundle.path / "log.mcap").resolve())
         scenario = scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded"))
         # An agent that failed did not act in its last step, and neither can its record.
@@ -243,6 +246,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         argument_files=snapshot.argument_files if code == "snapshot" else {},
         timeout_s=settings.run.timeout_s,
         keep_trials=True,
+        sealed=None if code != "log" or options.trusted else (str(bundle.path),),
     )
     return Rerun(
         bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere=bool(options.scenario)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import BundleError, CrashhuntError
-from crashhunt.executors._parts import require_origin
+from crashhunt.executors._parts import require_origin, seal
 from crashhunt.executors._protocol import WorkerSettings, scratch_of
 from crashhunt.executors._remains import died, hung, where_it_is
 from crashhunt.executors._worker import BLACK_BOX, Worker, worker_environment
@@ -161,6 +161,7 @@ def main() -> None:
     try:
         settings = WorkerSettings.from_json(job["settings"])
         require_origin("crashhunt", settings.code)
+        seal(settings)
         worker = Worker(settings)
         result = worker.run(TrialSpec.from_json(job["spec"]))
     except CrashhuntError as error:

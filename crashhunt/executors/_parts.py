@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import CrashhuntError, InvalidEpisodeError
 from crashhunt.plugins import locate, signature_of
+from crashhunt.sandbox import confine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -109,6 +110,17 @@ class Braking:
         close = getattr(self._driver, "close", None)
         if close is not None:
             close()
+
+
+def seal(settings: WorkerSettings) -> None:
+    """Confine this process to its scratch folder, if what it runs is a stranger's; it works there from then on."""
+    if settings.sealed is None:
+        return
+    home = settings.scratch / "home"
+    home.mkdir(exist_ok=True)
+    os.chdir(home)  # where SUMO writes what nobody has said where to write
+    os.environ |= {"HOME": str(home), "TMPDIR": str(home)}
+    confine(settings.scratch, [settings.scenario.folder, *settings.sealed])
 
 
 def require_origin(module: str, code: tuple[str, ...]) -> None:

@@ -34,6 +34,8 @@ class WorkerSettings:
         argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
+        sealed: of a stranger's crash, what the process may read besides what is installed and its scratch folder,
+            where alone it may write; None where it may do everything.
         find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
             few times more; only in a fresh process.
     """
@@ -46,6 +48,7 @@ class WorkerSettings:
     argument_files: dict[str, str] = field(default_factory=dict)
     timeout_s: float = 60.0
     keep_trials: bool = False
+    sealed: tuple[str, ...] | None = None
     find_escapes: bool = False
 
     def to_json(self) -> dict[str, Any]:
@@ -83,6 +86,7 @@ class WorkerSettings:
             argument_files=data.get("argument_files", {}),
             timeout_s=data["timeout_s"],
             keep_trials=data["keep_trials"],
+            sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
             find_escapes=data.get("find_escapes", False),
         )
 

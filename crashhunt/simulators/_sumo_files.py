@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators._sumo_xml import Reference
     from crashhunt.space import Value
 
-__all__ = ["StagedFiles"]
+__all__ = ["StagedFiles", "filled_in"]
 
 _NOWHERE = "/dev/null"
 
@@ -65,7 +65,7 @@ class StagedFiles:
         """
         for path, template in self._templates.items():
             try:
-                text = template.substitute({name: _text(value) for name, value in values.items()})
+                text = _substitute(template, values)
             except (KeyError, ValueError) as error:
                 raise InvalidEpisodeError(
                     f"{path.name} asks for the scenario argument {error}",
@@ -132,6 +132,20 @@ class StagedFiles:
         if parent not in self._opened:
             self._opened[parent] = os.open(parent, os.O_RDONLY | os.O_DIRECTORY)
         return f"/proc/self/fd/{self._opened[parent]}/{path.name}"
+
+
+def filled_in(content: bytes, values: Mapping[str, Value]) -> bytes:
+    """Return a route or additional file as a trial reads it.
+
+    Raises:
+        KeyError: it asks for an argument that is not there.
+        ValueError: it is no text, or has a dollar sign that means nothing.
+    """
+    return _substitute(string.Template(content.decode()), values).encode() if b"${" in content else content
+
+
+def _substitute(template: string.Template, values: Mapping[str, Value]) -> str:
+    return template.substitute({name: _text(value) for name, value in values.items()})
 
 
 def _text(value: Value) -> str:

@@ -156,44 +156,14 @@ _WRITING = frozenset(
     ]
 )
 # How something is written or shown, and to whom; none of it changes what happens on the road.
-_SHOWN = frozenset(
-    [
-        "write-license",
-        "write-metadata",
-        "precision",
-        "human-readable-time",
-        "verbose",
-        "print-options",
-        "help",
-        "version",
-        "no-warnings",
-        "aggregate-warnings",
-        "language",
-        "xml-validation",
-        "no-step-log",
-        "remote-port",
-        "num-clients",
-        "configuration-file",
-        "gui-settings-file",
-        "quit-on-end",
-        "start",
-        "delay",
-        "breakpoints",
-        "edgedata-files",
-        "alternative-net-file",
-        "selection-file",
-        "demo",
-        "disable-textures",
-        "registry-viewport",
-        "window-size",
-        "window-pos",
-        "tracker-interval",
-        "save-commented",
-        "game",
-        "osg-view",
-        "phemlight-path",
-    ]
-)
+_SHOWN_NAMES = """
+write-license write-metadata precision human-readable-time verbose print-options help version no-warnings
+aggregate-warnings language xml-validation no-step-log remote-port num-clients configuration-file
+gui-settings-file quit-on-end start delay breakpoints edgedata-files alternative-net-file selection-file demo
+disable-textures registry-viewport window-size window-pos tracker-interval save-commented game osg-view
+phemlight-path
+"""
+_SHOWN = frozenset(_SHOWN_NAMES.split())
 _SHOWN_FAMILIES = ("output-", "output.", "precision.", "save-", "log.", "duration-log.", "step-log.", "xml-validation.")
 _WINDOW_FAMILIES = ("game.", "gui-testing", "device.ssm.filter-edges.")
 

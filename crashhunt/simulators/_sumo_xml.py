@@ -18,10 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["Reference", "movable", "nested_files", "read_xml", "references", "rewritten"]
+__all__ = ["READ", "WRITTEN", "Reference", "movable", "nested_files", "read_xml", "references", "rewritten"]
 
-# Of every other element, `file` is what SUMO writes.
-_READ = {
+READ = {
     ("include", "href"),
     ("variableSpeedSign", "file"),
     ("rerouter", "file"),
@@ -29,12 +28,16 @@ _READ = {
     ("edgeData", "edgesFile"),
     ("laneData", "edgesFile"),
 }
-_WRITTEN = {"file", "output", "dest"}
+"""The attributes that name what SUMO reads."""
+
+WRITTEN = {"file", "output", "dest"}
+"""The attributes that name what SUMO writes, wherever they are not `READ`."""
 _NOWHERE = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR"}
 """What SUMO does not take for the name of a file."""
 
 # Whatever is not in a file's bytes, no attribute of it can be; most route files have none of these.
 _WORTH_PARSING = re.compile(rb"(?:file|edgesFile|output|dest|href)\s*=|[\"'.]file[\"']|<!DOCTYPE")
+_MAX_BYTES = 10**9
 _TAG = re.compile(rb"<[^\s/>]+")
 _ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
@@ -71,7 +74,10 @@ def read_xml(path: Path) -> bytes:
     try:
         content = path.read_bytes()
         if content.startswith(b"\x1f\x8b"):
-            content = gzip.decompress(content)
+            with gzip.open(path) as packed:
+                content = packed.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise EOFError("it has more than a gigabyte")
     except (OSError, EOFError, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ScenarioError(f"cannot be read: {reason}", fix="mend the file", where=str(path)) from None
@@ -94,10 +100,10 @@ def references(content: bytes, where: str) -> list[Reference]:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         for name, value in attributes.items():
-            if (tag, name) in _READ:
+            if (tag, name) in READ:
                 if value:
                     found.append(Reference(tag, name, value, "read", parser.CurrentByteIndex))
-            elif name in _WRITTEN and value not in _NOWHERE:
+            elif name in WRITTEN and value not in _NOWHERE:
                 found.append(Reference(tag, name, value, "written", parser.CurrentByteIndex))
         if tag == "param" and _is_written(attributes.get("key", "")) and attributes.get("value", "") not in _NOWHERE:
             found.append(Reference(tag, "value", attributes["value"], "written", parser.CurrentByteIndex))

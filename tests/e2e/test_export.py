@@ -172,7 +172,7 @@ def test_any_damage_is_refused_or_harmless(small_archive, tmp_path, data):
         ("scenario/scenario.toml", 'simulator = "sumo"', 'simulator = "os:system"', "os:system"),
         ("hunt.toml", '"overlap"', '"subprocess:run"', "subprocess:run"),
         ("scenario/scenario.toml", "[sumo.options]", '[sumo.options]\nsummary-output = "evil"', "summary-output"),
-        ("scenario/traffic.rou.xml", "<routes>", '<routes><inductionLoop id="a" file="evil"/>', "file=…"),
+        ("scenario/traffic.rou.xml", "<routes>", '<routes><event commandPosix="evil"/>', "<event>"),
     ],
 )  # fmt: skip
 def test_a_strangers_recorded_actions_do_nothing_but_simulate(exported, tmp_path, file, before, after, says):

@@ -146,7 +146,7 @@ def test_what_somebody_wrote_is_kept_or_told(town, tmp_path, text, kept, says):
 
 def test_a_jam_of_a_scenario_stays_one_unless_it_says_otherwise(town, tmp_path):
     (town / "scenario.toml").write_text(
-        '[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
     )
     assert staged(load_scenario(town), tmp_path / "a")["time-to-teleport"] == "-1"
     assert "literal" not in _as_dict(load_scenario("loop"))["sumo"]  # so that hunts of before can go on
@@ -155,10 +155,15 @@ def test_a_jam_of_a_scenario_stays_one_unless_it_says_otherwise(town, tmp_path):
     assert staged(load_scenario(town), tmp_path / "b")["time-to-teleport"] == "60"
 
 
+def test_a_value_is_never_taken_for_the_next_option(town, tmp_path):
+    options = staged(load_scenario(config(town, '<no-internal-links v="--summary=x"/>')), tmp_path)
+    assert options["no-internal-links"] == "--summary=x"
+
+
 @pytest.mark.parametrize("value", ['"yes"', "true", "1", '"T"', '"x"', '"ON"', '" true"'])
 def test_queues_are_refused(town, value):
     (town / "scenario.toml").write_text(
-        '[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
         f"[sumo.options]\nmesosim = {value}\n"
     )
     with pytest.raises(ScenarioError, match="none can be driven"):
@@ -187,7 +192,7 @@ def test_vehicles_are_not(town, value):
 )
 def test_options_under_any_name(town, text, says):
     (town / "scenario.toml").write_text(
-        f'[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n{text}\n'
+        f'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n{text}\n'
     )
     with pytest.raises(ScenarioError) as caught:
         load_scenario(town)

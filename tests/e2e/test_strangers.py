@@ -1,0 +1,205 @@
+"""A stranger's crash, with the actions that were recorded: it simulates, and does nothing else."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import zipfile
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import Shell
+
+from crashhunt.archive import open_archive
+from crashhunt.bundle import find_bundle
+from crashhunt.errors import CrashhuntError, UsageError
+from crashhunt.replays import ReplayOptions, prepare, replay
+from crashhunt.sandbox import landlock_version
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+STRANGER = ReplayOptions(code="log", force=True, trusted=False)
+OPTIONS, ROUTES = "scenario/scenario.toml", "scenario/traffic.rou.xml"
+
+
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory):
+    """A crash of the shipped scenario, exported."""
+    shell = Shell(tmp_path_factory.mktemp("exported"))
+    words = ("--arg", "speed=19", "--set", "vehicles=35", "--seed", "1", "--timeout", "140")
+    done = shell.crashhunt("run", "h", "1", "9", "600", *words, "--json", expect=None)
+    assert done.json["crashes"], done.err
+    shell.crashhunt("export", "h", "crash.zip")
+    return shell.folder / "crash.zip"
+
+
+def changed(source: Path, target: Path, *edits: tuple[str, str, str]) -> Path:
+    """Copy an exported crash with texts of its files replaced, as somebody would who has read how it is checked."""
+    files = {}
+    with zipfile.ZipFile(source) as old:
+        for name in old.namelist():
+            files[name] = old.read(name)
+    for file, before, after in edits:
+        name = file if file in files else next(name for name in files if name.endswith(f"/{file}"))
+        assert before.encode() in files[name], file
+        files[name] = files[name].replace(before.encode(), after.encode(), 1)
+        if ".add.xml" in after:
+            files[name.replace("scenario.toml", "d.add.xml")] = after.partition("<!--")[2].partition("-->")[0].encode()
+    index = json.loads(files.pop("archive.json"))
+    for name, data in files.items():
+        digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+        index["files"][name] = {"size": len(data), "blake2b": digest}
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+        for name, data in {**files, "archive.json": json.dumps(index).encode()}.items():
+            new.writestr(name, data)
+    return target
+
+
+def option(name: str, value: object) -> tuple[str, str, str]:
+    return OPTIONS, "[sumo.options]", f"[sumo.options]\n{json.dumps(name)} = {json.dumps(value)}"
+
+
+def routes(text: str) -> tuple[str, str, str]:
+    return ROUTES, "</routes>", f"{text}</routes>"
+
+
+def detector(victim: Path) -> tuple[str, str, str]:
+    """An additional file, which stands in a comment of the scenario."""
+    loop = f'<inductionLoop id="d" lane="south_0" pos="5" period="1" file="{victim}"/>'
+    text = f'# <!--<additional>{loop}</additional>-->\nadditional = ["d.add.xml"]\nnet = '
+    return OPTIONS, "net = ", text
+
+
+ADDITIONAL = (OPTIONS, "additional = []\n", "")
+SSM = '<vType id="z"><param key="has.ssm.device" value="true"/><param key="device.ssm.file" value="{}"/></vType>'
+# Of the issue, and what else came to mind.
+NAMES = ["netstate-dump", "ndump", "tripinfo", "summary", "vehroutes", "C", "l", "log-file", "save-state.prefix"]
+NAMES += ["device.ssm.file", "device.toc.file", "fcd-output", "made-up", "remote-port", "configuration-file", "weights"]
+ATTACKS = {
+    **{name: option(name, "VICTIM") for name in NAMES},
+    "a name that is two": option("scale=1 --summary", "VICTIM"),
+    "an argument": (OPTIONS, "[arguments.", '[arguments.x]\ndefault = "VICTIM"\noption = "summary"\n[arguments.'),
+    "a parameter": routes(SSM.format("VICTIM")),
+    "a spelled out parameter": routes('<vType id="z"><param key="&#100;evice.ssm.file" value="VICTIM"/></vType>'),
+    "a document type": (ROUTES, "<routes>", '<!DOCTYPE r SYSTEM "VICTIM"><routes>'),
+    "an element": routes('<event commandPosix="rm VICTIM"/>'),
+    "an attribute": routes('<vType id="z" imgFile="VICTIM"/>'),
+    "an include": routes('<include href="VICTIM"/>'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_what_is_not_known_to_be_harmless_asks_for_trust(crash, tmp_path, attack):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    file, before, after = ATTACKS[attack]
+    bad = changed(crash, tmp_path / "bad.zip", (file, before, after.replace("VICTIM", str(victim))))
+    with open_archive(bad) as archive, pytest.raises(CrashhuntError) as caught:
+        prepare(find_bundle(archive.directory, ""), STRANGER)
+    assert isinstance(caught.value, UsageError) == ("--trust" in caught.value.fix)
+    assert "\n" not in str(caught.value)
+    if attack != "configuration-file":  # no scenario may say that
+        assert isinstance(caught.value, UsageError) or attack in ("an include", "weights")
+    assert victim.read_text() == "mine"
+
+
+def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    with open_archive(changed(crash, tmp_path / "d.zip", ADDITIONAL, detector(victim))) as archive:
+        report = replay(find_bundle(archive.directory, ""), STRANGER)
+    assert report.verdict == "reproduced"
+    assert victim.read_text() == "mine"
+
+
+DOORS_OPEN = """
+import crashhunt.simulators._sumo_files as files
+files.is_output = files.is_shown = lambda name: False
+files.rewritten = lambda content, *_: content
+files.ALWAYS.pop("device.ssm.file", None)
+"""
+
+
+@pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+@pytest.mark.parametrize("attack", ["netstate-dump", "C", "a detector"])
+def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monkeypatch, attack):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    edits = [ADDITIONAL, detector(victim)] if attack == "a detector" else [option(attack, str(victim))]
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open" / "sitecustomize.py").write_text(DOORS_OPEN)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "open"))
+    monkeypatch.setattr("crashhunt.replays.refuse_side_effects", lambda *_: None)
+    with open_archive(changed(crash, tmp_path / "bad.zip", *edits)) as archive:
+        bundle = find_bundle(archive.directory, "")
+        try:
+            verdict = replay(bundle, STRANGER).verdict
+        except CrashhuntError as error:
+            verdict = str(error)
+        assert verdict != "reproduced"
+        assert victim.read_text() == "mine"
+        if attack == "netstate-dump":  # it is the kernel that has held
+            replay(bundle, ReplayOptions(code="log", force=True))
+            assert "netstate" in victim.read_text()
+
+
+EVIL = 'from pathlib import Path\nPath("evil was here").touch()\n'
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after"),
+    [
+        ("hunt.toml", 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
+        ("hunt.toml", 'sampler = "random"', 'sampler = "evil:Sampler"'),
+        ("hunt.toml", '"overlap"', '"evil:Oracle"'),
+        (OPTIONS, 'simulator = "sumo"', 'simulator = "evil:Simulator"'),
+        (OPTIONS, 'agent = "crashhunt.agents:KeepLaneWithSpeed"', 'agent = "evil:Agent"'),
+    ],
+)
+def test_no_code_is_imported(crash, tmp_path, monkeypatch, capsys, file, before, after):
+    from crashhunt.cli import main
+
+    (tmp_path / "evil.py").write_text(EVIL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of another machine"))
+    changed(crash, tmp_path / "bad.zip", (file, before, after))
+    for words in (
+        ["show", "bad.zip"],
+        ["report", "bad.zip", "--output", "x.html"],
+        ["replay", "bad.zip", "--from-log"],
+    ):
+        with pytest.raises(SystemExit):
+            main(words)
+    assert not (tmp_path / "evil was here").exists()
+
+
+def test_gymnasium_may_import_nothing_either(tmp_path):
+    from crashhunt.scenario import scenario_from_dict
+    from crashhunt.settings import HuntSettings
+    from crashhunt.trust import refuse_side_effects
+
+    settings = HuntSettings(scenario="x", scenario_digest="", trials=1, max_steps=1, seed=1)
+
+    def refused(values: dict[str, object], **tables: object) -> str:
+        scenario = scenario_from_dict(dict(tables), where="here", folder=tmp_path)
+        with pytest.raises(UsageError) as caught:
+            refuse_side_effects(scenario, settings, values)
+        return str(caught.value)
+
+    assert "'evil'" in refused({}, simulator="gym", gym={"id": "evil:Env-v0"})
+    assert "'evil'" in refused({}, simulator="gym", gym={"id": "CartPole-v1", "crash": {"function": "evil:crash"}})
+    assert "arguments" in refused({}, simulator="gym", gym={"id": "CartPole-v1", "kwargs": {"a": 1}})
+    assert "arguments" in refused({"a": 1}, simulator="gym", gym={"id": "CartPole-v1"})
+    assert "'evil'" in refused({}, simulator="highway", highway={"id": "evil:highway-v0"})
+    assert "os.system" in refused({"other_vehicles_type": "os.system"}, simulator="highway", highway={"id": "merge-v0"})
+
+
+def test_a_compressed_file_without_end_is_refused(tmp_path, monkeypatch):
+    from crashhunt.simulators import _sumo_xml
+
+    monkeypatch.setattr(_sumo_xml, "_MAX_BYTES", 1000)
+    (tmp_path / "a.xml.gz").write_bytes(gzip.compress(bytes(10_000)))
+    with pytest.raises(CrashhuntError, match="cannot be read"):
+        _sumo_xml.read_xml(tmp_path / "a.xml.gz")
