@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -53,11 +53,16 @@ class WorkerSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers."""
-        data = asdict(self)
-        data["scenario"]["folder"] = str(self.scenario.folder)
-        del data["scenario"]["file"]  # the crashhunt of an older snapshot would not know it
-        crash_on = [str(outcome) for outcome in self.crash_on]
-        return {**data, "schema": _SCHEMA, "scratch": str(self.scratch), "crash_on": crash_on}
+        # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
+        # what has come since is written only where it is asked for. For this the defaults may never change.
+        scenario: dict[str, Any] = _asked(replace(self.scenario, file=type(self.scenario).file))
+        return {
+            **{item.name: getattr(self, item.name) for item in fields(self)},
+            "schema": _SCHEMA,
+            "scenario": {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)},
+            "scratch": str(self.scratch),
+            "crash_on": [str(outcome) for outcome in self.crash_on],
+        }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
@@ -89,6 +94,20 @@ class WorkerSettings:
             sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
             find_escapes=data.get("find_escapes", False),
         )
+
+
+def _asked(value: Any) -> Any:
+    """Plain data, in which a dataclass has only the fields that are not at their default."""
+    if is_dataclass(value):
+        pairs = ((item, getattr(value, item.name)) for item in fields(value))
+        return {item.name: _asked(held) for item, held in pairs if held != _default(item)}
+    if isinstance(value, dict):
+        return {name: _asked(held) for name, held in value.items()}
+    return [_asked(held) for held in value] if isinstance(value, list | tuple) else value
+
+
+def _default(item: Field[Any]) -> Any:
+    return item.default_factory() if item.default_factory is not MISSING else item.default
 
 
 class Executor(Protocol):
