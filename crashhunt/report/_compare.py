@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import html
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from crashhunt.report._table import aligned
+from crashhunt.report._units import argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.trial import Outcome
 from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -33,7 +34,15 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 68rem; padding: 0 1rem;
   color: var(--ink); background: var(--back); }
 table { border-collapse: collapse; width: 100%; background: var(--paper); }
-th, td { text-align: left; padding: .4rem .7rem; border: 1px solid var(--line); }
+th, td { text-align: left; padding: .4rem .7rem; border: 1px solid var(--line); overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
+.rates { display: grid; gap: .9rem; } .rate { position: relative; height: 1.2rem; margin-top: .15rem; }
+.rate > * { position: absolute; top: 0; height: 100%; }
+.interval { height: 0; top: 50%; border-top: 2px solid var(--ink); }
+.interval::before, .interval::after { content: ""; position: absolute; top: -7px; height: 12px; width: 2px;
+  background: var(--ink); } .interval::after { right: 0; }
+.faint { color: var(--faint); } h1, p, figcaption, .name { overflow-wrap: anywhere; }
+svg { display: block; max-width: 100%; height: auto; }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; }
 figure { margin: 0; padding: .7rem; background: var(--paper); border: 1px solid var(--line); border-radius: 6px; }
 figcaption { font-weight: 600; } svg text { font-size: 11px; fill: var(--faint); }
@@ -83,10 +92,11 @@ def comparison_page(found: Comparison, path: Path) -> None:
     )
     plots = "".join(_argument_plots(found.hunts, colors))
     page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Comparison</title>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><title>Comparison</title>'
         f"<style>{_STYLE}</style></head><body><h1>Comparison</h1>{answers}<p>{keys}</p>"
-        f"<h2>Crash rate</h2>{_rates(found.hunts, colors)}"
-        f"<h2>Outcomes</h2>{_outcomes(found.hunts)}"
+        f'<h2>Crash rate</h2><figure class="rates">{_rates(found.hunts, colors)}</figure>'
+        f'<h2>Outcomes</h2><div class="wide">{_outcomes(found.hunts)}</div>'
         f'<h2>Crash rate against each argument</h2><div class="plots">{plots}</div></body></html>\n'
     )
     with whole_file(path) as temporary:
@@ -94,25 +104,20 @@ def comparison_page(found: Comparison, path: Path) -> None:
 
 
 def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
+    """A bar per hunt, and its interval; in percent of the width, so that a telephone shows it as well."""
     most = max([hunt.interval[1] if hunt.interval else hunt.crash_rate for hunt in hunts if hunt.trials] or [1.0])
-    scale, parts = 560 / max(most, 1e-9), []
-    for place, hunt in enumerate(hunts):
-        y = 18 + 30 * place
+    scale, parts = 100 / max(most, 1e-9), []
+    for hunt in hunts:
         rate = hunt.crash_rate if hunt.trials else 0.0
         said = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
-        parts.append(f'<rect x="0" y="{y - 9}" width="{rate * scale:.1f}" height="18" fill="{colors[hunt.dir]}"/>')
-        end = rate
+        bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
         if hunt.interval:
-            low, end = hunt.interval
-            parts.append(
-                f'<path d="M{low * scale:.1f} {y}H{end * scale:.1f}M{low * scale:.1f} {y - 5}v10M{end * scale:.1f} '
-                f'{y - 5}v10" stroke="currentColor" stroke-width="1.5"/>'
-            )
-        parts.append(f'<text x="{end * scale + 8:.1f}" y="{y + 4}">{said}</text>')
-    return (
-        f'<figure><svg width="720" height="{30 * len(hunts) + 8}" role="img" aria-label="crash rates with 95 % '
-        f'intervals">{"".join(parts)}</svg></figure>'
-    )
+            low, high = hunt.interval
+            said += f", 95 % interval {low:.2%} to {high:.2%}"
+            bar += f'<span class="interval" style="left:{low * scale:.2f}%;width:{(high - low) * scale:.2f}%"></span>'
+        name = f'<span class="name">{html.escape(hunt.dir)}</span>'
+        parts.append(f'<div>{name} <span class="faint">{said}</span><div class="rate">{bar}</div></div>')
+    return "".join(parts)
 
 
 def _outcomes(hunts: Sequence[HuntFigures]) -> str:
@@ -127,10 +132,14 @@ def _outcomes(hunts: Sequence[HuntFigures]) -> str:
 
 def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> list[str]:
     values: dict[str, dict[str, tuple[NDArray[Any], NDArray[Any]]]] = {}
+    units: dict[str, str] = {}
     for hunt in hunts:
         for name, pair in _arguments(HuntResults(hunt.dir)).items():
             values.setdefault(name, {})[hunt.dir] = pair
-    return [_argument_plot(name, of, colors) for name, of in values.items()]
+        for (agent, name), unit in argument_units(Path(hunt.dir), HuntResults(hunt.dir).settings).items():
+            units[f"{agent or 'scenario'}.{name}"] = unit
+    labels = {name: name.partition(".")[2] + (f" ({units[name]})" if name in units else "") for name in values}
+    return [_argument_plot(name, labels[name], of, colors) for name, of in values.items()]
 
 
 def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
@@ -149,7 +158,9 @@ def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]
     return {name: (np.array(found), hit) for name, found in columns.items() if len({str(v) for v in found}) > 1}
 
 
-def _argument_plot(name: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], colors: dict[str, str]) -> str:
+def _argument_plot(
+    name: str, label: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], colors: dict[str, str]
+) -> str:
     numeric = all(np.issubdtype(values.dtype, np.number) for values, _ in of.values())
     lines: dict[str, list[tuple[float, float, int]]] = {}
     if numeric:
@@ -171,12 +182,15 @@ def _argument_plot(name: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], 
                 middle = (place + 0.5) / (len(edges) - 1)
                 lines[hunt].append((middle, float(crashed[inside].mean()), int(inside.sum())))
     most = max([rate for line in lines.values() for _, rate, _ in line] + [1e-9])
-    parts = ['<path class="axis" d="M40 8V148H268"/>', f'<text x="36" y="16" text-anchor="end">{most:.0%}</text>',
+    parts = ['<path class="axis" d="M40 8V148H268"/>',
+             f'<text x="154" y="180" text-anchor="middle">{html.escape(label)}</text>',
+             '<text transform="translate(11 78) rotate(-90)" text-anchor="middle">crash rate</text>',
+             f'<text x="36" y="16" text-anchor="end">{most:.0%}</text>',
              '<text x="36" y="150" text-anchor="end">0</text>']  # fmt: skip
-    for place, label in enumerate(labels):
+    for place, end in enumerate(labels):
         x = 40 + 228 * (place / (len(labels) - 1) if numeric else (place + 0.5) / len(labels))
         anchor = ("start" if not place else "end") if numeric else "middle"
-        parts.append(f'<text x="{x:.0f}" y="163" text-anchor="{anchor}">{html.escape(label)}</text>')
+        parts.append(f'<text x="{x:.0f}" y="163" text-anchor="{anchor}">{html.escape(end)}</text>')
     for hunt, line in lines.items():
         at = [(40 + 228 * x, 148 - 136 * rate / most, count, rate) for x, rate, count in line]
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y, _, _ in at)
@@ -187,6 +201,6 @@ def _argument_plot(name: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], 
             for x, y, count, rate in at
         ]
     return (
-        f'<figure><figcaption>{html.escape(name)}</figcaption><svg width="280" height="170" role="img" '
+        f'<figure><figcaption>{html.escape(name)}</figcaption><svg viewBox="0 0 280 186" width="280" role="img" '
         f'aria-label="crash rate against {html.escape(name)}">{"".join(parts)}</svg></figure>'
     )

@@ -17,6 +17,7 @@ from crashhunt.oracles import approaches
 from crashhunt.recording import read_lanes
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._show import Story
+from crashhunt.report._units import argument_units
 from crashhunt.settings import read_settings
 from crashhunt.whole_file import whole_file
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
     from crashhunt.encounter import Encounter
     from crashhunt.recording import Recording
+    from crashhunt.settings import HuntSettings
 
 __all__ = ["report_data", "write_report"]
 
@@ -70,9 +72,20 @@ def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str) -> dic
         "agents": {agent: chosen.agent for agent, chosen in settings.agents.items()},
         "seed": settings.seed,
         "planned": settings.trials,
+        "maxSteps": settings.max_steps,
+        "scenarioArguments": list(settings.scenario_arguments),
+        "units": {
+            _shown_name(agent, name, settings): unit
+            for (agent, name), unit in argument_units(directory, settings).items()
+        },
         **_trials(directory),
         "crashes": [_crash(bundle) for bundle in bundles],
     }
+
+
+def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
+    """How the page calls an argument: with its agent where there are several."""
+    return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
 def _trials(directory: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ import pytest
 from conftest import needed
 
 from crashhunt.bundle import list_bundles
+from crashhunt.results import HuntResults
 
 selenium = pytest.importorskip("selenium")
 from selenium import webdriver  # noqa: E402
@@ -143,6 +145,93 @@ def test_it_is_driven_by_keyboard_and_plays(hunt, browser):
     assert step(browser) == 3
 
 
+def test_keys_work_after_a_click(hunt, browser):
+    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
+    opened(browser, hunt.folder / "report.html")
+    wait_until(lambda: step(browser) > 0 or browser.execute_script("return crashhuntView.crash.steps") < 50)
+
+    def press(*keys):
+        webdriver.ActionChains(browser).send_keys(*keys).perform()  # to whatever has the focus
+
+    for name in ("back", "forth", "in", "out", "follow"):
+        browser.find_element(By.ID, name).click()
+        press(Keys.HOME)
+        assert step(browser) == 0, name
+        press(Keys.ARROW_RIGHT)
+        assert step(browser) == 1, name
+        press(" ")  # plays, and does not press the button again
+        assert browser.execute_script("return crashhuntView.playing"), name
+        press(" ")
+        assert not browser.execute_script("return crashhuntView.playing"), name
+    listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
+    listed[1].click()
+    wait_until(lambda: text(browser, "summary").startswith(listed[1].text.split("\n")[0]))
+    press(Keys.HOME, Keys.ARROW_RIGHT)
+    assert step(browser) == 1
+
+    # With the keyboard, a button that has the focus is pressed by space, and the other keys work all the same.
+    browser.execute_script("document.getElementById('forth').focus()")
+    press(" ")
+    assert step(browser) == 2
+    press(Keys.ARROW_LEFT)
+    assert step(browser) == 1
+
+
+def test_dots_say_which_trial_they_are_and_lead_to_it(hunt, browser):
+    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
+    opened(browser, hunt.folder / "report.html")
+    names = browser.execute_script("return PLOTS.map((plot) => [plot.name, labelOf(plot.name)])")
+    assert ["speed", "speed (m/s)"] in names
+    trials = {trial["number"]: trial for trial in page_data(browser)["trials"]}
+
+    # By keyboard: from the lowest value on, with everything that there is to know.
+    canvas = browser.find_element(By.CSS_SELECTOR, "#plots canvas")
+    browser.execute_script("arguments[0].focus()", canvas)
+    canvas.send_keys(Keys.ARROW_RIGHT)
+    lowest = min(trials.values(), key=lambda trial: trial["values"][names[0][0]])
+    told = text(browser, "tip")
+    assert told.startswith(f"trial {lowest['number']}: {lowest['outcome']}")
+    assert f"speed {lowest['values']['speed']:.4g} m/s" in told
+    canvas.send_keys(Keys.END)
+    highest = max(trials.values(), key=lambda trial: trial["values"][names[0][0]])
+    assert text(browser, "tip").startswith(f"trial {highest['number']}:")
+    canvas.send_keys(Keys.ENTER)
+    wait_until(lambda: text(browser, "summary").startswith(f"{highest['number']:06d}-"))
+    assert not browser.find_element(By.ID, "tip").is_displayed()
+
+    # By pointer: over the dot, and beside it.
+    dot = browser.execute_script("return [PLOTS[0].dots[0].x, PLOTS[0].dots[0].y, PLOTS[0].dots[0].trial.number]")
+    middle = [canvas.size["width"] / 2, canvas.size["height"] / 2]
+    at = [round(dot[0] - middle[0]), round(dot[1] - middle[1])]
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    webdriver.ActionChains(browser).move_to_element_with_offset(canvas, *at).perform()
+    assert text(browser, "tip").startswith(f"trial {dot[2]}:")
+    webdriver.ActionChains(browser).move_to_element_with_offset(canvas, 0, round(middle[1]) - 40).perform()
+    assert not browser.find_element(By.ID, "tip").is_displayed()
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+@pytest.fixture
+def telephone(browser):
+    size = {"width": 375, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    yield browser
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_nothing_is_wider_than_a_telephone(hunt, telephone):
+    hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
+    opened(telephone, hunt.folder / "report.html")
+    assert telephone.execute_script("return document.documentElement.scrollWidth") == 375
+    long = f"a{'-very' * 20}-long-name"
+    (hunt.folder / "<b>bold&").rename(hunt.folder / long)
+    hunt.crashhunt("compare", long, long, "--html", "compare.html")
+    telephone.get((hunt.folder / "compare.html").as_uri())
+    assert telephone.execute_script("return document.documentElement.scrollWidth") == 375
+    labels = [label.text for label in telephone.find_elements(By.CSS_SELECTOR, "svg text")]
+    assert {"speed (m/s)", "crash rate"} <= set(labels)
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_light_and_dark_differ_and_can_be_read(hunt, browser, scheme):
     hunt.crashhunt("report", "<b>bold&", "-o", "report.html")
@@ -176,6 +265,16 @@ def test_software_faults_exports_and_hunts_without_crashes(shell, browser):
     browser.get((shell.folder / "calm" / "report.html").as_uri())
     assert text(browser, "tiles").startswith("2 of 2")
     assert not browser.find_element(By.ID, "crashes-section").is_displayed()
+    # A trial without a crash can be tried again, with what it was given.
+    browser.execute_script("pick(PLOTS[0].dots[0])")
+    trial = browser.execute_script("return PLOTS[0].dots[0].trial")
+    command = browser.find_element(By.CSS_SELECTOR, "#picked code").text
+    assert shlex.split(command)[:6] == ["crashhunt", "run", "again", "0", "100", "50"]
+    assert f"--set vehicles={trial['values']['vehicles']}" in command
+    words = shlex.split(command.replace("run again 0 100 50", "run again 1 1 50"))
+    shell.crashhunt(*words[1:])
+    (result,) = HuntResults(shell.folder / "again").results()
+    assert {**result.spec.arguments["ego"], **result.spec.scenario_arguments} == trial["values"]
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
