@@ -6,7 +6,6 @@ import builtins
 import json
 import os
 import pdb
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.episode import run_episode
 from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment, seal
+from crashhunt.keeper import Kept
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, labelled, save_panels, scope
 from crashhunt.trial import TrialResult, TrialSpec
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.replays import Rerun
     from crashhunt.simulators import Simulator
 
-__all__ = ["Look", "debug"]
+__all__ = ["Look", "debug", "main"]
 
 _LEFT = 77  # exit code
 
@@ -84,20 +84,27 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             "pause_before": min(look.until, max(1, rerun.bundle.result.steps)),
         }
         (scratch / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        command = [sys.executable, "-P", "-m", "crashhunt.debugger", folder]
-        done = subprocess.run(
-            command, env=fresh_environment(settings), stdout=2 if look.to_stderr else None, check=False
+        kept = Kept(
+            "crashhunt.debugger",
+            [folder],
+            environment=fresh_environment(settings),
+            apart=False,
+            stdout=2 if look.to_stderr else None,
         )
-        if done.returncode == _LEFT:
+        try:
+            code = kept.process.wait()
+        finally:
+            kept.end()
+        if code == _LEFT:
             raise KeyboardInterrupt
-        if look.window is not None and done.returncode < 0:
+        if look.window is not None and code < 0:
             # sumo-gui does not always survive being closed in the middle of a step.
-            print(f"the window was closed, with signal {-done.returncode}", file=sys.stderr)
+            print(f"the window was closed, with signal {-code}", file=sys.stderr)
             raise KeyboardInterrupt
         try:
             answer = json.loads((scratch / "answer.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            ended = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+            ended = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise CrashhuntError(
                 f"the replay ended before its last step, with {ended}", where=rerun.bundle.id
             ) from None
@@ -244,7 +251,9 @@ class _Debugger(pdb.Pdb):
         os._exit(_LEFT)
 
 
-def _main(folder: Path) -> None:
+def main() -> None:
+    """Run the trial that a file in a folder describes, with the terminal at hand."""
+    folder = Path(sys.argv[1])
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
     try:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
@@ -278,7 +287,3 @@ def _main(folder: Path) -> None:
     except CrashhuntError as error:
         answer = error.to_json()
     (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    _main(Path(sys.argv[1]))

@@ -7,6 +7,7 @@ import random
 import sys
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.scene import Actor, Roster, Scene
     from crashhunt.simulators import Simulator
 
-__all__ = ["run_episode", "seed_everything"]
+__all__ = ["run_episode", "seed_everything", "words_of"]
 
 
 _MEASURE_EVERY = 256
@@ -104,6 +105,7 @@ def run_episode(
         RecorderError: the disk is full.
     """
     began = time.monotonic()
+    setup_s = 0.0
     seed_everything(spec.seed)
     agents: dict[str, Agent] = {}
     run = _Run(spec, simulator, box, tuple(oracles), frozenset(crash_on))
@@ -112,23 +114,15 @@ def run_episode(
         setup_s = time.monotonic() - began
         if result is None:
             result = run.drive(agents)
+        result = run.finish(result)
+    except RecorderError:
+        raise
+    except BaseException as error:  # of an oracle, or of what the agent has damaged, such as our own files
+        result = run.failed(error)
     finally:
         for agent in agents.values():
-            close = getattr(agent, "close", None)
-            if close is not None:
-                _quietly(close)
-    run.meter.measure(box.take_frames())
-    box.mark(Phase.DONE)
-    closest = run.meter.closest
-    if result.collision is not None and "overlap" in result.collision.seen_by:
-        closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
-    return replace(
-        result,
-        digest=digest_of(box.committed()) if result.outcome is not Outcome.INVALID else "",
-        closest=closest,
-        setup_s=setup_s,
-        wall_s=time.monotonic() - began,
-    )
+            _quietly(agent)
+    return replace(result, setup_s=setup_s, wall_s=time.monotonic() - began)
 
 
 def seed_everything(seed: int) -> None:
@@ -216,7 +210,9 @@ class _Run:
                 scene = simulator.scene()
                 scene.follow(before)
                 before = scene
-            except Exception as error:
+            except RecorderError:
+                raise
+            except BaseException as error:  # an environment of a user's may exit as well as an agent
                 return self._result(Outcome.SIMULATOR_ERROR, failure=_failure(error, ""))
             scribe.scene(step, scene, tuple([rewards.get(name, 0.0) for name in names]))
             self.step = step
@@ -231,6 +227,25 @@ class _Run:
                 if not active or all(terminations.get(name) or truncations.get(name) for name in actions):
                     return self._result(Outcome.FINISHED)
         return self._result(Outcome.SURVIVED)
+
+    def finish(self, result: TrialResult) -> TrialResult:
+        """Add what is measured over the whole recording."""
+        self.meter.measure(self.box.take_frames())
+        self.box.mark(Phase.DONE)
+        digest = digest_of(self.box.committed()) if result.outcome is not Outcome.INVALID else ""
+        closest = self.meter.closest
+        if result.collision is not None and "overlap" in result.collision.seen_by:
+            closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
+        return replace(result, digest=digest, closest=closest)
+
+    def failed(self, error: BaseException) -> TrialResult:
+        """What comes of an episode that could not go on, and neither agent nor simulator said why."""
+        outcome = Outcome.AGENT_ERROR if isinstance(error, OSError | MemoryError) else Outcome.SIMULATOR_ERROR
+        result = TrialResult(self.spec, outcome, steps=self.step, failure=_failure(error, ""))
+        try:
+            return self.finish(result)
+        except BaseException:
+            return result
 
     def _check(self, scene: Scene) -> Finding | None:
         findings: list[Finding] = []
@@ -268,7 +283,7 @@ def _any_action(space: Any) -> Any:
 def _failure(error: BaseException, agent: str) -> Failure:
     # A message of our own says everything; where in our code it was raised is nobody's business.
     text = "" if isinstance(error, InvalidEpisodeError) else "".join(traceback.format_exception(error))
-    message = str(error) if isinstance(error, EpisodeError) else " ".join(str(error).split())
+    message = words_of(error) if isinstance(error, EpisodeError) else " ".join(words_of(error).split())
     kinds: dict[type[BaseException], str] = {
         ActionError: "bad action",
         InvalidEpisodeError: "invalid",
@@ -277,8 +292,20 @@ def _failure(error: BaseException, agent: str) -> Failure:
     return Failure(kinds.get(type(error), type(error).__name__), message, text, agent)
 
 
-def _quietly(close: Callable[[], None]) -> None:
+def words_of(error: BaseException) -> str:
+    """Return the message of an exception, which may be of a class that cannot even say it."""
     try:
-        close()
-    except Exception:
-        traceback.print_exc()
+        return str(error)
+    except BaseException as other:  # in a ``__str__`` of somebody else's
+        return f"(its message cannot be had: {type(other).__name__})"
+
+
+def _quietly(agent: Agent) -> None:
+    """Close an agent; whatever comes of that, the episode is over."""
+    try:
+        close = getattr(agent, "close", None)
+        if close is not None:
+            close()
+    except BaseException:
+        with suppress(BaseException):
+            traceback.print_exc()

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
+_STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TICK_S = 0.1
 _HEARTBEAT_S = 1.0
 _INVALID_BEFORE_GIVING_UP = 10
@@ -155,6 +156,7 @@ class Hunt:
             time.monotonic() - progress.began,
             tuple(crashes),
             reason,
+            tuple(progress.notes),
         )
 
     def _hunt(
@@ -207,6 +209,9 @@ class Hunt:
                     break
                 if self._hopeless(progress, finished):
                     return "no_valid_trial"
+                for note in executor.notes():
+                    ledger.remark(note)
+                    progress.notes.append(note)
                 if time.monotonic() - heartbeat > _HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     ledger.note(heartbeat=time.time())
@@ -280,8 +285,10 @@ class Hunt:
 
         def confirmed(bundle: Bundle) -> Bundle:
             if bundle.confirmed is None and not self._interrupted:
-                bundle = confirm(bundle)
-                bundle.write()
+                found = confirm(bundle, lambda: self._interrupted)
+                if found is not None:
+                    bundle = found
+                    bundle.write()
             return bundle
 
         with ThreadPoolExecutor(self.settings.run.parallel) as threads:  # which only wait for their process
@@ -308,7 +315,7 @@ class Hunt:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """Turn Ctrl-C and SIGTERM into a request to stop; a second one ends the process at once."""
+        """Turn Ctrl-C, SIGTERM and a hang-up into a request to stop; a second one ends the process at once."""
 
         def stop(number: int, _frame: object) -> None:
             if self._interrupted:
@@ -317,7 +324,9 @@ class Hunt:
             self._interrupted = True
 
         try:
-            before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+            # Whoever ignores hang-ups, as nohup does, goes on ignoring them.
+            asked = [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
+            before = {number: signal.signal(number, stop) for number in asked}
         except ValueError:  # not in the main thread; whoever runs us there handles signals
             before = {}
         try:

@@ -133,6 +133,13 @@ class Ledger:
     def enter(self, state: str, detail: str = "", **facts: Any) -> None:
         """Set the state of the hunt, and write down when it got there and why."""
         self.note(state=state, detail=detail or None, **facts)
+        self._event(state, detail)
+
+    def remark(self, detail: str) -> None:
+        """Write down something that happened on the way; the state of the hunt stays what it is."""
+        self._event("remark", detail)
+
+    def _event(self, state: str, detail: str) -> None:
         event = (time.time(), state, detail)
         try:
             with self._lasting():

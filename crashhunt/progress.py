@@ -60,6 +60,7 @@ class HuntReport:
         wall_s: wall time of this run.
         crashes: what was found, the one with the fewest steps first.
         reason: in words, where not one trial was valid.
+        notes: what people should know about how it went, such as trials that were run again.
     """
 
     directory: Path
@@ -70,6 +71,7 @@ class HuntReport:
     wall_s: float
     crashes: tuple[Bundle, ...]
     reason: str = ""
+    notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``run --json`` prints."""
@@ -83,6 +85,7 @@ class HuntReport:
             "wall_s": round(self.wall_s, 3),
             "steps_total": self.steps_total,
             "crashes": [bundle.summary() for bundle in self.crashes],
+            "notes": list(self.notes),
         }
 
 
@@ -100,3 +103,4 @@ class Progress:
     last_invalid: TrialResult | None = None
     untold: dict[int, TrialResult] = field(default_factory=dict)  # that the sampler has not been told yet
     next_told: int = 0
+    notes: list[str] = field(default_factory=list)

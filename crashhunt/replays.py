@@ -22,7 +22,7 @@ from crashhunt.trial import Outcome
 from crashhunt.trust import refuse_side_effects
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
+
+_LOOK_EVERY_S = 0.5
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 Code = Literal["snapshot", "current", "log"]
@@ -169,11 +171,21 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
 
 
-def confirm(bundle: Bundle) -> Bundle:
-    """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash."""
+def confirm(bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle | None:
+    """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
+
+    Args:
+        bundle: the crash.
+        stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
+
+    Returns:
+        None where it was given up.
+    """
     try:
         rerun = prepare(bundle, ReplayOptions(force=True))
-        report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)))
+        report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped)
+    except _StoppedError:
+        return None
     except CrashhuntError as error:
         failure = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure)
@@ -275,13 +287,22 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     )
 
 
-def _run(rerun: Rerun) -> ReplayReport:
+class _StoppedError(Exception):
+    pass
+
+
+def _run(rerun: Rerun, stopped: Callable[[], bool] = lambda: False) -> ReplayReport:
     with tempfile.TemporaryDirectory(prefix="crashhunt-replay-") as folder:
         scratch = Path(folder)
         executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
         try:
             executor.submit(rerun.spec)
-            result = next(result for _ in iter(int, 1) for result in executor.completed(1.0))
+            found: list[TrialResult] = []
+            while not found:
+                found = list(executor.completed(_LOOK_EVERY_S))
+                if stopped():
+                    raise _StoppedError
+            result = found[0]
         finally:
             executor.close()
         message = result.failure.message if result.failure else "it left no recording"

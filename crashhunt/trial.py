@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.integrity import typed
+from crashhunt.text import encodable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -223,6 +224,11 @@ class Failure:
     agent: str = ""
     exit_code: int | None = None
     last_output: str = ""
+
+    def __post_init__(self) -> None:
+        # It goes into JSON, a log and onto terminals, and what an exception says may be no valid text.
+        for name in ("kind", "message", "traceback", "last_output"):
+            object.__setattr__(self, name, encodable(getattr(self, name)))
 
 
 @dataclass(frozen=True, slots=True)

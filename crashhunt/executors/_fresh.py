@@ -5,26 +5,25 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.errors import BundleError, CrashhuntError
 from crashhunt.executors._parts import require_origin, seal
-from crashhunt.executors._protocol import WorkerSettings, scratch_of
-from crashhunt.executors._remains import died, hung, where_it_is
+from crashhunt.executors._protocol import WorkerSettings, answer_file, scratch_of
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._worker import BLACK_BOX, Worker, worker_environment
+from crashhunt.keeper import Kept
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from crashhunt.trial import Escape
 
@@ -38,8 +37,8 @@ _ESCAPE_S = 60.0
 
 @dataclass(slots=True)
 class _Running:
-    spec: TrialSpec
-    process: subprocess.Popen[bytes]
+    attempt: Attempt
+    kept: Kept
     answer: Path
     began: float
     killed: bool = False
@@ -57,12 +56,12 @@ class FreshProcessExecutor:
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
         self._settings = settings
         self._parallel = parallel
-        self._waiting: deque[TrialSpec] = deque()
+        self._waiting: deque[Attempt] = deque()
         self._running: dict[int, _Running] = {}
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
-        self._waiting.append(spec)
+        self._waiting.append(Attempt(spec))
         self._start()
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
@@ -78,52 +77,53 @@ class FreshProcessExecutor:
 
     def cancel(self, *, above: int = -1) -> None:
         """Give up all trials whose number is greater than ``above``, at once."""
-        self._waiting = deque(spec for spec in self._waiting if spec.number <= above)
+        self._waiting = deque(attempt for attempt in self._waiting if attempt.spec.number <= above)
         for number in [number for number in self._running if number > above]:
-            _kill(self._running.pop(number).process)
+            self._running.pop(number).kept.end()
 
     def close(self) -> None:
-        """Kill every process."""
+        """Kill every process, and everything that it has started."""
         self.cancel()
 
     def _start(self) -> None:
         while self._waiting and len(self._running) < self._parallel:
-            spec = self._waiting.popleft()
-            answer = self._settings.scratch / f"answer-{spec.number:06d}.json"
+            attempt = self._waiting.popleft()
+            number = attempt.spec.number
+            answer = answer_file(self._settings.scratch, number)
             answer.unlink(missing_ok=True)
-            job = {"settings": self._settings.to_json(), "spec": spec.to_json(), "answer": str(answer)}
-            with (self._settings.scratch / f"start-{spec.number:06d}.log").open("wb") as log:
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "crashhunt.executors._fresh"],
-                    stdin=subprocess.PIPE,
+            job = self._settings.scratch / f"job-{number:06d}.json"
+            content = {"settings": self._settings.to_json(), "spec": attempt.spec.to_json(), "answer": str(answer)}
+            job.write_text(json.dumps(content), encoding="utf-8")
+            with (self._settings.scratch / f"start-{number:06d}.log").open("wb") as log:
+                kept = Kept(
+                    "crashhunt.executors._fresh",
+                    [str(job)],
+                    environment=fresh_environment(self._settings),
+                    stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=log,
-                    env=fresh_environment(self._settings),
-                    start_new_session=True,
                 )
-            assert process.stdin is not None
-            with suppress(BrokenPipeError):
-                process.stdin.write(json.dumps(job).encode())
-                process.stdin.close()
-            self._running[spec.number] = _Running(spec, process, answer, time.monotonic())
+            self._running[number] = _Running(attempt, kept, answer, time.monotonic())
 
     def _look(self, number: int) -> TrialResult | None:
         running = self._running[number]
-        exit_code, now = running.process.poll(), time.monotonic()
+        exit_code, now = running.kept.process.poll(), time.monotonic()
         if exit_code is not None:
             del self._running[number]
+            running.kept.end()
             return self._result(running, exit_code)
         header = where_it_is(self._settings.scratch, number)
         limit = self._settings.timeout_s + _LAST_WORDS_S
         if running.answer.exists():  # what is left to do is to find its escape, in trials that have limits of their own
             limit = _ESCAPE_S + 2 * limit
-        if now - header.started > limit if header else now - running.began > limit + _START_UP_S:
+        began, allowed = (header.started, limit) if header else (running.began, limit + _START_UP_S)
+        if now - max(began, running.began) > allowed:
             running.killed = True
-            _kill(running.process)
+            running.kept.end()
         return None
 
-    def _result(self, running: _Running, exit_code: int) -> TrialResult:
-        scratch, spec = self._settings.scratch, running.spec
+    def _result(self, running: _Running, exit_code: int) -> TrialResult | None:
+        scratch, spec = self._settings.scratch, running.attempt.spec
         if running.killed and not running.answer.exists():
             return hung(spec, scratch, self._settings.timeout_s)
         try:
@@ -137,6 +137,11 @@ class FreshProcessExecutor:
                     fix="read the whole message there",
                     where=str(log),
                 ) from None
+            if exit_code == DAMAGED:
+                return damaged(spec, scratch, "")
+            if running.attempt.again(scratch, exit_code):
+                self._waiting.appendleft(running.attempt)
+                return None
             return died(spec, scratch, exit_code)
         if "error" in answer:
             raise CrashhuntError(**answer["error"])
@@ -149,42 +154,41 @@ def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
     return {**os.environ, **worker_environment(), **({"PYTHONPATH": paths} if paths else {})}
 
 
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
 def main() -> None:
-    """Run the one trial that standard input describes."""
-    job = json.load(sys.stdin)
+    """Run the one trial that a file describes; what comes of it goes into another one."""
+    dumps, write, rename, leave = json.dumps, Path.write_text, os.replace, os._exit  # apart from what an agent damages
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    temporary = Path(f"{job['answer']}.part")
+
+    def answer(content: dict[str, Any]) -> None:
+        write(temporary, dumps(content), encoding="utf-8")
+        rename(temporary, job["answer"])
+
+    code = DAMAGED
     try:
-        settings = WorkerSettings.from_json(job["settings"])
-        require_origin("crashhunt", settings.code)
-        seal(settings)
-        worker = Worker(settings)
-        result = worker.run(TrialSpec.from_json(job["spec"]))
-    except CrashhuntError as error:
-        _answer(job["answer"], error.to_json())
-        return
-    _answer(job["answer"], {"result": result.to_json()})  # which counts, whatever becomes of what follows
-    escape = _escape(worker, settings, result) if settings.find_escapes else None
-    if escape is not None:
-        _answer(job["answer"], {"result": replace(result, escape=escape).to_json()})
-
-
-def _answer(path: str, answer: dict[str, Any]) -> None:
-    temporary = f"{path}.part"
-    with open(temporary, "w", encoding="utf-8") as file:
-        json.dump(answer, file)
-    os.replace(temporary, path)  # noqa: PTH105 - one rename
+        result = None
+        try:
+            settings = WorkerSettings.from_json(job["settings"])
+            require_origin("crashhunt", settings.code)
+            seal(settings)
+            worker = Worker(settings)
+            result = worker.run(TrialSpec.from_json(job["spec"]))
+            answer({"result": result.to_json()})  # which counts, whatever becomes of what follows
+        except CrashhuntError as error:
+            answer(error.to_json())
+        escape = _escape(worker, settings, result) if result is not None and settings.find_escapes else None
+        if result is not None and escape is not None:
+            answer({"result": replace(result, escape=escape).to_json()})
+        code = 0
+    finally:
+        leave(code)
 
 
 def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Escape | None:
     """Until when braking would have avoided a crash, by trials in this process, whose simulator is warm."""
     from crashhunt.escape import find_escape
 
-    if result.collision is None:
+    if result.collision is None or worker.change:  # which the further trials would depend on
         return None
     braking = worker.full_braking(result.collision.agent)
     if braking is None:
@@ -203,7 +207,3 @@ def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Es
         return find_escape(result, recording(result.spec.number), braking, run)
     except BundleError:
         return None
-
-
-if __name__ == "__main__":
-    main()

@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.episode import seed_everything
 from crashhunt.errors import CrashhuntError, InvalidEpisodeError
-from crashhunt.plugins import locate, signature_of
+from crashhunt.plugins import import_module, locate, signature_of
 from crashhunt.sandbox import confine
 
 if TYPE_CHECKING:
@@ -31,11 +32,29 @@ class Parts:
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
-        self._factories: dict[str, Any] = {}
+        self._factories: dict[str, tuple[Any, tuple[str, ...]]] = {}
         if settings.code:
             # What the snapshot does not have may come from where the hunt was started, as it did then.
             sys.path[:0] = [*settings.code, str(Path.cwd())]
         self.oracles: list[Oracle] = [locate("oracles", name)() for name in settings.oracles]
+
+    def load(self) -> None:
+        """Import everything that trials need, always in the same order.
+
+        What modules do when they are imported, such as setting constants of a simulator's classes, is done before the
+        first episode: so it holds in every one of them, whichever comes first.
+
+        Raises:
+            CrashhuntError: something cannot be imported.
+        """
+        # Whatever modules draw when they are imported is the same in every process.
+        seed_everything(0)
+        scenario = self._settings.scenario
+        locate("simulators", scenario.simulator)
+        for module in scenario.modules():
+            import_module(module)
+        for agent in scenario.agents:
+            self._factory(agent)
 
     def simulator(self) -> Simulator:
         """Make a simulator, with a folder for files of its own."""
@@ -51,13 +70,7 @@ class Parts:
         Raises:
             CrashhuntError: its module comes from elsewhere than the snapshot that has it.
         """
-        found = self._factories.get(agent)
-        if found is None:
-            factory = locate("agents", self._settings.scenario.agents[agent].agent)
-            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
-                require_origin(factory.__module__, self._settings.code)
-            found = self._factories[agent] = factory, signature_of(factory).given
-        factory, wanted = found
+        factory, wanted = self._factory(agent)
         given: dict[str, Any] = {}
         if "observation_space" in wanted:
             shown = getattr(simulator, "shown_spaces", {})
@@ -72,6 +85,15 @@ class Parts:
         }
         made: Agent = factory(**{**given, **values})
         return made
+
+    def _factory(self, agent: str) -> tuple[Any, tuple[str, ...]]:
+        found = self._factories.get(agent)
+        if found is None:
+            factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
+                require_origin(factory.__module__, self._settings.code)
+            found = self._factories[agent] = factory, signature_of(factory).given
+        return found
 
 
 class Braking:

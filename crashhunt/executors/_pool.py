@@ -2,58 +2,58 @@
 
 from __future__ import annotations
 
-import os
+import json
 import queue
+import selectors
 import signal
-import sys
+import socket
 import threading
 import time
-from concurrent.futures import CancelledError
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from functools import partial
-from multiprocessing.context import ForkServerContext, ForkServerProcess
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from pebble import ProcessExpired, ProcessPool
-
-from crashhunt.executors._remains import died, hung, where_it_is
-from crashhunt.executors._worker import run_trial, start_worker, worker_environment
-from crashhunt.plugins import registered
+from crashhunt.errors import CrashhuntError
+from crashhunt.executors._protocol import answer_file
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._template_link import TemplateLink
+from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from multiprocessing.synchronize import RLock
-
-    from pebble import ProcessFuture
 
     from crashhunt.executors._protocol import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
-    from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial import TrialSpec
 
 __all__ = ["PoolExecutor"]
 
-_main_lock = threading.Lock()
 _LOOK_EVERY_S = 0.1
-_GRACE_S = 1.0  # for the pool to notice by itself that a worker is gone, with its exit code
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
-_START_UP_S = 60.0  # for a new worker to import what it needs, before a trial counts as begun
+_START_UP_S = 60.0  # for a new worker to get ready, before a trial counts as begun
+_RECEIVED = 1 << 16
 
 
-@dataclass(slots=True)
-class _Running:
-    spec: TrialSpec
-    future: ProcessFuture[TrialResult]
-    gone_at: float | None = None  # when its process was first found dead
+@dataclass(slots=True, eq=False)
+class _Worker:
+    """A process, and what it is doing."""
+
+    slot: int
+    socket: socket.socket
+    attempt: Attempt | None = None
+    given_at: float = 0.0
+    trials: int = 0
+    received: bytearray = field(default_factory=bytearray)
+    retired: bool = False  # it is not given any more trials
     killed: bool = False  # at its time limit, by us
 
 
 class PoolExecutor:
-    """Runs trials on warm workers, each a process of its own.
+    """Runs trials on warm workers, each a process of its own; they are forked from a template.
 
-    pebble sees to it that a worker that dies costs its own trial only. What pebble does not see is seen here: a worker
-    that leaves with exit code 0, and one that hangs.
+    A thread hands trials out as soon as a worker is free, whatever the one that calls is busy with. A worker is
+    replaced where a trial has left anything in it that the next would find.
 
     Args:
         settings: of the hunt.
@@ -65,199 +65,275 @@ class PoolExecutor:
         self._settings = settings
         self._parallel = parallel
         self._recycle_after = recycle_after
-        self._running: dict[int, _Running] = {}
-        self._done: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._lock = threading.RLock()
+        self._waiting: deque[Attempt] = deque()
+        self._workers: dict[int, _Worker] = {}
+        self._slots = 0
         self._looked = 0.0
-        self._pool: ProcessPool | None = None
+        self._done: queue.SimpleQueue[TrialResult | Exception] = queue.SimpleQueue()
+        self._notes: dict[str, None] = {}  # each is told once
+        self._told = 0
+        self._selector = selectors.DefaultSelector()
+        self._link: TemplateLink | None = None
+        self._wake_up, self._woken = socket.socketpair()
+        self._selector.register(self._woken, selectors.EVENT_READ)
+        self._thread: threading.Thread | None = None
+        self._closing = False
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
-        pool = self._open()
-        future = pool.schedule(run_trial, args=(spec,), timeout=self._settings.timeout_s + _START_UP_S)
-        self._running[spec.number] = _Running(spec, future)
-        future.add_done_callback(partial(self._finished, spec.number))
+        with self._lock:
+            self._waiting.append(Attempt(spec))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._serve, name="crashhunt-pool", daemon=True)
+                self._thread.start()
+        self._wake_up.send(b".")
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
         """Yield the trials that have ended, waiting so long for a first one.
 
         Raises:
-            CrashhuntError: a trial could not even begin, for a reason that has nothing to do with it.
+            CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
         """
-        deadline = time.monotonic() + timeout_s
-        found = False
-        while not found:
-            wait = min(deadline - time.monotonic(), _LOOK_EVERY_S)
-            with suppress(queue.Empty):
-                number = self._done.get(timeout=wait) if wait > 0 else self._done.get_nowait()
-                while True:
-                    result = self._collect(number)
-                    if result is not None:
-                        found = True
-                        yield result
-                    number = self._done.get_nowait()
-            if time.monotonic() - self._looked > _LOOK_EVERY_S:
-                self._looked = time.monotonic()
-                for result in self._look_after():
-                    found = True
-                    yield result
-            if time.monotonic() >= deadline:
-                return
+        with suppress(queue.Empty):
+            found = self._done.get(timeout=timeout_s) if timeout_s > 0 else self._done.get_nowait()
+            while True:
+                if isinstance(found, Exception):
+                    raise found
+                yield found
+                found = self._done.get_nowait()
 
     def cancel(self, *, above: int = -1) -> None:
         """Give up all trials whose number is greater than ``above``, at once."""
-        given_up = [number for number in self._running if number > above]
-        for number in given_up:
-            running = self._running.pop(number)
-            running.future.cancel()
-            header = where_it_is(self._settings.scratch, number)
-            if header is not None and not running.future.done():
-                _kill(header.pid)
+        with self._lock:
+            self._waiting = deque(attempt for attempt in self._waiting if attempt.spec.number <= above)
+            for worker in self._workers.values():
+                if worker.attempt is not None and worker.attempt.spec.number > above:
+                    worker.attempt = None
+                    self._retire(worker)
+                    if self._link is not None:
+                        self._link.kill(worker.slot)
+            kept = []
+            with suppress(queue.Empty):
+                while True:
+                    found = self._done.get_nowait()
+                    if isinstance(found, Exception) or found.spec.number <= above:
+                        kept.append(found)
+            for found in kept:
+                self._done.put(found)
 
     def where(self) -> dict[int, BlackBoxHeader]:
         """Return where each running trial is, for people who watch."""
-        found = {number: where_it_is(self._settings.scratch, number) for number in self._running}
+        with self._lock:
+            running = [worker.attempt.spec.number for worker in self._workers.values() if worker.attempt is not None]
+        found = {number: where_it_is(self._settings.scratch, number) for number in running}
         return {number: header for number, header in found.items() if header is not None}
 
+    def notes(self) -> list[str]:
+        """Return what people should be told that has not been returned before."""
+        fresh = list(self._notes)[self._told :]
+        self._told += len(fresh)
+        return fresh
+
     def close(self) -> None:
-        """Kill every worker."""
-        self.cancel()
-        if self._pool is not None:
-            # A worker is told to end by SIGTERM, which it does not catch: it ends even where it does not return.
-            self._pool.stop()
-            self._pool.join()
-            self._pool = None
+        """Kill every worker, and everything that it has started."""
+        with self._lock:
+            self._closing = True
+            self.cancel()
+        if self._link is not None:
+            self._link.end()
+        if self._thread is not None:
+            with suppress(OSError):
+                self._wake_up.send(b".")
+            self._thread.join()
+            self._thread = None
+        for worker in self._workers.values():
+            worker.socket.close()
+        self._workers.clear()
+        self._selector.close()
+        self._wake_up.close()
+        self._woken.close()
 
-    def _finished(self, number: int, _future: object) -> None:
-        self._done.put(number)
-
-    def _open(self) -> ProcessPool:
-        if self._pool is None or not self._pool.active:
-            # The fork server has the simulator loaded, so that a new worker is there in milliseconds, not in seconds.
-            context = _Context()
-            preload = [start_worker.__module__]
-            simulator = registered("simulators").get(self._settings.scenario.simulator)
-            if simulator is not None:
-                preload.append(simulator.module)
-            context.set_forkserver_preload(preload)
-            with _environment(worker_environment()):
-                self._pool = ProcessPool(
-                    max_workers=self._parallel,
-                    max_tasks=self._recycle_after,
-                    initializer=start_worker,
-                    initargs=(self._settings,),
-                    context=context,
-                )
-                assert self._pool.active  # starts it
-        return self._pool
-
-    def _collect(self, number: int) -> TrialResult | None:
-        running = self._running.pop(number, None)
-        if running is None:
-            return None  # cancelled, or already accounted for
-        spec, scratch = running.spec, self._settings.scratch
+    def _serve(self) -> None:
         try:
-            return running.future.result()
-        except TimeoutError:
-            return hung(spec, scratch, self._settings.timeout_s)
-        except ProcessExpired as expired:
-            if running.killed:
-                return hung(spec, scratch, self._settings.timeout_s)
-            return died(spec, scratch, int(expired.exitcode))
-        except CancelledError:
-            return None
-        except RuntimeError:  # pebble gave up on the whole pool, because a worker died between two trials
-            self._resubmit(running)
-            return None
+            while not self._closing:
+                ready = self._selector.select(_LOOK_EVERY_S)
+                with self._lock:
+                    if self._closing:
+                        return
+                    for key, _ in ready:
+                        if key.fileobj is self._woken:
+                            self._woken.recv(_RECEIVED)
+                        elif isinstance(key.data, _Worker):
+                            if key.data.slot in self._workers:  # which its end, heard of just now, has changed
+                                self._hear(key.data)
+                        else:
+                            self._hear_template()
+                    self._look_after()
+                    self._hand_out()
+        except Exception as error:
+            self._done.put(error)
 
-    def _resubmit(self, first: _Running) -> None:
-        """Start a new pool for everything that the broken one had not finished."""
-        waiting = [first, *self._running.values()]
-        self._running.clear()
-        if self._pool is not None:
-            self._pool.stop()
-            self._pool.join()
-            self._pool = None
-        for running in sorted(waiting, key=lambda item: item.spec.number):
-            self.submit(running.spec)
+    def _hand_out(self) -> None:
+        """Give trials to workers that have none, in the order of the queue."""
+        while self._waiting:
+            running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
+            if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
+                return
+            if self._link is None:
+                self._link = TemplateLink(self._settings)
+                self._selector.register(self._link.control, selectors.EVENT_READ)
+            free = next((worker for worker in self._workers.values() if not (worker.attempt or worker.retired)), None)
+            if free is None:
+                if (
+                    not self._link.ready
+                    or sum(not worker.retired for worker in self._workers.values()) >= self._parallel
+                ):
+                    return
+                free = self._hire(self._link)
+            self._give(free, self._waiting.popleft())
 
-    def _look_after(self) -> Iterator[TrialResult]:
-        """Deal with workers that hang, and with those that left without a word."""
-        now = time.monotonic()
-        for number, running in list(self._running.items()):
-            if running.future.done():
-                continue
-            header = where_it_is(self._settings.scratch, number)
-            if header is None:
-                continue
-            if not _is_alive(header.pid):
-                running.gone_at = running.gone_at or now
-                if now - running.gone_at > _GRACE_S:
-                    del self._running[number]
-                    running.future.cancel()
-                    if running.killed:
-                        yield hung(running.spec, self._settings.scratch, self._settings.timeout_s)
-                    else:
-                        yield died(running.spec, self._settings.scratch, 0)
-            elif now - header.started > self._settings.timeout_s + _LAST_WORDS_S and not running.killed:
-                running.killed = True
-                _kill(header.pid)
+    def _hire(self, link: TemplateLink) -> _Worker:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._slots += 1
+            link.fork(self._slots, theirs)
+        worker = self._workers[self._slots] = _Worker(self._slots, ours)
+        ours.setblocking(False)
+        self._selector.register(ours, selectors.EVENT_READ, worker)
+        return worker
 
+    def _give(self, worker: _Worker, attempt: Attempt) -> None:
+        worker.attempt, worker.given_at, worker.killed = attempt, time.monotonic(), False
+        worker.trials += 1
+        text = json.dumps(attempt.spec.to_json()).encode() + b"\n"
+        worker.socket.setblocking(True)
+        with suppress(OSError):  # it has ended, which the template will tell
+            worker.socket.sendall(text)
+        worker.socket.setblocking(False)
 
-class _Process(ForkServerProcess):
-    """Does not run the script that started the hunt again in every worker: nothing in there is needed."""
+    def _hear(self, worker: _Worker) -> None:
+        """Take what a worker says, as far as it has come."""
+        over = False
+        try:
+            data = worker.socket.recv(_RECEIVED)
+            over = not data
+            worker.received += data
+        except BlockingIOError:
+            return
+        except OSError:
+            over = True
+        if over:
+            with suppress(KeyError, ValueError):
+                self._selector.unregister(worker.socket)
+        while b"\n" in worker.received:
+            line, _, rest = bytes(worker.received).partition(b"\n")
+            worker.received = bytearray(rest)
+            self._take(worker, line)
 
-    @staticmethod
-    def _Popen(process_obj: Any) -> Any:  # noqa: N802 - the name is multiprocessing's
-        with _main_lock:
-            script = sys.modules["__main__"]
-            sys.modules["__main__"] = ModuleType("__main__")
-            try:
-                return ForkServerProcess._Popen(process_obj)
-            finally:
-                sys.modules["__main__"] = script
-
-
-class _Context(ForkServerContext):
-    """Keeps locks until the pool is gone: pebble drops its own before it has stopped the workers that are starting."""
-
-    Process = _Process
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._locks: list[RLock] = []
-
-    def RLock(self) -> RLock:  # noqa: N802 - the name is multiprocessing's
-        """Make a lock."""
-        lock = super().RLock()
-        self._locks.append(lock)
-        return lock
-
-
-def _kill(pid: int) -> None:
-    with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Have the processes that start meanwhile see other environment variables."""
-    before: dict[str, Any] = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
+    def _take(self, worker: _Worker, line: bytes) -> None:
+        """Account for what a worker says about its trial."""
+        attempt = worker.attempt
+        if attempt is None:
+            return  # it was given up meanwhile
+        try:
+            answer = json.loads(line)
+            if "error" in answer:
+                raise CrashhuntError(**answer["error"])
+            change = answer.get("change", True)
+            if "result" in answer:
+                result = TrialResult.from_json(answer["result"])
+                if result.spec.number != attempt.spec.number:
+                    return
             else:
-                os.environ[name] = value
+                result = damaged(attempt.spec, self._settings.scratch, f" ({answer['damaged']})")
+        except (ValueError, KeyError, TypeError):
+            return  # somebody else wrote that; the worker's own answer or its end is still to come
+        worker.attempt = None
+        self._done.put(result)
+        if self._link is not None:
+            self._link.deaths = 0
+        if change and isinstance(change, str):
+            self._notes[f"trials change {change}, so that each has a worker of its own: none depends on another"] = None
+        if change or (self._recycle_after and worker.trials >= self._recycle_after):
+            self._retire(worker)
+
+    def _retire(self, worker: _Worker) -> None:
+        """Give a worker no more trials; when it has none, it ends."""
+        worker.retired = True
+        with suppress(OSError):
+            worker.socket.shutdown(socket.SHUT_WR)
+
+    def _hear_template(self) -> None:
+        """Take what the template says about the ends of workers, and its own."""
+        assert self._link is not None
+        messages = self._link.receive()
+        for message in messages or ():
+            self._ended(message["slot"], message["exit_code"])
+        if messages is None:
+            self._restart()
+
+    def _restart(self) -> None:
+        """Start another template, and run everything again that was running when it, and every worker, ended."""
+        assert self._link is not None
+        for worker in list(self._workers.values()):
+            self._discard(worker)
+            if worker.attempt is not None:  # one of them may have done it, as shows when each runs alone
+                self._end_attempt(worker.attempt, -signal.SIGKILL)
+        self._waiting = deque(sorted(self._waiting, key=lambda attempt: attempt.spec.number))
+        self._selector.unregister(self._link.control)
+        if not self._link.unfit:
+            self._notes["the process that starts the workers was killed from outside, and was started again"] = None
+        self._link = self._link.anew()
+        self._selector.register(self._link.control, selectors.EVENT_READ)
+
+    def _ended(self, slot: int, exit_code: int) -> None:
+        worker = self._workers.get(slot)
+        if worker is None:
+            return
+        self._hear(worker)  # what it said before it ended
+        self._discard(worker)
+        attempt, scratch = worker.attempt, self._settings.scratch
+        if attempt is not None and exit_code == DAMAGED:
+            with suppress(OSError):
+                self._take(worker, answer_file(scratch, attempt.spec.number).read_bytes())
+            attempt = worker.attempt
+        if attempt is None:
+            return
+        if worker.killed:
+            self._done.put(hung(attempt.spec, scratch, self._settings.timeout_s))
+        elif exit_code == DAMAGED:
+            self._done.put(damaged(attempt.spec, scratch, ""))
+        else:
+            self._end_attempt(attempt, exit_code)
+
+    def _end_attempt(self, attempt: Attempt, exit_code: int) -> None:
+        """Account for a trial whose process is gone, or run it again."""
+        scratch = self._settings.scratch
+        if why := attempt.again(scratch, exit_code):
+            self._notes[why] = None
+            self._waiting.appendleft(attempt)
+        else:
+            self._done.put(died(attempt.spec, scratch, exit_code))
+
+    def _discard(self, worker: _Worker) -> None:
+        with suppress(KeyError, ValueError):
+            self._selector.unregister(worker.socket)
+        worker.socket.close()
+        self._workers.pop(worker.slot, None)
+
+    def _look_after(self) -> None:
+        """Kill workers that hang."""
+        now = time.monotonic()
+        if now - self._looked < _LOOK_EVERY_S:
+            return
+        self._looked = now
+        for worker in self._workers.values():
+            if worker.attempt is None or worker.killed or self._link is None:
+                continue
+            header = where_it_is(self._settings.scratch, worker.attempt.spec.number)
+            limit = self._settings.timeout_s + _LAST_WORDS_S
+            began, allowed = (header.started, limit) if header else (worker.given_at, limit + _START_UP_S)
+            if now - max(began, worker.given_at) > allowed:
+                worker.killed = True
+                self._link.kill(worker.slot)

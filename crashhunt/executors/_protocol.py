@@ -6,6 +6,8 @@ from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 from crashhunt import __version__
 from crashhunt.errors import CrashhuntError
 from crashhunt.trial import Outcome
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Executor", "WorkerSettings", "scratch_of"]
 
+_AUDIT = 1  # apart from what draws the trial itself
 _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
 
 
@@ -38,6 +41,8 @@ class WorkerSettings:
             where alone it may write; None where it may do everything.
         find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
             few times more; only in a fresh process.
+        audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
+        hunt_seed: what decides which.
     """
 
     scenario: Scenario
@@ -50,6 +55,15 @@ class WorkerSettings:
     keep_trials: bool = False
     sealed: tuple[str, ...] | None = None
     find_escapes: bool = False
+    audit: float = 0.0
+    hunt_seed: int = 0
+
+    def is_audited(self, result: TrialResult) -> bool:
+        """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
+        if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
+            return False
+        draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
+        return bool(draw < self.audit * 2**32)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers."""
@@ -93,6 +107,8 @@ class WorkerSettings:
             keep_trials=data["keep_trials"],
             sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
             find_escapes=data.get("find_escapes", False),
+            audit=data.get("audit", 0.0),
+            hunt_seed=data.get("hunt_seed", 0),
         )
 
 
@@ -114,7 +130,9 @@ class Executor(Protocol):
     """Runs trials somewhere else.
 
     Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
-    that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted.
+    that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
+    whose process was killed from outside is run again, alone. `notes` says such things, to be told to people; an
+    executor may go without.
     """
 
     def submit(self, spec: TrialSpec) -> None:
@@ -133,3 +151,8 @@ class Executor(Protocol):
 def scratch_of(scratch: Path, number: int) -> Path:
     """Return the folder that a running trial writes to, and that stays if it is kept."""
     return scratch / f"trial-{number:06d}"
+
+
+def answer_file(scratch: Path, number: int) -> Path:
+    """Return the file for what came of a trial, where its process has no other way to say so."""
+    return scratch / f"answer-{number:06d}.json"

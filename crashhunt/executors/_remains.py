@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.errors import BundleError
@@ -18,7 +19,46 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["died", "hung", "where_it_is"]
+__all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "signal_name", "where_it_is"]
+
+DAMAGED = 79
+"""The exit code of a worker that has run its trial to the end, and could not say what came of it."""
+_FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
+_ATTEMPTS = 3
+
+
+@dataclass(slots=True)
+class Attempt:
+    """A trial that is to be run, and what has become of it so far.
+
+    A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
+    kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same place
+    it was the trial itself.
+
+    Args:
+        spec: the trial.
+        ends: of its processes: which signal, at which step.
+    """
+
+    spec: TrialSpec
+    ends: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no other trial may run meanwhile."""
+        return bool(self.ends)
+
+    def again(self, scratch: Path, exit_code: int) -> str:
+        """Why it is to be run once more, in words; empty where what has happened is its outcome."""
+        if -exit_code not in _FROM_OUTSIDE:
+            return ""
+        header = where_it_is(scratch, self.spec.number)
+        end = exit_code, header.step if header is not None else -1
+        seen = end in self.ends
+        self.ends.append(end)
+        if seen or len(self.ends) >= _ATTEMPTS:
+            return ""
+        return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
 
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
@@ -34,10 +74,17 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int) -> TrialResult:
     """
     header = where_it_is(scratch, spec.number)
     message = (
-        f"the process died of {_signal_name(exit_code)}" if exit_code < 0 else f"the process exited with {exit_code}"
+        f"the process died of {signal_name(exit_code)}" if exit_code < 0 else f"the process exited with {exit_code}"
     )
     kind = "signal" if exit_code < 0 else "exit code"
     return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code)
+
+
+def damaged(spec: TrialSpec, scratch: Path, what: str) -> TrialResult:
+    """Return the result of a trial after which its process could not report any more."""
+    header = where_it_is(scratch, spec.number)
+    message = f"the process could not report what came of it, as something in it is damaged{what}"
+    return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None)
 
 
 def hung(spec: TrialSpec, scratch: Path, timeout_s: float) -> TrialResult:
@@ -71,7 +118,9 @@ def _result(
     else:
         steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
         closest = closest_approach(scenes, recording.agents)
-        if header is not None and phase == Phase.ACT:
+        if outcome is Outcome.AGENT_ERROR:
+            agent = recording.agents[0] if len(recording.agents) == 1 else ""
+        elif header is not None and phase == Phase.ACT:
             agent = recording.agents[header.agent]
             message = f"{message} in {agent}'s act() of step {steps + 1}"
         else:
@@ -92,7 +141,8 @@ def _result(
     )
 
 
-def _signal_name(exit_code: int) -> str:
+def signal_name(exit_code: int) -> str:
+    """Return what people call the signal that a process died of."""
     try:
         return signal.Signals(-exit_code).name
     except ValueError:

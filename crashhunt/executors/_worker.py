@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import gc
 import io
@@ -13,21 +12,24 @@ import shutil
 import signal
 import sys
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.episode import run_episode
+from crashhunt.errors import RecorderError
+from crashhunt.executors._baseline import Baseline
 from crashhunt.executors._parts import Braking, Parts
 from crashhunt.executors._protocol import WorkerSettings, scratch_of
-from crashhunt.recording import BlackBox
+from crashhunt.processes import adopt_orphans, end_descendants
+from crashhunt.recording import DISK, BlackBox
 from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from crashhunt.agents import Agent
     from crashhunt.simulators import FullBraking, Simulator
@@ -39,13 +41,13 @@ __all__ = [
     "OUTPUT",
     "STACK",
     "Worker",
+    "loaded",
     "read_map",
     "read_tail",
     "worker_environment",
 ]
 
 BLACK_BOX, OUTPUT, STACK, MAP = "blackbox.bin", "run.log", "stack.txt", "map.json"
-_PR_SET_PDEATHSIG = 1
 _TAIL = 4000  # bytes
 
 
@@ -70,9 +72,18 @@ class Worker:
 
     Args:
         settings: of the hunt.
+        parts: what has been imported already.
+
+    Attributes:
+        change: what the last trial has changed in this process, in words. Where there is something, the next trial
+            belongs into another process.
+        used: whether an agent has run here.
     """
 
-    def __init__(self, settings: WorkerSettings) -> None:
+    def __init__(self, settings: WorkerSettings, parts: Parts | None = None) -> None:
+        self.change = ""
+        self.used = False
+        self._pid = os.getpid()
         self._settings = settings
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
@@ -80,7 +91,7 @@ class Worker:
         self._lanes: Sequence[Lane] | None = None  # of the map that all workers share
         self._fresh = 0
         self._home = Path.cwd()
-        _die_with_parent()
+        adopt_orphans()
         # Ctrl-C reaches the whole terminal; the hunt decides what becomes of its workers. A request to end must work
         # even while the simulator does not return to Python.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -88,15 +99,17 @@ class Worker:
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
+        os.register_at_fork(after_in_child=self._stand_aside)
         logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
-        self._parts = Parts(settings)
+        self._parts = parts if parts is not None else loaded(settings)
+        self._baseline: Baseline | None = None
         gc.freeze()  # what is loaded by now is never garbage
 
     def run(self, spec: TrialSpec) -> TrialResult:
-        """Run a trial. Its scratch folder stays where the result says ``kept``.
+        """Run a trial, and end every process that it has started. Its scratch folder stays where it is ``kept``.
 
         Raises:
-            OSError: the disk is full.
+            CrashhuntError: the disk is full, or the simulator cannot be made at all.
         """
         os.chdir(self._home)  # from wherever the last agent has gone
         box, folder = self._prepare(spec)
@@ -104,30 +117,62 @@ class Worker:
         simulator = self._simulator
         if simulator is None:
             simulator = self._simulator = self._parts.simulator()
+        if self._baseline is None:
+            _tidy(simulator)
+            self._baseline = Baseline(self._settings.code, self._settings.scratch)
+        self._baseline.begin()
+        self.used = True
         made = time.monotonic()
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
         faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
-        result = run_episode(
-            spec,
-            simulator=simulator,
-            make_agent=self._parts.agent if spec.overruled is None else partial(self._overruled, spec.overruled),
-            box=box,
-            oracles=self._parts.oracles,
-            crash_on=self._settings.crash_on,
-        )
-        faulthandler.cancel_dump_traceback_later()
-        kept = self._settings.keep_trials or result.outcome in self._settings.crash_on or result.failure is not None
+        try:
+            result = run_episode(
+                spec,
+                simulator=simulator,
+                make_agent=self._parts.agent if spec.overruled is None else partial(self._overruled, spec.overruled),
+                box=box,
+                oracles=self._parts.oracles,
+                crash_on=self._settings.crash_on,
+            )
+        finally:
+            if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
+                os._exit(0)
+        with _undisturbed(self):
+            faulthandler.cancel_dump_traceback_later()
+            self.change = self._changed(simulator)
+            result = self._kept(result, simulator, folder)
+        wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
+        return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)
+
+    def _stand_aside(self) -> None:
+        """Keep the copy of this process that an agent forks from writing into the recording."""
+        if self._box is not None:
+            self._box.detach()
+
+    def _kept(self, result: TrialResult, simulator: Simulator, folder: Path) -> TrialResult:
+        """Keep what a trial has left behind, where somebody wants it."""
+        settings = self._settings
+        kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
+        kept = kept or settings.is_audited(result)
         if result.outcome is not Outcome.INVALID:
             self._draw_map(simulator, folder if kept else None)
         failure = result.failure and replace(result.failure, last_output=read_tail(folder / OUTPUT))
-        wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
-        result = replace(result, worker=os.getpid(), kept=kept, wall_s=wall_s, setup_s=setup_s, failure=failure)
         if kept:
             # The next trial gets a folder of its own; this one now belongs to the hunt.
             self._folder = None
             if result.failure is not None and result.failure.traceback:
                 (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
-        return result
+        return replace(result, kept=kept, failure=failure)
+
+    def _changed(self, simulator: Simulator) -> str:
+        """End what the trial has started; return what else is not as before it."""
+        assert self._baseline is not None
+        if end_descendants(self._baseline.children):
+            return "which processes run"
+        if not os.path.samestat(os.fstat(1), self._output) or not os.path.samestat(os.fstat(2), self._output):
+            return "standard output"
+        _tidy(simulator)
+        return self._baseline.change()
 
     def full_braking(self, agent: str) -> FullBraking | None:
         """Return how a vehicle of the last trial brakes as hard as it can, where its simulator says."""
@@ -174,6 +219,7 @@ class Worker:
             os.dup2(output, 1)
             os.dup2(output, 2)
             os.close(output)
+            self._output = os.fstat(1)
             self._stack = (made / STACK).open("w")
             faulthandler.enable(self._stack)
             faulthandler.register(signal.SIGUSR1, self._stack)
@@ -207,23 +253,34 @@ def read_tail(path: Path) -> str:
         return ""
 
 
-def _die_with_parent() -> None:
-    """Have the kernel end this process when its parent is gone, whatever it is doing; where that can be had."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def loaded(settings: WorkerSettings) -> Parts:
+    """Import everything that trials need.
+
+    Raises:
+        CrashhuntError: something cannot be imported.
+    """
+    parts = Parts(settings)
+    parts.load()
+    return parts
 
 
-# A pool's task is a function, and what the process keeps warm has to live somewhere between two of them.
-_worker: Worker | None = None
+def _tidy(simulator: Simulator) -> None:
+    """Have a simulator undo what its episodes change beyond itself, where it can."""
+    tidy = getattr(simulator, "tidy", None)
+    if tidy is not None:
+        tidy()
 
 
-def start_worker(settings: WorkerSettings) -> None:
-    """Make this process a worker; a pool's initializer."""
-    global _worker
-    _worker = Worker(settings)
-
-
-def run_trial(spec: TrialSpec) -> TrialResult:
-    """Run a trial in the worker that this process is; a pool's task."""
-    assert _worker is not None
-    return _worker.run(spec)
+@contextmanager
+def _undisturbed(worker: Worker) -> Iterator[None]:
+    """Finish a trial in whatever state it has left the process in; a result is not lost for what comes after it."""
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno in DISK:
+            raise RecorderError(
+                f"the trial cannot be kept: {error.strerror}",
+                fix="free some space and run the same command again",
+                where=str(error.filename or ""),
+            ) from error
+        worker.change = f"what Python itself needs ({type(error).__name__})"

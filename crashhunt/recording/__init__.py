@@ -5,7 +5,16 @@ Writing and reading logs needs MCAP and protobuf, which a worker never does: the
 
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.recording._blackbox import BlackBox, BlackBoxHeader, Phase, Record, Tag, read_black_box, read_header
+from crashhunt.recording._blackbox import (
+    DISK,
+    BlackBox,
+    BlackBoxHeader,
+    Phase,
+    Record,
+    Tag,
+    read_black_box,
+    read_header,
+)
 from crashhunt.recording._compare import Divergence, first_divergence, values_around
 from crashhunt.recording._recording import (
     AgentChannel,
@@ -22,6 +31,7 @@ if TYPE_CHECKING:
     from crashhunt.recording._views import foxglove_layout, read_lanes
 
 __all__ = [
+    "DISK",
     "AgentChannel",
     "BlackBox",
     "BlackBoxHeader",

@@ -8,6 +8,7 @@ length) and its payload, padded to 8 bytes. Everything is little-endian. Only wh
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import struct
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     from crashhunt.scene import Roster, Scene
 
-__all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
+__all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
 
 _MAGIC = b"CRASHBB1"
 _HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
@@ -40,6 +41,8 @@ _FIRST = 64
 _HEAD = struct.Struct("<BxHI")
 _CHUNK = 1 << 20
 _MAPPED = 64 << 20
+DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
+"""What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
 
 
 class Tag(IntEnum):
@@ -215,6 +218,11 @@ class BlackBox:
         """The bytes of all records so far."""
         return memoryview(self._map)[_FIRST : self._offset]
 
+    def detach(self) -> None:
+        """Write to nowhere from now on: this process is a copy of the one that records."""
+        self._map = mmap.mmap(-1, self._mapped)
+        self._file = os.open(os.devnull, os.O_RDWR)
+
     def close(self) -> None:
         """Unmap and close the file."""
         self._map.close()
@@ -237,6 +245,8 @@ class BlackBox:
                 os.ftruncate(self._file, self._mapped)
                 self._map = mmap.mmap(self._file, self._mapped)
         except OSError as error:
+            if error.errno not in DISK:  # such as a file that the agent has closed
+                raise
             raise RecorderError(
                 f"the trial cannot be recorded: {error.strerror}",
                 fix="free some space and run the same command again",

@@ -32,6 +32,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"Not one trial was valid: {report.reason}")
+    lines += [f"Note: {note}" for note in report.notes]
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because == "all_trials":

@@ -14,6 +14,7 @@ from crashhunt.scenario import argument_values
 from crashhunt.scene import Contact, Roster, Scene
 from crashhunt.simulators._options import as_tables, merge
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
+from crashhunt.text import encodable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -154,5 +155,5 @@ class _Rule:
         if self._function is not None:
             found = self._function(observation, reward, terminated, truncated, info)
             if found:
-                return found if isinstance(found, str) else self._rule.function
+                return encodable(found) if isinstance(found, str) else self._rule.function
         return "terminated" if rule.termination and terminated else ""

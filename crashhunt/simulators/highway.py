@@ -167,6 +167,10 @@ class HighwaySimulator:
             return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
         return None
 
+    def tidy(self) -> None:
+        """Undo what the environment has changed in classes."""
+        restore_classes()
+
     def close(self) -> None:
         """Close the environment."""
         self._env.close()

@@ -1,0 +1,127 @@
+"""The pool's end of its template: how the template is started, asked for workers, and listened to."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.errors import CrashhuntError
+from crashhunt.executors._remains import signal_name
+from crashhunt.executors._worker import worker_environment
+from crashhunt.keeper import Kept
+
+if TYPE_CHECKING:
+    from crashhunt.executors._protocol import WorkerSettings
+
+__all__ = ["TemplateLink"]
+
+_MESSAGE = 1 << 16
+_DEATHS = 3  # in a row, without a trial between them, before the pool gives up
+_END_S = 5.0
+_FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
+_numbers = itertools.count()
+
+
+class TemplateLink:
+    """A running template.
+
+    Args:
+        settings: of the hunt.
+        late: whether workers import agents themselves, because the template could not be forked any more.
+        deaths: how often it was killed before.
+    """
+
+    def __init__(self, settings: WorkerSettings, *, late: bool = False, deaths: int = 0) -> None:
+        self._settings = settings
+        self._late = late
+        self.deaths = deaths
+        self.ready = False
+        self.unfit = False
+        number = next(_numbers)
+        job = settings.scratch / f"template-{number}.json"
+        content = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
+        job.write_text(json.dumps(content), encoding="utf-8")
+        self._log = settings.scratch / f"template-{number}.log"
+        # Messages stay apart from each other, and file descriptors with theirs.
+        self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs, self._log.open("wb") as log:
+            self._kept = Kept(
+                "crashhunt.executors._template",
+                [str(theirs.fileno()), str(job)],
+                environment={**os.environ, **worker_environment()},
+                inherited=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        self.control.setblocking(False)
+
+    def fork(self, slot: int, end: socket.socket) -> None:
+        """Ask for a worker, which is given one end of a socket."""
+        with suppress(OSError):  # it is gone, which shows when it is listened to
+            socket.send_fds(self.control, [json.dumps({"slot": slot}).encode()], [end.fileno()])
+
+    def kill(self, slot: int) -> None:
+        """Kill a worker, if it is still there."""
+        with suppress(OSError):
+            self.control.send(json.dumps({"kill": slot}).encode())
+
+    def receive(self) -> list[dict[str, Any]] | None:
+        """Return which workers have ended, and how; None where the template itself is gone.
+
+        Raises:
+            CrashhuntError: what trials need cannot be imported.
+        """
+        ended: list[dict[str, Any]] = []
+        while True:
+            try:
+                data = self.control.recv(_MESSAGE)
+            except BlockingIOError:
+                return ended
+            except OSError:
+                data = b""
+            if not data:
+                return None
+            message = json.loads(data)
+            if "error" in message:
+                raise CrashhuntError(**message["error"])
+            if "slot" in message:
+                ended.append(message)
+            self.ready = self.ready or "ready" in message
+            self.unfit = self.unfit or "unfit" in message
+
+    def anew(self) -> TemplateLink:
+        """Start another one in its place, after its end.
+
+        Raises:
+            CrashhuntError: it has ended by itself, or too often.
+        """
+        try:
+            code = self._kept.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            code = -signal.SIGKILL
+        self.end()
+        if self.unfit:
+            return TemplateLink(self._settings, late=True, deaths=self.deaths)
+        if -code not in _FROM_OUTSIDE or self.deaths + 1 >= _DEATHS:
+            lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            how = f"was killed by {signal_name(code)}" if code < 0 else f"exited with {code}"
+            said = f": {lines[-1]}" if lines else ""
+            again = f", {_DEATHS} times" if -code in _FROM_OUTSIDE else ""
+            raise CrashhuntError(
+                f"the process that starts the workers {how}{again}{said}",
+                fix="see that the limits on memory and processes leave it room, and run the same command again",
+            )
+        return TemplateLink(self._settings, late=self._late, deaths=self.deaths + 1)
+
+    def end(self) -> None:
+        """Kill it, its workers, and everything that they have started."""
+        self._kept.end()
+        self.control.close()
