@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
+from crashhunt._watching import watched
 from crashhunt.errors import BundleError
 from crashhunt.snapshot import Snapshot
 from crashhunt.whole_file import whole_file
@@ -25,6 +26,7 @@ from crashhunt.whole_file import whole_file
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt._watching import Watch
     from crashhunt.bundle import Bundle
 
 __all__ = ["Archive", "export_crash", "open_archive"]
@@ -53,12 +55,13 @@ class Archive:
     made_here: bool
 
 
-def export_crash(bundle: Bundle, target: Path) -> int:
+def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:
     """Write a crash, its hunt's settings and its snapshot into one zip file, all of it or nothing.
 
     Args:
         bundle: the crash.
         target: the file; one that is there is replaced.
+        watch: called after each file with how many are done, and how many there are.
 
     Returns:
         Its size in bytes.
@@ -77,7 +80,7 @@ def export_crash(bundle: Bundle, target: Path) -> int:
     files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
     entries: dict[str, dict[str, Any]] = {}
     with whole_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in files:
+        for path in watched(files, len(files), watch):
             if path.is_file() and not path.is_symlink():
                 name = path.relative_to(hunt).as_posix()
                 data = path.read_bytes()

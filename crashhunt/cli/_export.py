@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, say
+from crashhunt.cli._progress import shown_progress
 
 if TYPE_CHECKING:
     import argparse
@@ -33,7 +34,8 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.bundle import find_bundle
 
     bundle = find_bundle(options.directory, options.crash)
-    size = export_crash(bundle, options.file)
+    with shown_progress(f"writing {options.file}", as_json=options.json) as watch:
+        size = export_crash(bundle, options.file, watch=watch)
     say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB)", as_json=options.json)
     if options.json:
         print(json.dumps({"crash": bundle.id, "file": str(options.file), "bytes": size}))

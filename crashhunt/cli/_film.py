@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import integer
+from crashhunt.cli._progress import shown_progress
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
@@ -124,7 +125,8 @@ def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOption
     written = {}
     for path, write in ((options.video, write_video), (options.gif, write_gif), (options.frames, write_frames)):
         if path is not None:
-            written[str(path)] = write(path, shots, film)
+            with shown_progress(f"writing {path}", as_json=options.json) as watch:
+                written[str(path)] = write(path, shots, film, watch=watch)
     return written
 
 

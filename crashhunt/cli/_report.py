@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say
+from crashhunt.cli._progress import shown_progress
 from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
         bundles.sort(key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         shown = bundles[: options.crashes]
         target = options.output or (Path(f"{options.directory}.html") if exported else hunt / "report.html")
-        size = write_report(hunt, shown, target, name=options.directory.resolve().name)
+        with shown_progress(f"writing {target}", as_json=options.json) as watch:
+            size = write_report(hunt, shown, target, name=options.directory.resolve().name, watch=watch)
     left = f", the {len(shown)} with the fewest steps" if len(shown) < len(bundles) else ""
     say(f"{target} ({size / 1e6:.1f} MB) shows {len(shown)} of {len(bundles)} crashes{left}", as_json=options.json)
     if options.json:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
+from crashhunt._watching import watched
 from crashhunt.encounter import Encounter
 from crashhunt.errors import UsageError
 from crashhunt.oracles import approaches
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt._watching import Watch
     from crashhunt.recording import Recording
     from crashhunt.render._panels import Panel
 
@@ -191,12 +194,18 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             yield from [last[1]] * options.last_step_repeats
 
 
+def _count(shots: Sequence[Shot], options: FilmOptions) -> int:
+    """Return how many pictures `frames` yields."""
+    shown = sum(len(_steps(shot, options)) + options.last_step_repeats for shot in shots)
+    return shown + max(0, len(shots) - 1) * options.blank_frames
+
+
 def _frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
     """Return how many pictures a second the film has."""
     return options.fps or 1.0 / min(shot.recording.prologue.step_length_s for shot in shots)
 
 
-def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
+def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
     """Write an MP4 file, all of it or nothing; return how many pictures it has.
 
     Raises:
@@ -209,7 +218,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
     count = 0
     with whole_file(path) as temporary, av.open(str(temporary), "w") as container:
         stream: Any = None
-        for picture in frames(shots, options):
+        for picture in watched(frames(shots, options), _count(shots, options), watch):
             if stream is None:
                 rate = Fraction(_frame_rate(shots, options)).limit_denominator(1000)
                 stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
@@ -222,13 +231,16 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
     return count
 
 
-def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
+def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
     """Write an animated GIF; return how many pictures it has.
 
     Raises:
         HuntDirectoryError: the file cannot be written.
     """
-    pictures = [Image.fromarray(picture).quantize(64) for picture in frames(shots, options)]
+    pictures = [
+        Image.fromarray(picture).quantize(64)
+        for picture in watched(frames(shots, options), _count(shots, options), watch)
+    ]
     with whole_file(path) as temporary:
         pictures[0].save(
             temporary,
@@ -240,21 +252,29 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
     return len(pictures)
 
 
-def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions) -> int:
+def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
     """Write ``000000.png`` and so on; return how many.
 
     Raises:
         HuntDirectoryError: the folder cannot be written.
     """
-    count = 0
+    made: list[Path] = []
+    new = not folder.exists()
     try:
         folder.mkdir(exist_ok=True)
-        for picture in frames(shots, options):
-            Image.fromarray(picture).save(folder / f"{count:06d}.png")
-            count += 1
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    return count
+        for picture in watched(frames(shots, options), _count(shots, options), watch):
+            made.append(folder / f"{len(made):06d}.png")
+            Image.fromarray(picture).save(made[-1])
+    except BaseException as error:  # Ctrl-C too: half a film is none, and would be in the way of the next
+        for path in made:
+            path.unlink(missing_ok=True)
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            raise cannot_write(folder, error) from error
+        raise
+    return len(made)
 
 
 def _builtin_labels(shot: Shot) -> tuple[str, ...]:

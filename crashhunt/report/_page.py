@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt import __version__
+from crashhunt._watching import watched
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.oracles import approaches
 from crashhunt.recording import read_lanes
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt._watching import Watch
     from crashhunt.bundle import Bundle
     from crashhunt.encounter import Encounter
     from crashhunt.recording import Recording
@@ -37,7 +39,9 @@ __all__ = ["report_data", "write_report"]
 _DOTS = 4000  # trials in a plot; more cannot be told apart
 
 
-def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, name: str = "") -> int:
+def write_report(
+    directory: Path, bundles: Sequence[Bundle], target: Path, *, name: str = "", watch: Watch | None = None
+) -> int:
     """Write the report of a hunt, all of it or nothing.
 
     Args:
@@ -45,6 +49,7 @@ def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, na
         bundles: the crashes to animate.
         target: the file; one that is there is replaced.
         name: of the hunt, for the title; its directory's by default.
+        watch: called after each crash with how many are done, and how many there are.
 
     Returns:
         Its size in bytes.
@@ -53,7 +58,7 @@ def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, na
         BundleError: a crash is damaged.
         HuntDirectoryError: the file cannot be written.
     """
-    data = report_data(directory, bundles, name=name or directory.resolve().name)
+    data = report_data(directory, bundles, name=name or directory.resolve().name, watch=watch)
     page = resources.files("crashhunt.report").joinpath("page.html").read_text(encoding="utf-8")
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
@@ -62,7 +67,7 @@ def write_report(directory: Path, bundles: Sequence[Bundle], target: Path, *, na
     return target.stat().st_size
 
 
-def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str) -> dict[str, Any]:
+def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str, watch: Watch | None = None) -> dict[str, Any]:
     """Return everything that the page shows."""
     settings = read_settings(directory / "hunt.toml")
     return {
@@ -79,7 +84,7 @@ def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str) -> dic
             for (agent, name), unit in argument_units(directory, settings).items()
         },
         **_trials(directory),
-        "crashes": [_crash(bundle) for bundle in bundles],
+        "crashes": [_crash(bundle) for bundle in watched(bundles, len(bundles), watch)],
     }
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
 
 _LINE_EVERY_S = 5.0
+_LEAST_BAR = 8
 _STYLES = {"traffic crash": "bold red", "software fault": "bold magenta", "no crash": "green"}
 
 
@@ -65,26 +66,61 @@ class Watcher:
             self._console.print(_line(status), soft_wrap=True, highlight=False)
 
     def _screen(self, status: HuntStatus) -> RenderableType:
-        head = Text.assemble((self._title, "bold"), f"   {status.phase}   {format_seconds(status.elapsed_s)}")
-        bar = Table.grid(padding=(0, 2))
-        bar.add_row(
-            ProgressBar(total=max(1, status.planned), completed=status.done, width=30),
-            f"{status.done}/{status.planned} trials",
-            f"{status.rate_per_s:.1f}/s",
-            f"{_time_left(status)} left",
-        )
+        """The head in a line, progress, outcomes; then as much of the rest as fits, the workers first."""
+        width, height = self._console.size
+        rows: list[RenderableType] = [self._head(status, width), _bar(status, width)]
         outcomes = Text("  ").join(
             Text(f"{name} {count}", style=_STYLES[Outcome(name).category] if name != Outcome.INVALID else "yellow")
             for name, count in sorted(status.outcomes.items())
         )
-        workers = Table.grid(padding=(0, 3))
-        for number, header in sorted(status.workers.items()):
-            doing = {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}")
-            workers.add_row(f"worker {header.pid}", f"trial {number}", doing)
-        rows: list[RenderableType] = [head, bar, outcomes or Text("no trial has ended yet", style="dim")]
+        rows.append(outcomes or Text("no trial has ended yet", style="dim"))
+        # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
+        left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.nearest is not None:
-            rows.append(Text(f"nearest miss: {_near(status.nearest)}", overflow="fold"))
-        return Group(*rows, workers)
+            near = Text(f"nearest miss: {_near(status.nearest)}", overflow="fold")
+            if len(self._console.render_lines(near)) + len(status.workers) > left:
+                near = Text(near.plain, no_wrap=True, overflow="ellipsis")
+            left -= len(self._console.render_lines(near))
+            rows.append(near)
+        return Group(*rows, _workers(status, width, max(1, left)))
+
+    def _head(self, status: HuntStatus, width: int) -> Text:
+        now = f"   {status.phase}   {format_seconds(status.elapsed_s)}"
+        title = Text(self._title, "bold")
+        title.truncate(max(1, width - len(now)), overflow="ellipsis")
+        return Text.assemble(title, now, no_wrap=True)
+
+
+def _bar(status: HuntStatus, width: int) -> RenderableType:
+    said = (f"{status.done}/{status.planned} trials", f"{status.rate_per_s:.1f}/s", f"{_time_left(status)} left")
+    if width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
+        said = (said[0].removesuffix(" trials"), *said[1:])
+    table = Table.grid(padding=(0, 2))
+    room = width - sum(len(part) + 2 for part in said)
+    bar = ProgressBar(total=max(1, status.planned), completed=status.done, width=max(1, min(30, room)))
+    table.add_row(bar, *said)
+    return table
+
+
+def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
+    """What each worker is doing: a line each, or side by side where there are too few lines."""
+    doing = [
+        (header.pid, number, {Phase.SETUP: "setting up", Phase.DONE: "done"}.get(header.phase, f"step {header.step}"))
+        for number, header in sorted(status.workers.items())
+    ]
+    workers = Table.grid(padding=(0, 3))
+    if len(doing) <= lines:
+        for pid, number, what in doing:
+            workers.add_row(f"worker {pid}", f"trial {number}", what)
+        return workers
+    cells = [f"{number}: {what}" for _, number, what in doing]
+    columns = max(1, (width + 3) // (max(map(len, cells)) + 3))
+    most = columns * lines
+    if len(cells) > most:
+        cells = [*cells[: most - 1], f"and {len(cells) - most + 1} more"]
+    for first in range(0, len(cells), columns):
+        workers.add_row(*cells[first : first + columns])
+    return workers
 
 
 def format_arguments(result: TrialResult) -> str:

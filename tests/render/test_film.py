@@ -192,6 +192,36 @@ def test_a_film_that_cannot_be_written_leaves_nothing_behind(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "in the way.gif", "in the way.mp4"]
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_interrupted_frames_leave_nothing_behind(tmp_path, there):
+    folder = tmp_path / "f"
+    if there:
+        folder.mkdir()
+    seen = []
+
+    def interrupt(done, total):
+        seen.append((done, total))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    options = FilmOptions(size=(64, 64), last_step_repeats=0)
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(folder, [shot(4)], options, watch=interrupt)
+    assert seen == [(1, 5), (2, 5)]
+    assert folder.exists() == there
+    assert list(tmp_path.rglob("*.png")) == []
+
+
+@pytest.mark.parametrize("options", [{}, {"last_s": 0.5}, {"fps": 3.0, "blank_frames": 4}, {"last_step_repeats": 0}])
+def test_how_many_pictures_there_will_be_is_known_before(tmp_path, options):
+    seen = []
+    shots = [shot(4), shot(7)]
+    made = write_gif(
+        tmp_path / "f.gif", shots, FilmOptions(size=(64, 64), **options), watch=lambda *now: seen.append(now)
+    )
+    assert seen == [(done, made) for done in range(1, made + 1)]
+
+
 def test_an_interrupted_video_leaves_nothing_behind(tmp_path, monkeypatch):
     def interrupted(self, step):
         if step == 3:

@@ -1,0 +1,91 @@
+"""The status screen on terminals of all sizes, and the line of commands that take their time."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+
+import pytest
+from conftest import CRASHHUNT
+from rich.console import Console
+
+from crashhunt.progress import HuntStatus
+from crashhunt.recording import BlackBoxHeader, Phase
+from crashhunt.report import Watcher
+from crashhunt.trial import ClosestApproach, Outcome, TrialResult, TrialSpec
+
+TITLE = "crashhunt: intersection-two-agents, crashhunt.agents:CarFollowing, crashhunt.agents:KeepLaneWithSpeed"
+
+
+def status(workers: int) -> HuntStatus:
+    traffic = {"vehicles": 29, "imperfection": 0.569, "speed_spread": 0.1034, "trucks_per_100_cars": 34}
+    spec = TrialSpec(123, 1, {"ego": {"speed": 17.2, "headway_s": 1.25}}, traffic, max_steps=1500)
+    nearest = TrialResult(spec, Outcome.SURVIVED, closest=ClosestApproach(0.42, 1.2, 3.0))
+    phases = [Phase.SETUP, *(phase for phase in Phase if phase not in (Phase.SETUP, Phase.DONE))]
+    boxes = {
+        120 + n: BlackBoxHeader(4711231 + n, 120 + n, 0.0, 0, 100 + n, phases[min(n, 1)], 0) for n in range(workers)
+    }
+    outcomes = {"collision": 2, "survived": 110, "finished": 8, "invalid": 3, "agent_error": 1}
+    return HuntStatus("hunting", 1000, 123, outcomes, 12.3, 65.0, nearest, boxes, 2)
+
+
+def screen(width: int, height: int, workers: int) -> list[str]:
+    console = Console(width=width, height=height, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, TITLE)._screen(status(workers)))
+    return [line.rstrip() for line in shown.get().splitlines()]
+
+
+@pytest.mark.parametrize(("width", "height", "workers"), [(40, 24, 8), (40, 13, 8), (40, 12, 4), (120, 12, 32)])
+def test_every_worker_is_on_the_screen(width, height, workers):
+    lines = screen(width, height, workers)
+    assert len(lines) < height
+    assert max(map(len, lines)) <= width
+    assert "hunting   1:05" in lines[0]
+    assert "123/1000" in lines[1]
+    for number in range(120, 120 + workers):
+        shown = "setting up" if number == 120 else f"step {number - 20}"
+        assert any(str(number) in line and shown in line for line in lines), number
+
+
+def test_where_not_all_fit_it_says_how_many_more():
+    lines = screen(40, 12, 64)
+    assert len(lines) < 12
+    assert "and 53 more" in lines[-1]
+    assert lines[4].startswith("nearest miss: trial 123, 0.42 s")
+
+
+def on_a_terminal(folder, *words: str) -> tuple[int, str]:
+    """Run a command whose standard error is a terminal; return its exit code and what was shown there."""
+    ours, theirs = pty.openpty()
+    done = subprocess.Popen([str(CRASHHUNT), *words], cwd=folder, stdout=subprocess.PIPE, stderr=theirs, text=True)
+    os.close(theirs)
+    shown = b""
+    try:
+        while more := os.read(ours, 4096):
+            shown += more
+    except OSError:  # Linux says so when the other end is closed
+        pass
+    os.close(ours)
+    done.communicate()
+    return done.returncode, shown.decode(errors="replace")
+
+
+def test_reports_exports_and_films_say_how_far_they_are(toy):
+    pytest.importorskip("PIL")
+    toy.crashhunt("run", "h", "1", "3", "60", "--scenario", "toy", "--arg", "speed=14", "--seed", "1", "--keep-going")
+    for words, file in (
+        (("report", "h"), "h/report.html"),
+        (("export", "h", "h.zip"), "h.zip"),
+        (("replay", "h", "--from-log", "--gif", "h.gif", "--last-seconds", "0.3"), "h.gif"),
+    ):
+        code, shown = on_a_terminal(toy.folder, *words)
+        assert code == 0, shown
+        assert f"writing {file}" in shown
+        assert "\x1b[?25h" in shown  # the cursor is there again
+    code, shown = on_a_terminal(toy.folder, "report", "h", "--json")
+    assert code == 0
+    assert "writing" not in shown
+    assert "\x1b" not in shown
+    assert toy.crashhunt("export", "h", "h.zip").err == ""
