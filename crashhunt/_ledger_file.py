@@ -25,7 +25,10 @@ __all__ = [
     "damaged",
     "explained",
     "migrate",
+    "opened",
     "plain_trial",
+    "removed",
+    "rewrite",
     "version_of",
 ]
 
@@ -187,3 +190,45 @@ def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
             where=where,
         )
     return damaged(path, text)
+
+
+def opened(path: Path) -> sqlite3.Connection:
+    """Open a ledger."""
+    return sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+
+
+def removed(path: Path, was: os.stat_result) -> bool:
+    """Whether the file of a ledger that is open was removed.
+
+    Raises:
+        HuntDirectoryError: another file is in its place.
+    """
+    try:
+        if os.path.samestat(path.stat(), was):
+            return False
+    except FileNotFoundError:
+        return True
+    raise HuntDirectoryError(
+        "another file was put in the place of the ledger while the hunt ran",
+        fix="run the hunt again, in a directory that nobody else writes to",
+        where=str(path),
+    )
+
+
+def rewrite(database: sqlite3.Connection, path: Path) -> None:
+    """Write a ledger that is open, and whose file was removed, to a new one; it is closed.
+
+    Raises:
+        HuntDirectoryError: the folder is gone or not writable.
+    """
+    try:
+        with whole_file(path) as temporary:
+            with closing(sqlite3.connect(temporary)) as copy:
+                database.backup(copy)
+            database.close()  # which removes what belongs to the old file
+    except sqlite3.Error as error:
+        raise explained(path, error) from error
+    except OSError as error:
+        message = f"the ledger was removed while the hunt ran, and cannot be written anew: {error.strerror}"
+        fix = "run the hunt again, in a directory that nobody else writes to"
+        raise HuntDirectoryError(message, fix=fix, where=str(path)) from error

@@ -21,6 +21,8 @@
 
 from __future__ import annotations
 
+import errno
+
 __all__ = [
     "ActionError",
     "ArgumentError",
@@ -37,6 +39,7 @@ __all__ = [
     "SimulatorError",
     "SnapshotError",
     "UsageError",
+    "remedy",
 ]
 
 
@@ -129,3 +132,12 @@ class ActionError(EpisodeError):
 
 class SimulatorError(EpisodeError):
     """The simulator gave up."""
+
+
+def remedy(error: OSError) -> str:
+    """Return what to do about an error of the operating system, as an imperative."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "raise the limit on open files (ulimit -n), and run the same command again"
+    if error.errno in (errno.EAGAIN, errno.ENOMEM):
+        return "leave it more processes (ulimit -u) or memory, and run the same command again"
+    return "free some space or make the folder writable, and run the same command again"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.bundle import list_bundles, write_bundle, write_trial
 from crashhunt.directory import HuntDirectory
-from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError
+from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
 from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_of
 from crashhunt.ledger import Ledger
 from crashhunt.plan import spec_of, with_settings
@@ -22,6 +22,7 @@ from crashhunt.replays import confirm
 from crashhunt.simulators._sumo_says import explained
 from crashhunt.snapshot import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.status import this_process
+from crashhunt.text import encodable
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -97,22 +98,27 @@ class Hunt:
             try:
                 return self._run(ledger, watch or (lambda _: None))
             except CrashhuntError as error:
-                with suppress(CrashhuntError):
-                    ledger.enter("error", str(error))
+                self._fail(ledger, str(error))
                 raise
             except OSError as error:
-                with suppress(CrashhuntError):
-                    ledger.enter("error", f"{error.strerror or error}: {error.filename or self.directory}")
+                self._fail(ledger, f"{error.strerror or error}: {error.filename or self.directory}")
                 raise HuntDirectoryError(
-                    f"{error.strerror or error}",
-                    fix="free some space or make the folder writable, and run the same command again",
-                    where=str(error.filename or self.directory),
+                    f"{error.strerror or error}", fix=remedy(error), where=str(error.filename or self.directory)
                 ) from error
+            except Exception as error:
+                self._fail(ledger, f"{type(error).__name__}: {error}")
+                raise
             finally:
                 with suppress(CrashhuntError):
                     ledger.note(owner=None, heartbeat=time.time())
                 ledger.close()
                 shutil.rmtree(self._place.scratch, ignore_errors=True)
+
+    def _fail(self, ledger: Ledger, why: str) -> None:
+        """Write down why the hunt ends, where that can still be written."""
+        shutil.rmtree(self._place.scratch, ignore_errors=True)  # on a disk that is full, this makes room for a line
+        with suppress(CrashhuntError):
+            ledger.enter("error", encodable(why))
 
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
@@ -120,6 +126,10 @@ class Hunt:
         sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
         progress = Progress()
         finished = ledger.finished()
+        for bundle in list_bundles(self.directory):
+            if bundle.result.spec.number not in finished:  # it was killed between saving the one and the other
+                ledger.record(bundle.result, snapshot=bundle.snapshot)
+                finished.add(bundle.result.spec.number)
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         progress.crashes = list_bundles(self.directory)
@@ -142,6 +152,7 @@ class Hunt:
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
         watch(self._status(progress, "done"))
+        self._see_to(ledger, progress)
         reason = ""
         if stopped == "no_valid_trial" and progress.last_invalid is not None:
             reason = _why_invalid(progress.last_invalid, self.scenario)
@@ -214,6 +225,7 @@ class Hunt:
                     progress.notes.append(note)
                 if time.monotonic() - heartbeat > _HEARTBEAT_S:
                     heartbeat = time.monotonic()
+                    self._see_to(ledger, progress)
                     ledger.note(heartbeat=time.time())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
@@ -232,6 +244,17 @@ class Hunt:
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials"
+
+    def _see_to(self, ledger: Ledger, progress: Progress) -> None:
+        """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
+
+        Raises:
+            HuntDirectoryError: another file is in its place, or the directory is gone.
+        """
+        if ledger.restore():
+            note = "ledger.sqlite was removed while the hunt ran, and was written anew with everything that was in it"
+            ledger.remark(note)
+            progress.notes.append(note)
 
     def _take(
         self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: Progress

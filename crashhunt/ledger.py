@@ -22,7 +22,10 @@ from crashhunt._ledger_file import (
     damaged,
     explained,
     migrate,
+    opened,
     plain_trial,
+    removed,
+    rewrite,
     version_of,
 )
 from crashhunt.errors import HuntDirectoryError
@@ -66,13 +69,11 @@ class Ledger:
         try:
             if writable and not has_begun(path):
                 create(path)
-            self._database = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+            self._database = opened(path)
             with ExitStack() as failed:
                 failed.callback(self._database.close)
                 if writable:
-                    # A reader never blocks the writer, and a kill or a power cut leaves a file that opens.
-                    self._database.execute("PRAGMA journal_mode = WAL")
-                    self._database.execute("PRAGMA synchronous = NORMAL")
+                    self._prepare()
                 self._version = version_of(self._database, path)
                 if writable:
                     self._break_seal()
@@ -285,6 +286,22 @@ class Ledger:
         row = next(self._select(f"SELECT {COLUMNS}{self._digest} FROM trials ORDER BY number DESC LIMIT 1"), None)
         return float(row[8]) if row and self._plain(row) else None
 
+    def restore(self) -> bool:
+        """Write the file anew where somebody has removed it; its content is there as long as it is open.
+
+        Returns:
+            Whether it was gone.
+
+        Raises:
+            HuntDirectoryError: another file is in its place, or the folder is gone, or not writable.
+        """
+        if not removed(self._path, self._file):
+            return False
+        rewrite(self._database, self._path)
+        self._database = opened(self._path)
+        self._prepare()
+        return True
+
     def close(self) -> None:
         """Close the file; a writer seals it before."""
         if self._writable:
@@ -371,6 +388,12 @@ class Ledger:
             self._version = version_of(self._database, self._path)
         if self.sealed:
             self._note(_SEAL, None)
+
+    def _prepare(self) -> None:
+        """Make what follows last: a reader never blocks the writer, and a kill leaves a file that opens."""
+        self._database.execute("PRAGMA journal_mode = WAL")
+        self._database.execute("PRAGMA synchronous = NORMAL")
+        self._file = self._path.stat()
 
     def _compare_seal(self, seal: dict[str, Any] | None, name: str, found: object) -> None:
         # A writer may have come meanwhile; then it is another seal, or none.

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import json
 import os
 import sys
+import traceback
+from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt import __version__
@@ -22,7 +25,7 @@ from crashhunt.cli._show import add_show
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
-from crashhunt.errors import CrashhuntError, UsageError
+from crashhunt.errors import CrashhuntError, UsageError, remedy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,24 +53,69 @@ exit codes: 0 done, 1 the answer is no, 2 bad usage or input, 3 not one valid tr
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    as_json = "--json" in words
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # not every terminal knows every letter; as on stderr
     try:
-        _check_names(words)
-        options = _parser().parse_args(words)
-        code = options.command(options, words)
-    except CrashhuntError as error:
-        if as_json:
-            print(json.dumps(error.to_json()))
-        print(f"crashhunt: {error}", file=sys.stderr)
-        code = error.exit_code
+        code = _run(words)
+        _flush()
     except BrokenPipeError:  # whoever read our output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _give_up_output()
         code = 0
     except KeyboardInterrupt:
         code = 130
+    except Exception as error:
+        code = _report(_explained(error), as_json="--json" in words)
     sys.exit(code)
+
+
+def _run(words: Sequence[str]) -> int:
+    try:
+        _check_names(words)
+        options = _parser().parse_args(words)
+        code: int = options.command(options, words)
+    except CrashhuntError as error:
+        return _report(error, as_json="--json" in words)
+    except SystemExit as leaving:  # of --help and --version
+        return leaving.code if isinstance(leaving.code, int) else 0
+    return code
+
+
+def _report(error: CrashhuntError, *, as_json: bool) -> int:
+    with suppress(OSError):
+        print(f"crashhunt: {error}", file=sys.stderr, flush=True)
+    if as_json:
+        try:
+            print(json.dumps(error.to_json()), flush=True)
+        except OSError:
+            _give_up_output()
+    return error.exit_code
+
+
+def _explained(error: Exception) -> CrashhuntError:
+    """What nobody has expected, in one line; with a variable of the environment, where it came from as well."""
+    if os.environ.get("CRASHHUNT_TRACEBACK"):
+        traceback.print_exc()
+    if isinstance(error, OSError):
+        if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT):
+            _give_up_output()
+            return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
+        return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    fix = "CRASHHUNT_TRACEBACK=1 shows how it came to it; if no module of yours is to blame, report it"
+    return CrashhuntError(f"this should not happen: {said}", fix=fix, where=where)
+
+
+def _flush() -> None:
+    if sys.stdout is not None:
+        sys.stdout.flush()
+
+
+def _give_up_output() -> None:
+    """Send what is still to be written to nowhere, so that Python does not fail over it when it leaves."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _check_names(words: Sequence[str]) -> None:

@@ -1,0 +1,193 @@
+"""A stop is never a crash, and leaves nothing behind; only the hunt's own failures end it, in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from crashhunt.processes import children_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+CRASHHUNT = Path(sys.executable).parent / "crashhunt"
+FINE = ("--scenario", "toy", "--arg", "speed=5", "--seed", "3")
+SLOW = ("--set", "step_wall_s=0.02")
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.02)
+
+
+def rows(hunt: Path) -> dict[int, str]:
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
+        return dict(database.execute("SELECT number, outcome FROM trials"))
+    return {}
+
+
+def tree(pid: int) -> list[int]:
+    return [pid, *(below for child in children_of(pid) for below in tree(child))]
+
+
+def left_in(folder: Path) -> list[int]:
+    """Processes that work in a folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cwd"):
+        with suppress(OSError):
+            if path.readlink() == folder:
+                found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.parametrize("everybody", [True, False], ids=["every process", "the group"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
+    words = ("run", "h", "2", "12", "40", *FINE, *SLOW, "--json")
+    process = toy.start(*words, start_new_session=True)
+    wait_for(lambda: len(rows(toy.folder / "h")) >= 2)
+    if everybody:  # as systemd and SLURM do; the workers come first
+        for pid in reversed(tree(process.pid)):
+            os.kill(pid, number)
+    else:  # as timeout does
+        os.killpg(process.pid, number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert json.loads(out)["stopped_because"] == "interrupted"
+    assert set(rows(toy.folder / "h").values()) == {"survived"}
+    wait_for(lambda: not left_in(toy.folder))
+    assert toy.crashhunt(*words).json["outcomes"] == {"survived": 12}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
+    words = ("run", "h", "1", "2", "60", *FINE, *SLOW, "--json")
+    process = toy.start(*words)
+    box = toy.folder / "h" / ".scratch" / "trial-000000" / "blackbox.bin"
+    wait_for(box.exists)
+    wait_for(lambda: len(tree(process.pid)) == 4)
+    os.kill(tree(process.pid)[-1], number)  # hunt, keeper, template, worker
+    out, err = process.communicate(timeout=90)
+    report = json.loads(out)
+    assert report["outcomes"] == {"survived": 2}, err
+    assert f"was ended by {number.name} from outside, and is run again" in report["notes"][0]
+    assert report["notes"][0] in toy.crashhunt("logs", "h").out
+
+
+def test_when_the_template_is_killed_another_one_takes_over(toy):
+    process = toy.start("run", "h", "2", "6", "40", *FINE, *SLOW, "--json")
+    wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
+    os.kill(tree(process.pid)[2], signal.SIGKILL)
+    out, err = process.communicate(timeout=90)
+    assert json.loads(out)["outcomes"] == {"survived": 6}, err
+    assert "was started again" in out
+
+
+def test_a_killed_hunt_takes_every_process_along(toy):
+    process = toy.start("run", "h", "2", "1000", "40", *FINE, *SLOW)
+    wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not left_in(toy.folder))
+
+
+def test_a_killed_replay_leaves_no_process(toy):
+    toy.crashhunt("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5")
+    for children in (1, 2, 2):  # the keeper as it starts, and what it keeps
+        process = toy.start("replay", "h")
+        wait_for(lambda process=process, least=children + 1: len(tree(process.pid)) >= least)
+        process.kill()
+        process.communicate()
+        wait_for(lambda: not left_in(toy.folder))
+
+
+def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
+    words = ("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Hangs", "--arg", "at=5")
+    process = toy.start(*words, "--timeout", "8", "--json")
+    wait_for(lambda: list((toy.folder / "h" / "crashes").glob("*-hang")))
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert time.monotonic() - began < 7, "it waited for the hang"
+    (crash,) = json.loads(out)["crashes"]
+    assert crash["confirmed"] is None
+    assert toy.crashhunt(*words, "--timeout", "2", "--json").json["crashes"][0]["confirmed"] is True
+
+
+def test_a_ledger_that_is_removed_is_written_anew(toy):
+    process = toy.start("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
+    wait_for(lambda: len(rows(toy.folder / "h")) >= 3)
+    before = rows(toy.folder / "h")
+    for path in (toy.folder / "h").glob("ledger.sqlite*"):
+        path.unlink()
+    wait_for(lambda: len(rows(toy.folder / "h")) > len(before))
+    process.send_signal(signal.SIGINT)
+    report = json.loads(process.communicate(timeout=60)[0])
+    assert "written anew" in report["notes"][0]
+    after = rows(toy.folder / "h")
+    assert before.items() <= after.items()
+    assert len(after) == report["trials_run"]
+
+
+def test_another_ledger_in_its_place_ends_the_hunt(toy):
+    process = toy.start("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
+    wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
+    (toy.folder / "other").write_bytes(b"")
+    (toy.folder / "other").rename(toy.folder / "h" / "ledger.sqlite")
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "another file was put in the place of the ledger" in json.loads(out)["error"]["message"]
+    assert err.count("\n") == 2  # the first says that it hunts
+
+
+def test_a_bundle_without_a_row_gets_one(toy):
+    words = ("run", "h", "1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5")
+    first = toy.crashhunt(*words, "--keep-going", "--json").json
+    from crashhunt.ledger import Ledger
+
+    with closing(Ledger(toy.folder / "h" / "ledger.sqlite", writable=True)) as ledger:
+        ledger.replace([1])
+    assert set(rows(toy.folder / "h")) == {0, 2}
+    second = toy.crashhunt(*words, "--keep-going", "--json").json
+    assert second["trials_run"] == 3
+    assert second["crashes"] == first["crashes"]
+
+
+@pytest.mark.parametrize("words", [("status", "h"), ("scenarios",), ("trials", "h")])
+def test_output_that_cannot_be_written_is_one_line(toy, words):
+    toy.crashhunt("run", "h", "1", "1", "5", *FINE)
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [CRASHHUNT, *words],
+            cwd=toy.folder,
+            env=toy.environment,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert "cannot be written: No space left on device" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_too_few_files_are_one_line(toy):
+    command = ["bash", "-c", f"ulimit -n 16; exec {CRASHHUNT} run h 2 4 20 {' '.join(FINE)}"]
+    done = subprocess.run(command, cwd=toy.folder, env=toy.environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Too many open files" in done.stderr
+    assert "ulimit -n" in done.stderr
+    assert done.stderr.count("\n") == 1
+    wait_for(lambda: not left_in(toy.folder))
