@@ -16,7 +16,18 @@ import numpy as np
 
 from crashhunt.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
 from crashhunt.oracles import ApproachMeter, Finding, Oracle, merge_findings
-from crashhunt.recording import AgentChannel, BlackBox, Phase, Prologue, Tag, digest_of, encode_actors, encode_events
+from crashhunt.recording import (
+    AgentChannel,
+    BlackBox,
+    Phase,
+    Prologue,
+    Tag,
+    digest_of,
+    encode_actors,
+    encode_events,
+    encode_heights,
+    encode_spines,
+)
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -76,6 +87,10 @@ class _Scribe:
             self.box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
         if scene.contacts or scene.off_road:
             self.box.append(Tag.EVENTS, 0, encode_events(scene))
+        if scene.heights:
+            self.box.append(Tag.HEIGHTS, 0, encode_heights(scene))
+        if scene.spines:
+            self.box.append(Tag.SPINES, 0, encode_spines(scene))
         self.box.step(step, scene, rewards)
 
 

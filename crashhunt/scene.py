@@ -24,6 +24,7 @@ __all__ = [
     "Scene",
     "Spine",
     "is_person",
+    "joined_frame",
 ]
 
 PERSON = "person "
@@ -122,25 +123,58 @@ class Roster:
         return len(self.actors)
 
 
+_NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
+
+
 class Frame(NamedTuple):
     """Successive scenes of the same actors, as bare columns.
 
     Args:
         roster: the actors.
         columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
-        heights: of each scene, as in `Scene`; None where all is flat.
-        grades: likewise.
-        spines: of each scene, as in `Scene`; None where nobody long is in a bend.
+        heights: float64, shape (scenes, 2 n): all heights, then all grades; None where the map is flat.
+        spines: of each scene; None where no long vehicle is in a bend.
     """
 
     roster: Roster
     columns: NDArray[np.float64]
-    heights: Sequence[Sequence[float]] | None = None
-    grades: Sequence[Sequence[float]] | None = None
-    spines: Sequence[Mapping[int, Spine]] | None = None
+    heights: NDArray[np.float64] | None = None
+    spines: tuple[Mapping[int, Spine], ...] | None = None
+
+    def scene(self, number: int) -> Scene:
+        """Return one of the scenes, without its time."""
+        count, row = len(self.roster), self.columns[number].tolist()
+        points = list(zip(row[: 2 * count : 2], row[1 : 2 * count : 2], strict=True))
+        heights = self.heights[number].tolist() if self.heights is not None else []
+        spines = self.spines[number] if self.spines is not None else _NO_SPINES
+        return Scene(
+            0.0,
+            self.roster,
+            points,
+            row[2 * count : 3 * count],
+            row[3 * count :],
+            heights=heights[:count],
+            grades=heights[count:],
+            spines=spines,
+        )
 
 
-_NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
+def joined_frame(roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None]) -> Frame:
+    """Return scenes of one roster as a frame.
+
+    Args:
+        roster: of all of them.
+        columns: as in `Frame`.
+        scenes: each one; None where nobody is high or bent.
+    """
+    heights = spines = None
+    if any(scene is not None and scene.heights for scene in scenes):
+        flat = [0.0] * (2 * len(roster))
+        rows = [[*scene.heights, *scene.grades] if scene is not None and scene.heights else flat for scene in scenes]
+        heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
+    if any(scene is not None and scene.spines for scene in scenes):
+        spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
+    return Frame(roster, columns, heights, spines)
 
 
 class Scene:
@@ -228,13 +262,7 @@ class Scene:
     def frame(self) -> Frame:
         """The scene as bare columns."""
         flat = [value for point in self.points for value in point]
-        return Frame(
-            self.roster,
-            np.array([[*flat, *self.headings, *self.speeds]]),
-            [self.heights] if self.heights else None,
-            [self.grades] if self.heights else None,
-            [self.spines] if self.spines else None,
-        )
+        return joined_frame(self.roster, np.array([[*flat, *self.headings, *self.speeds]]), [self])
 
     @property
     def data(self) -> NDArray[np.float64]:

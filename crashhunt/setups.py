@@ -88,12 +88,13 @@ class ObservationSetup:
 
     Args:
         vehicles: rows: the controlled vehicle and its nearest actors.
-        features: columns.
+        features: columns; ``kind`` says what a row is: 1 a motor vehicle, 2 a two-wheeler, 3 a person on foot, 4 what
+            runs on rails, 5 an obstacle.
         normalize: scale to [-1, 1] by highway-env's ranges.
     """
 
     vehicles: int = 8
-    features: tuple[Literal["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"], ...] = (
+    features: tuple[Literal["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind"], ...] = (
         "presence",
         "x",
         "y",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from crashhunt.oracles._geometry import rectangle_gap, time_to_contact
+from crashhunt.outlines import LEVEL_M, levels, outlines
 from crashhunt.trial import ClosestApproach
 
 if TYPE_CHECKING:
@@ -71,35 +72,31 @@ def approaches(
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
         and times of more than 10 s do not count.
     """
-    count = sum(len(columns) for _, columns, *_ in frames)
+    count = sum(len(frame.columns) for frame in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-    xs, ys, headings, speeds, halves, steps, owns = [], [], [], [], [], [], []
+    blocks = []
     step = first = 0
-    for roster, columns, *_ in frames:
-        scenes, actors = len(columns), len(roster)
-        row = roster.index.get(agent)
+    for frame in frames:
+        row = frame.roster.index.get(agent)
         if row is not None:
-            xs.append(columns[:, 0 : 2 * actors : 2].ravel())
-            ys.append(columns[:, 1 : 2 * actors : 2].ravel())
-            headings.append(columns[:, 2 * actors : 3 * actors].ravel())
-            speeds.append(columns[:, 3 * actors :].ravel())
-            halves.append(np.tile(roster.half_sizes, (scenes, 1)))
-            steps.append(np.repeat(np.arange(step, step + scenes), actors))
-            owns.append(np.repeat(np.arange(first + row, first + scenes * actors, actors), actors))
-            first += scenes * actors
-        step += scenes
-    if not xs:
+            for block in [_block(frame, row)] if frame.spines is None else _bent_blocks(frame, row):
+                blocks.append(block.moved(step, first))
+                first += len(block.x)
+        step += len(frame.columns)
+    if not blocks:
         return times, gaps, brakes
-    heading, speed, half = np.concatenate(headings), np.concatenate(speeds), np.concatenate(halves)
-    number, own = np.concatenate(steps), np.concatenate(owns)
+    whole = _Block(*(np.concatenate(columns) for columns in zip(*blocks, strict=True)))
+    heading, speed, half, number, own = whole.heading, whole.speed, whole.half, whole.step, whole.own
     forward = np.stack((np.cos(heading), np.sin(heading)), axis=1)
-    center = np.stack((np.concatenate(xs), np.concatenate(ys)), axis=1) - half[:, :1] * forward
+    center = np.stack((whole.x, whole.y), axis=1) - half[:, :1] * forward
     velocity = speed[:, None] * forward
     offset, relative = center - center[own], velocity - velocity[own]
     reach = np.hypot(half[:, 0], half[:, 1])
     reach = reach + reach[own]
     distance = np.hypot(offset[:, 0], offset[:, 1])
     others = np.arange(len(own)) != own
+    if any(frame.heights is not None for frame in frames):
+        others &= _on_one_level(whole, forward)
 
     def pairs(rows: NDArray[np.intp]) -> tuple[NDArray[np.float64], ...]:
         """Offsets, velocities and turns in the agent's frame, and both half sizes."""
@@ -133,3 +130,79 @@ def approaches(
         np.divide(closing_speed[course], 2 * contact, out=needed, where=contact > 0)
         np.maximum.at(brakes, number[course], needed)
     return times, gaps, brakes
+
+
+class _Block(NamedTuple):
+    """Rectangles of scenes in which an agent is: of each its front, how it moves, and against whom it is measured."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    half: NDArray[np.float64]
+    step: NDArray[np.intp]
+    own: NDArray[np.intp]
+    z: NDArray[np.float64]
+    grade: NDArray[np.float64]
+    tall: NDArray[np.float64]
+
+    def moved(self, step: int, first: int) -> _Block:
+        """The same, counted on from a step and a rectangle."""
+        return self._replace(step=self.step + step, own=self.own + first)
+
+
+def _block(frame: Frame, row: int) -> _Block:
+    roster, columns = frame.roster, frame.columns
+    scenes, actors = len(columns), len(roster)
+    heights = frame.heights if frame.heights is not None else np.zeros((scenes, 2 * actors))
+    return _Block(
+        columns[:, 0 : 2 * actors : 2].ravel(),
+        columns[:, 1 : 2 * actors : 2].ravel(),
+        columns[:, 2 * actors : 3 * actors].ravel(),
+        columns[:, 3 * actors :].ravel(),
+        np.tile(roster.half_sizes, (scenes, 1)),
+        np.repeat(np.arange(scenes), actors),
+        np.repeat(np.arange(row, scenes * actors, actors), actors),
+        heights[:, :actors].ravel(),
+        heights[:, actors:].ravel(),
+        np.tile([actor.height for actor in roster.actors], scenes),
+    )
+
+
+def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
+    """One for each scene and each part of the agent, which is measured against all parts of the others."""
+    blocks = []
+    for step in range(len(frame.columns)):
+        scene = frame.scene(step)
+        rows = [number for number in range(len(frame.roster)) if number != row]
+        mine = [(row, *part) for part in zip(outlines(scene, row), levels(scene, row), strict=True)]
+        theirs = [
+            (number, *part)
+            for number in rows
+            for part in zip(outlines(scene, number), levels(scene, number), strict=True)
+        ]
+        for part in mine:
+            values = np.array(
+                [
+                    (x, y, h, scene.speeds[who], length / 2, width / 2, *level, frame.roster.actors[who].height)
+                    for who, (x, y, h, length, width), level in (part, *theirs)
+                ]
+            )
+            x, y, heading, speed, length, width, z, grade, tall = values.T
+            here = np.full(len(values), step)
+            own = np.zeros(len(values), np.intp)
+            half = np.stack((length, width), axis=1)
+            blocks.append(_Block(x, y, heading, speed, half, here, own, z, grade, tall))
+    return blocks
+
+
+def _on_one_level(whole: _Block, forward: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """As `same_level` says of two."""
+    own = whole.own
+    dx, dy = whole.x - whole.x[own], whole.y - whole.y[own]
+    ahead = whole.grade[own] * (dx * forward[own, 0] + dy * forward[own, 1])
+    behind = whole.grade * (dx * forward[:, 0] + dy * forward[:, 1])
+    above = whole.z - whole.z[own]
+    lower = np.where(above > 0, whole.tall[own], whole.tall)
+    level: NDArray[np.bool_] = np.abs(above - (ahead + behind) / 2) < np.maximum(LEVEL_M, lower)
+    return level

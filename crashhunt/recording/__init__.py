@@ -24,6 +24,8 @@ from crashhunt.recording._recording import (
     digest_of,
     encode_actors,
     encode_events,
+    encode_heights,
+    encode_spines,
 )
 
 if TYPE_CHECKING:
@@ -45,6 +47,8 @@ __all__ = [
     "digest_of",
     "encode_actors",
     "encode_events",
+    "encode_heights",
+    "encode_spines",
     "first_divergence",
     "foxglove_layout",
     "read_black_box",

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.errors import BundleError, RecorderError
-from crashhunt.scene import Frame
+from crashhunt.scene import joined_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.scene import Roster, Scene
+    from crashhunt.scene import Frame, Roster, Scene
 
 __all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
 
@@ -56,6 +56,8 @@ class Tag(IntEnum):
     STEP = 6  # int64 step, float64 time, float64 reward of each agent, then the scene's data
     LANES = 7  # text: the lane of each actor of the roster, one a line
     EVENTS = 8  # JSON: what touched, who left the road
+    HEIGHTS = 9  # float64[]: z of each actor, then the grade at each; only where the map is not flat
+    SPINES = 10  # of each long vehicle that is bent: uint32 row, uint32 points, float64 x, y and z of each
 
 
 class Phase(IntEnum):
@@ -118,7 +120,7 @@ class BlackBox:
         self._agents = 0
         self._roster: object = None
         self._steps: dict[int, struct.Struct] = {}
-        self._trail: list[tuple[Roster, int]] = []
+        self._trail: list[tuple[Roster, int, Scene | None]] = []
         try:
             self._reserve(_FIRST)
         except RecorderError:
@@ -195,7 +197,8 @@ class BlackBox:
             *scene.speeds,
         )
         self._roster = scene.roster
-        self._trail.append((scene.roster, offset + packer.size - 32 * count))
+        rest = scene if scene.heights or scene.spines else None
+        self._trail.append((scene.roster, offset + packer.size - 32 * count, rest))
         self._offset = offset + packer.size
         self._step = step
         _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, step, _SIMULATE, 0)
@@ -207,10 +210,12 @@ class BlackBox:
     def take_frames(self) -> list[Frame]:
         """Return the scenes recorded since the last call, as bare columns."""
         frames: list[Frame] = []
-        for roster, run in groupby(self._trail, key=itemgetter(0)):
+        for roster, group in groupby(self._trail, key=itemgetter(0)):
+            run = list(group)
             size = 32 * len(roster)
-            scenes = [self._map[offset : offset + size] for _, offset in run]
-            frames.append(Frame(roster, np.frombuffer(b"".join(scenes), "<f8").reshape(len(scenes), 4 * len(roster))))
+            data = b"".join([self._map[offset : offset + size] for _, offset, _ in run])
+            columns = np.frombuffer(data, "<f8").reshape(len(run), 4 * len(roster))
+            frames.append(joined_frame(roster, columns, [scene for *_, scene in run]))
         self._trail.clear()
         return frames
 

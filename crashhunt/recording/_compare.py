@@ -146,7 +146,7 @@ def _in_scene(step: int, left: Scene, right: Scene) -> Divergence | None:
         was_value, now_value = float(was_data[row, column]), float(now_data[row, column])
         who = left.roster.actors[row].id
         return Divergence(step, who, f"scene.{name}", was_value, now_value, ("scene", (column,)))
-    for field in ("contacts", "off_road", "lanes"):
+    for field in ("contacts", "off_road", "lanes", "heights", "grades", "spines"):
         # As text, in which a speed that nobody knows, NaN, equals itself.
         was_events, now_events = str(getattr(left, field)), str(getattr(right, field))
         if was_events != now_events:

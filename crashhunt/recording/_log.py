@@ -22,7 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from crashhunt.errors import BundleError
 from crashhunt.recording import _schemas as schemas
 from crashhunt.recording._blackbox import Record, Tag
-from crashhunt.recording._recording import Prologue, Recording
+from crashhunt.recording._recording import Prologue, Recording, decode_spines, pack_spines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -196,6 +196,13 @@ def _write_evidence(log: LogWriter, recording: Recording) -> None:
         elif tag == Tag.ROSTER:
             message = schemas.Roster(actors=np.frombuffer(payload, "<u4").tolist())
             log.write("/scene/roster", schemas.Roster, message.SerializeToString(), time_ns, sequence)
+        elif tag == Tag.HEIGHTS:
+            heights, grades = np.frombuffer(payload, "<f8").reshape(2, -1).tolist()
+            message = schemas.Heights(heights=heights, grades=grades)
+            log.write("/scene/heights", schemas.Heights, message.SerializeToString(), time_ns, sequence)
+        elif tag == Tag.SPINES:
+            message = _spines_message(payload)
+            log.write("/scene/spines", schemas.Spines, message.SerializeToString(), time_ns, sequence)
         elif tag == Tag.STEP:
             step, time_s = _STEP.unpack_from(payload)
             time_ns = to_ns(time_s)
@@ -226,6 +233,11 @@ def _read_evidence(evidence: Sequence[tuple[int, str, bytes]]) -> Iterator[Recor
             yield _read_step(data)
         elif topic == "/scene/roster":
             yield Record(Tag.ROSTER, 0, np.array(schemas.Roster.FromString(data).actors, "<u4").tobytes())
+        elif topic == "/scene/heights":
+            heights = schemas.Heights.FromString(data)
+            yield Record(Tag.HEIGHTS, 0, np.array([*heights.heights, *heights.grades], "<f8").tobytes())
+        elif topic == "/scene/spines":
+            yield _read_spines(data)
         elif topic in texts:
             payload = schemas.Text.FromString(data).text.encode()
             if texts[topic] == Tag.PROLOGUE:
@@ -241,3 +253,17 @@ def _read_step(data: bytes) -> Record:
     step = schemas.Step.FromString(data)
     values = np.array([*step.rewards, *step.positions, *step.headings, *step.speeds], "<f8")
     return Record(Tag.STEP, 0, _STEP.pack(step.step, step.time_s) + values.tobytes())
+
+
+def _spines_message(payload: bytes) -> Any:
+    spines = decode_spines(payload)
+    coordinates = [value for spine in spines.values() for point in spine for value in point]
+    return schemas.Spines(rows=list(spines), points=[len(spine) for spine in spines.values()], coordinates=coordinates)
+
+
+def _read_spines(data: bytes) -> Record:
+    message = schemas.Spines.FromString(data)
+    values = np.array(list(message.coordinates), "<f8").reshape(-1, 3)
+    ends = np.cumsum(list(message.points))[:-1]
+    spines = dict(zip(message.rows, np.split(values, ends), strict=True))
+    return Record(Tag.SPINES, 0, pack_spines(spines))

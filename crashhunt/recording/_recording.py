@@ -16,13 +16,28 @@ from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.scene import Actor, Contact, Roster, Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
-__all__ = ["AgentChannel", "Prologue", "Recording", "StepRecord", "digest_of", "encode_actors", "encode_events"]
+    from crashhunt.scene import Spine
+
+__all__ = [
+    "AgentChannel",
+    "Prologue",
+    "Recording",
+    "StepRecord",
+    "decode_spines",
+    "digest_of",
+    "encode_actors",
+    "encode_events",
+    "encode_heights",
+    "encode_spines",
+    "pack_spines",
+]
 
 _STEP_HEAD = struct.Struct("<qd")
+_SPINE_HEAD = struct.Struct("<II")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +94,8 @@ class Prologue:
 
 def encode_actors(actors: Iterable[Actor]) -> bytes:
     """Return the payload that introduces actors."""
-    return json.dumps([[actor.id, actor.kind, actor.length, actor.width] for actor in actors]).encode()
+    known = [[actor.id, actor.kind, actor.length, actor.width, actor.height] for actor in actors]
+    return json.dumps([entry if entry[-1] else entry[:-1] for entry in known]).encode()
 
 
 def decode_actors(payload: bytes) -> list[Actor]:
@@ -91,6 +107,35 @@ def encode_events(scene: Scene) -> bytes:
     """Return the payload that says what touched and who left the road."""
     contacts = [[getattr(contact, name) for name in Contact.__slots__] for contact in scene.contacts]
     return json.dumps({"contacts": contacts, "off_road": list(scene.off_road)}).encode()
+
+
+def encode_heights(scene: Scene) -> bytes:
+    """Return the payload that says how high everybody is, and how steep it is there."""
+    return np.array([*scene.heights, *scene.grades], "<f8").tobytes()
+
+
+def encode_spines(scene: Scene) -> bytes:
+    """Return the payload that says how the long vehicles are bent."""
+    return pack_spines(scene.spines)
+
+
+def pack_spines(spines: Mapping[int, Any]) -> bytes:
+    """Return the payload of `encode_spines`: row to points, shape (n, 3), in m."""
+    return b"".join(
+        _SPINE_HEAD.pack(row, len(spine)) + np.array(spine, "<f8").tobytes() for row, spine in spines.items()
+    )
+
+
+def decode_spines(payload: bytes) -> dict[int, Spine]:
+    """Rebuild what `encode_spines` was given."""
+    found, offset = {}, 0
+    while offset < len(payload):
+        row, count = _SPINE_HEAD.unpack_from(payload, offset)
+        offset += _SPINE_HEAD.size
+        points = np.frombuffer(payload, "<f8", 3 * count, offset).reshape(-1, 3).tolist()
+        found[row] = tuple((x, y, z) for x, y, z in points)
+        offset += 24 * count
+    return found
 
 
 @dataclass(slots=True)
@@ -197,6 +242,8 @@ class Recording:
         current = StepRecord(0)
         lanes: tuple[str, ...] = ()
         events: dict[str, Any] = {}
+        heights: list[float] = []
+        spines: dict[int, Spine] = {}
         for record in self.records[1:]:
             tag, aux, payload = record
             if tag == Tag.OBSERVATION:
@@ -214,6 +261,10 @@ class Recording:
                 lanes = tuple(payload.decode().split("\n"))
             elif tag == Tag.EVENTS:
                 events = json.loads(payload)
+            elif tag == Tag.HEIGHTS:
+                heights = np.frombuffer(payload, "<f8").tolist()
+            elif tag == Tag.SPINES:
+                spines = decode_spines(payload)
             elif tag == Tag.STEP:
                 step, time_s = _STEP_HEAD.unpack_from(payload)
                 rewards = np.frombuffer(payload, "<f8", len(agents), _STEP_HEAD.size)
@@ -227,11 +278,16 @@ class Recording:
                 values = data.tolist()
                 points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
                 headings, speeds = values[2 * count : 3 * count], values[3 * count :]
-                current.scene = Scene(time_s, roster, points, headings, speeds, contacts, off_road, lanes)
+                if len(heights) not in (0, 2 * count) or any(row >= count for row in spines):
+                    raise ValueError(f"step {step} is about more actors than there are")
+                current.scene = Scene(
+                    time_s, roster, points, headings, speeds, contacts, off_road, lanes,
+                    heights[:count], heights[count:], spines,
+                )  # fmt: skip
                 current.scene.previous = self.all_steps[-1].scene if self.all_steps else None
                 current.rewards = {agent.id: float(reward) for agent, reward in zip(agents, rewards, strict=True)}
                 self.all_steps.append(current)
-                current, lanes, events = StepRecord(step + 1), (), {}
+                current, lanes, events, heights, spines = StepRecord(step + 1), (), {}, [], {}
         if current.observations or current.actions:
             self.all_steps.append(current)
 

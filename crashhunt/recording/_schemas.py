@@ -6,7 +6,18 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-__all__ = ["DoubleArray", "FloatArray", "IntArray", "Metrics", "Roster", "Step", "Text", "array_type"]
+__all__ = [
+    "DoubleArray",
+    "FloatArray",
+    "Heights",
+    "IntArray",
+    "Metrics",
+    "Roster",
+    "Spines",
+    "Step",
+    "Text",
+    "array_type",
+]
 
 _TYPES = {
     "double": descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE,
@@ -29,6 +40,8 @@ _MESSAGES = {
         "headings": "double*",
         "speeds": "double*",
     },
+    "Heights": {"heights": "double*", "grades": "double*"},
+    "Spines": {"rows": "uint32*", "points": "uint32*", "coordinates": "double*"},
     "Metrics": {
         "speed": "double",
         "time_to_collision_s": "double",
@@ -61,6 +74,7 @@ def _make() -> dict[str, Any]:
 
 _classes = _make()
 Text, Roster, Step, Metrics = (_classes[name] for name in ("Text", "Roster", "Step", "Metrics"))
+Heights, Spines = _classes["Heights"], _classes["Spines"]
 FloatArray, DoubleArray, IntArray = (_classes[name] for name in ("FloatArray", "DoubleArray", "IntArray"))
 
 

@@ -20,7 +20,9 @@ from mcap.reader import SeekingReader
 
 from crashhunt.errors import BundleError
 from crashhunt.oracles import approaches
+from crashhunt.outlines import levels, outlines
 from crashhunt.recording import _schemas as schemas
+from crashhunt.scene import is_person
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,6 +39,7 @@ __all__ = ["foxglove_layout", "read_lanes", "write_views"]
 
 _MAP_REACH_M = 300.0
 _HEIGHT_M = 1.5
+_PERSON_HEIGHT_M = 1.7
 _COLORS = {
     "ego": (1.0, 0.8, 0.1, 1.0),
     "agent": (0.2, 0.8, 0.4, 1.0),
@@ -186,22 +189,26 @@ def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene],
             if box is None:
                 box = boxes[actor] = _box(actor, recording.agents, parties, lifetime_ns)
             (x, y), half = centers[row], scene.headings[row] / 2
-            place = box.cubes[0].pose
-            place.position.x, place.position.y = x, y
-            z, w = math.sin(half), math.cos(half)
-            place.orientation.z, place.orientation.w = z, w
+            z = scene.heights[row] if scene.heights else 0.0
+            turn_z, turn_w = math.sin(half), math.cos(half)
+            if scene.spines or len(box.cubes) > 1:
+                _bend(box, scene, row)
+            else:
+                place = box.cubes[0].pose
+                place.position.x, place.position.y, place.position.z = x, y, z + box.cubes[0].size.z / 2
+                place.orientation.z, place.orientation.w = turn_z, turn_w
             box.timestamp.seconds, box.timestamp.nanos = seconds, nanos
             data = box.SerializeToString()
             parts.append(b"\x12" + _varint(len(data)) + data)  # field 2, entities
             child = children.get(actor.id)
             if child is not None:
                 child.timestamp.seconds, child.timestamp.nanos = seconds, nanos
-                child.translation.x, child.translation.y = x, y
-                child.rotation.z, child.rotation.w = z, w
+                child.translation.x, child.translation.y, child.translation.z = x, y, z
+                child.rotation.z, child.rotation.w = turn_z, turn_w
                 if actor.id == recording.agents[0]:
                     pose.timestamp.seconds, pose.timestamp.nanos = seconds, nanos
-                    pose.pose.position.x, pose.pose.position.y = x, y
-                    pose.pose.orientation.z, pose.pose.orientation.w = z, w
+                    pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = x, y, z
+                    pose.pose.orientation.z, pose.pose.orientation.w = turn_z, turn_w
         log.write("/scene/actors", SceneUpdate, b"".join(parts), time_ns)
         log.write("/tf", FrameTransforms, transforms.SerializeToString(), time_ns)
         log.write("/ego/pose", PoseInFrame, pose.SerializeToString(), time_ns)
@@ -222,9 +229,27 @@ def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_n
     entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
     entity.metadata.add(key="kind", value=actor.kind)
     cube = entity.cubes.add(color=_color(role))
-    cube.size.x, cube.size.y, cube.size.z = actor.length, actor.width, _HEIGHT_M
-    cube.pose.position.z = _HEIGHT_M / 2
+    height = actor.height or (_PERSON_HEIGHT_M if is_person(actor.id) else _HEIGHT_M)
+    cube.size.x, cube.size.y, cube.size.z = actor.length, actor.width, height
+    cube.pose.position.z = height / 2
     return entity
+
+
+def _bend(entity: Any, scene: Scene, row: int) -> None:
+    """Make an actor of as many cubes as it has parts in this scene."""
+    like, actor = entity.cubes[0], scene.roster.actors[row]
+    parts = list(zip(outlines(scene, row), levels(scene, row), strict=True))
+    while len(entity.cubes) < len(parts):
+        entity.cubes.add().CopyFrom(like)
+    del entity.cubes[len(parts) :]
+    for cube, ((x, y, heading, length, _), (z, _)) in zip(entity.cubes, parts, strict=True):
+        cube.size.x, cube.size.y = length, actor.width
+        cube.pose.position.x, cube.pose.position.y = (
+            x - length / 2 * math.cos(heading),
+            y - length / 2 * math.sin(heading),
+        )
+        cube.pose.position.z = z + cube.size.z / 2
+        cube.pose.orientation.z, cube.pose.orientation.w = math.sin(heading / 2), math.cos(heading / 2)
 
 
 def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
@@ -252,12 +277,13 @@ def _write_crash(log: LogWriter, recording: Recording, scene: Scene, crash: Tria
     entity = SceneEntity(id="crash", frame_id="map")
     _stamp(entity.timestamp, scene.time_s)
     text = entity.texts.add(text=str(crash.outcome), font_size=2.0, billboard=True, color=_color("party"))
-    text.pose.position.x, text.pose.position.y, text.pose.position.z = x, y, 4.0
+    z = scene.heights[row] if scene.heights else 0.0
+    text.pose.position.x, text.pose.position.y, text.pose.position.z = x, y, z + 4.0
     text.pose.orientation.w = 1.0
     ring = entity.lines.add(type=LinePrimitive.LINE_LOOP, thickness=0.3, color=_color("party"))
     ring.pose.orientation.w = 1.0
     for angle in np.linspace(0, 2 * np.pi, 32, endpoint=False).tolist():
-        ring.points.add(x=x + 5 * math.cos(angle), y=y + 5 * math.sin(angle), z=0.1)
+        ring.points.add(x=x + 5 * math.cos(angle), y=y + 5 * math.sin(angle), z=z + 0.1)
     log.write("/scene/crash", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), time_ns)
 
 

@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw
 
 from crashhunt.outlines import corners
 from crashhunt.render._draw import FAINT, INK, as_array, font
+from crashhunt.scene import is_person
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +24,7 @@ __all__ = ["SceneView"]
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
 _EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
 _TRAIL_S = 4.0
+_PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _FINE = 2  # drawn so many times larger, for smooth edges
 _LEGEND_STEP = 22
 
@@ -79,8 +81,9 @@ class SceneView:
         self._draw_road(draw)
         for name, color in ((self._other, _CRASH), (self._agent, _EGO)):
             self._draw_trail(draw, name, color, step)
-        for other, actor in enumerate(scene.roster.actors):
-            self._draw_vehicle(draw, scene, other, self._color(actor.id))
+        order = range(len(scene.roster))
+        for other in sorted(order, key=scene.heights.__getitem__) if scene.heights else order:
+            self._draw_actor(draw, scene, other, self._color(scene.roster.actors[other].id))
         if step == self._crash_step and row is not None:
             x, y = self._place(np.array([scene.points[row]]))[0]
             for radius in (34, 38):
@@ -117,15 +120,22 @@ class SceneView:
             pale = tuple((part + 255) // 2 for part in color)
             draw.line(self._place(np.array(points)).ravel().tolist(), fill=pale, width=2 * _FINE)
 
-    def _draw_vehicle(self, draw: ImageDraw.ImageDraw, scene: Scene, row: int, color: tuple[int, int, int]) -> None:
+    def _draw_actor(self, draw: ImageDraw.ImageDraw, scene: Scene, row: int, color: tuple[int, int, int]) -> None:
         outline = self._place(corners(scene, row))
-        if not ((outline > -50).all() and (outline < np.array([self.width, self.height]) * _FINE + 50).all()):
+        dark = tuple(part // 2 for part in color)
+        if not ((outline > -50) & (outline < np.array([self.width, self.height]) * _FINE + 50)).all(axis=1).any():
             return
-        draw.polygon(outline.ravel().tolist(), fill=color, outline=tuple(part // 2 for part in color))
-        front, back = (outline[0] + outline[3]) / 2, (outline[1] + outline[2]) / 2
-        glass = [front + (back - front) * share + (outline[0] - outline[3]) * side
+        if is_person(scene.roster.actors[row].id):
+            x, y = outline.mean(axis=0)
+            radius = max(_PERSON_PIXELS * _FINE, float(np.ptp(outline, axis=0).max()) / 2)
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color, outline=dark)
+            return
+        draw.polygon(outline.ravel().tolist(), fill=color, outline=dark)
+        front_left, back_left, back_right, front_right = outline[[0, 1, -2, -1]]
+        front, back = (front_left + front_right) / 2, (back_left + back_right) / 2
+        glass = [front + (back - front) * share + (front_left - front_right) * side
                  for share, side in ((0.22, 0.38), (0.34, 0.42), (0.34, -0.42), (0.22, -0.38))]  # fmt: skip
-        draw.polygon(np.array(glass).ravel().tolist(), fill=tuple(part // 2 for part in color))
+        draw.polygon(np.array(glass).ravel().tolist(), fill=dark)
 
     def _color(self, name: str) -> tuple[int, int, int]:
         if name == self._agent:

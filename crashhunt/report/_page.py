@@ -160,9 +160,14 @@ def _scenes(recording: Recording, agent: str) -> dict[str, Any]:
     """All scenes as columns: float32, shape (steps, actors, 4), x and y from the first position of the agent."""
     scenes = recording.scenes()
     names: dict[str, Any] = {}
+    highest: dict[str, float] = {}
     for scene in scenes:
-        for actor in scene.roster.actors:
+        for row, actor in enumerate(scene.roster.actors):
             names.setdefault(actor.id, actor)
+            if scene.heights:
+                highest[actor.id] = max(highest.get(actor.id, -math.inf), scene.heights[row])
+    if highest:  # the page draws them in this order
+        names = dict(sorted(names.items(), key=lambda entry: highest.get(entry[0], 0.0)))
     place = {name: number for number, name in enumerate(names)}
     table = np.full((len(scenes), len(names), 4), np.nan)
     for number, scene in enumerate(scenes):
@@ -184,6 +189,11 @@ def _scenes(recording: Recording, agent: str) -> dict[str, Any]:
         "origin": origin.tolist(),
         "time0": scenes[0].time_s if scenes else 0.0,
         "actors": [[actor.id, actor.kind, actor.length, actor.width] for actor in names.values()],
+        "bends": [
+            [number, place[scene.roster.actors[row].id], np.round(np.array(spine)[:, :2] - origin, 2).ravel().tolist()]
+            for number, scene in enumerate(scenes)
+            for row, spine in scene.spines.items()
+        ],
         "steps": len(scenes),
         "table": _packed(table),
         "ttc": _packed(times),

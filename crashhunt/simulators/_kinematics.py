@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.outlines import on_one_level
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -20,10 +22,19 @@ if TYPE_CHECKING:
 
 __all__ = ["Kinematics"]
 
-_ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h")
+_ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
 _USUAL = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 # highway-env's: five and two times its top speed of 40 m/s, and its lane width of 4 m.
 _RANGE_X, _RANGE_V, _LANE_WIDTH = 200.0, 80.0, 4.0
+
+# What `kind` says about an actor, by the simulator's word for it; nobody is 0, and what is not listed a motor vehicle.
+_MOTOR, _TWO_WHEELS, _PERSON, _RAIL, _OBSTACLE = 1.0, 2.0, 3.0, 4.0, 5.0
+_KINDS = {
+    **dict.fromkeys(("bicycle", "motorcycle", "moped", "scooter"), _TWO_WHEELS),
+    **dict.fromkeys(("pedestrian", "wheelchair"), _PERSON),
+    **dict.fromkeys(("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"), _RAIL),
+    **dict.fromkeys(("Obstacle", "Landmark"), _OBSTACLE),
+}
 
 
 class Kinematics:
@@ -33,7 +44,11 @@ class Kinematics:
     centre it is (m), vx and vy its speed along and across the lane (m/s), its heading that in the map. The other rows
     are the nearest actors, nearest first, as seen from the vehicle: x ahead, y to the right (m), velocity and heading
     relative to its own. Headings grow clockwise, as y points to the right. Rows without an actor are 0. On a straight
-    road along the x axis this is what highway-env shows.
+    road along the x axis this is what highway-env shows. Who is on another level, on a bridge above or a road below, is
+    not shown: it looks like somebody in the way and never is.
+
+    `kind`, which only who asks for is shown, is 1 for a motor vehicle, 2 for a two-wheeler (bicycle, motorcycle), 3
+    for a person on foot, 4 for what runs on rails, 5 for an obstacle; a fifth of that where normalised.
 
     Scalars go through the C library's sine and cosine: NumPy's own differ between processors in the last bit.
 
@@ -62,9 +77,9 @@ class Kinematics:
 
         limits = dict.fromkeys(_ALL, 1.0) | {"heading": float(np.float32(np.pi))}
         if not self._normalize:
-            limits |= {"x": 1e6, "y": 1e6, "vx": 1e3, "vy": 1e3}
+            limits |= {"x": 1e6, "y": 1e6, "vx": 1e3, "vy": 1e3, "kind": _OBSTACLE}
         high = np.tile([limits[feature] for feature in self.features], (self.shape[0], 1)).astype(np.float32)
-        low = np.where([feature == "presence" for feature in self.features], 0.0, -high).astype(np.float32)
+        low = np.where([feature in ("presence", "kind") for feature in self.features], 0.0, -high).astype(np.float32)
         return spaces.Box(low, high, self.shape, np.float32)
 
     def blank(self) -> NDArray[np.float32]:
@@ -91,10 +106,14 @@ class Kinematics:
         center_x, center_y = x - half * own_cos, y - half * own_sin
         own_vx, own_vy = speed * own_cos, speed * own_sin
         select = self._select if not self._normalize else self._normalized(lanes)
-        own = (1.0, distance, from_left, speed, lateral_speed, atan2(-own_sin, own_cos), own_cos, -own_sin)
+        kind = _KINDS.get(actors[row].kind, _MOTOR)
+        own = (1.0, distance, from_left, speed, lateral_speed, atan2(-own_sin, own_cos), own_cos, -own_sin, kind)
         values = [*select(own)]
         usual = self._usual
-        nearest = scene.neighbors(row)[: self._others]
+        nearest = scene.neighbors(row)
+        if scene.heights:
+            nearest = [(squared, other) for squared, other in nearest if on_one_level(scene, row, other)]
+        nearest = nearest[: self._others]
         for _, other in nearest:
             heading = headings[other]
             c, s = cos(heading), sin(heading)
@@ -110,13 +129,14 @@ class Kinematics:
                 values += (1.0, ahead, right, faster, drift, turn_cos, turn_sin)
             else:
                 turn = atan2(turn_sin, turn_cos)
-                values += select((1.0, ahead, right, faster, drift, turn, turn_cos, turn_sin))
+                kind = _KINDS.get(actors[other].kind, _MOTOR)
+                values += select((1.0, ahead, right, faster, drift, turn, turn_cos, turn_sin, kind))
         values += self._blank * (self._others - len(nearest))
         return np.frombuffer(self._pack(*values), "<f4").reshape(self.shape)
 
     def _normalized(self, lanes: int) -> Callable[[tuple[float, ...]], tuple[float, ...]]:
         range_y = _LANE_WIDTH * max(lanes, 1)
-        ranges = (1.0, _RANGE_X, range_y, _RANGE_V, _RANGE_V, 0.0, 0.0, 0.0)
+        ranges = (1.0, _RANGE_X, range_y, _RANGE_V, _RANGE_V, 0.0, 0.0, 0.0, _OBSTACLE)
 
         def select(values: tuple[float, ...]) -> tuple[float, ...]:
             scaled = [

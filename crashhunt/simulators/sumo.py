@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import weakref
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +12,13 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
+from crashhunt.scene import PERSON, Lane, is_person
 from crashhunt.setups import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._sumo_files import StagedFiles
+from crashhunt.simulators._sumo_sight import Sight
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,24 +28,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
+    from crashhunt.scene import Scene
     from crashhunt.setups import AgentSetup
     from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
 
 __all__ = ["SumoSimulator"]
 
-SIGHT_M = 150.0
-"""A scene has the vehicles that were within this distance of a controlled one when it last looked around. What is
-further away has no part in a crash, and a town has thousands of vehicles."""
-
-LOOK_AROUND_EVERY = 10
-"""Steps from one look around to the next, and whenever a vehicle enters or leaves. Also how often a scene says the
-lane of each vehicle: a string each is too dear for every step."""
-
-_SIGHT_SQUARED = SIGHT_M**2
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _SEEN_M = 150.0  # of the network, in a window that follows a vehicle
 _KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
-_RADIANS = math.pi / 180.0
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
 
@@ -73,7 +64,7 @@ class SumoSimulator:
         # Without these options of SUMO a vehicle is always in the middle of a lane.
         options = scenario.sumo.options if scenario.sumo else {}
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
-        self._known: dict[str, Actor] = {}
+        self._sight = Sight(tuple(scenario.agents), scenario.step_length_s, lateral=self._lateral)
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._lanes: list[Lane] | None = None
@@ -89,11 +80,13 @@ class SumoSimulator:
         return bool(libsumo.isLoaded())
 
     def follow(self, agent: str, other: str) -> None:
-        """Mark two vehicles in the window, and keep the first in view."""
+        """Mark two actors in the window, and keep the first in view."""
         present = sumo.vehicle_getIDList()
         for name, color in ((agent, _FOLLOWED), (other, _MARKED)):
             if name in present:
                 libsumo.vehicle.setColor(name, color)
+            elif is_person(name) and name.removeprefix(PERSON) in sumo.person_getIDList():
+                libsumo.person.setColor(name.removeprefix(PERSON), color)
         if agent in present:
             (view, *_) = libsumo.gui.getIDList()
             if libsumo.gui.getTrackedVehicle(view) != agent:
@@ -118,9 +111,7 @@ class SumoSimulator:
         self._targets = dict.fromkeys(self.agents, -1)
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._steps = 0
-        self._touched: set[tuple[str, str]] = set()
-        self._ids: tuple[str, ...] = ()
-        self._known.clear()  # the same id may be another vehicle now
+        self._sight.reset()
         self._off_road: list[str] = []
         self._look()
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}, {}
@@ -292,79 +283,8 @@ class SumoSimulator:
         return found
 
     def _look(self) -> None:
-        """Read the state of the vehicles in sight."""
-        if (
-            self._steps % LOOK_AROUND_EVERY == 0
-            or sumo.simulation_getDepartedNumber()
-            or sumo.simulation_getArrivedNumber()
-            or sumo.simulation_getStartingTeleportNumber()
-            or sumo.simulation_getEndingTeleportNumber()
-        ):
-            self._look_around()
-        ids = self._ids
-        contacts = self._contacts()
-        lanes: tuple[str, ...] = ()
-        if self._steps % LOOK_AROUND_EVERY == 0 or contacts or self._off_road:
-            lanes = tuple(map(sumo.vehicle_getLaneID, ids))
-        self._scene = Scene(
-            sumo.simulation_getTime(),
-            self._roster,
-            list(map(sumo.vehicle_getPosition, ids)),
-            # SUMO's angles are in degrees, clockwise from north.
-            [(90.0 - angle) * _RADIANS for angle in map(sumo.vehicle_getAngle, ids)],
-            list(map(sumo.vehicle_getSpeed, ids)),
-            contacts,
-            tuple(self._off_road),
-            lanes,
-            swept=True,
-        )
-
-    def _look_around(self) -> None:
-        """Choose the vehicles in sight: those near a controlled one, and the controlled ones themselves."""
-        everybody = sumo.vehicle_getIDList()
-        points = list(map(sumo.vehicle_getPosition, everybody))
-        controlled = self._scenario.agents
-        seen: set[str] = set()
-        for eye in controlled:
-            if eye in everybody:
-                ex, ey = points[everybody.index(eye)]
-                seen.update(
-                    [
-                        vehicle
-                        for vehicle, (x, y) in zip(everybody, points, strict=True)
-                        if (x - ex) * (x - ex) + (y - ey) * (y - ey) < _SIGHT_SQUARED
-                    ]
-                )
-        ids = tuple([vehicle for vehicle in everybody if vehicle in seen])
-        if ids != self._ids:
-            self._ids = ids
-            self._roster = Roster(tuple(self._actor(vehicle) for vehicle in ids))
-
-    def _actor(self, vehicle: str) -> Actor:
-        found = self._known.get(vehicle)
-        if found is None:
-            length, width = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle)
-            found = self._known[vehicle] = Actor(vehicle, sumo.vehicle_getVehicleClass(vehicle), length, width)
-        return found
-
-    def _contacts(self) -> tuple[Contact, ...]:
-        """The collisions that began in this step; SUMO repeats one as long as it lasts."""
-        found = []
-        for collision in sumo.simulation_getCollisions():
-            pair = (collision.collider, collision.victim)
-            if pair not in self._touched:
-                self._touched.add(pair)
-                found.append(
-                    Contact(
-                        collision.collider,
-                        collision.victim,
-                        collision.type,
-                        collision.lane,
-                        collision.colliderSpeed,
-                        collision.victimSpeed,
-                    )
-                )
-        return tuple(found)
+        """Read the state of everybody in sight."""
+        self._scene = self._sight.look(self._steps, self._off_road)
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
         edge = sumo.vehicle_getRoadID(agent)

@@ -17,6 +17,8 @@ from crashhunt.recording import (
     Tag,
     encode_actors,
     encode_events,
+    encode_heights,
+    encode_spines,
     read_black_box,
 )
 from crashhunt.scene import Actor, Contact, Roster, Scene
@@ -84,10 +86,20 @@ def write(episode: Episode, path: Path) -> int:
         points = [tuple(map(float, point)) for point in rng.normal(scale=50, size=(count, 2))]
         headings, speeds = rng.uniform(-4, 2, count).tolist(), rng.uniform(0, 30, count).tolist()
         scene = Scene(20 + step * 0.1, roster, points, headings, speeds, contacts, (), lanes)
+        if episode.seed % 3 == 0:
+            scene.heights, scene.grades = rng.normal(size=(2, count)).tolist()
+            if step % 4 == 1:
+                scene.spines = {
+                    row: tuple(map(tuple, rng.normal(size=(3 + row, 3)).tolist())) for row in range(2)[:count]
+                }
         if lanes:
             box.append(Tag.LANES, 0, "\n".join(lanes).encode())
         if contacts:
             box.append(Tag.EVENTS, 0, encode_events(scene))
+        if scene.heights:
+            box.append(Tag.HEIGHTS, 0, encode_heights(scene))
+        if scene.spines:
+            box.append(Tag.SPINES, 0, encode_spines(scene))
         box.step(step, scene, tuple(rng.normal(size=len(channels)).tolist()))
     if episode.unfinished:
         box.observation(0, np.zeros((3, 2), episode.dtype))

@@ -171,3 +171,22 @@ def test_the_observation_has_the_layout_of_highway_env(normalize):
     # They choose neighbours by distance along the lane, we by distance; the nearest is compared, and how it is shown.
     shown = {tuple(np.round(other, 3)) for other in theirs[1:]}
     assert sum(tuple(np.round(other, 3)) in shown for other in ours[1:]) >= 4
+
+
+def test_the_kind_is_shown_to_who_asks_for_it():
+    kinds = {"ego": "truck", "a": "pedestrian", "b": "bicycle", "c": "tram", "d": "Obstacle", "e": "passenger"}
+    roster = Roster(tuple(Actor(name, kind, 4.0, 1.8) for name, kind in kinds.items()))
+    points = [(10.0 * place, 0.0) for place in range(len(kinds))]
+    scene = Scene(0.0, roster, points, [0.0] * len(kinds), [1.0] * len(kinds))
+
+    def seen(**setup):
+        kinematics = Kinematics(ObservationSetup(**setup))
+        shown = kinematics.observe(scene, 0, distance=0, from_left=0, lateral_speed=0, lanes=1)
+        assert kinematics.space.contains(shown)
+        return shown
+
+    assert seen(vehicles=7, features=("kind", "presence"))[:, 0].tolist() == [1, 3, 2, 4, 5, 1, 0]
+    assert seen(vehicles=3, features=("presence", "kind"), normalize=True)[1, 1] == pytest.approx(0.6)
+    assert seen().shape == (8, 7)
+    scene.heights, scene.grades = (0.0, 8.0, 0.0, 0.0, 0.0, 0.0), (0.0,) * 6
+    assert seen(vehicles=7, features=("kind", "presence"))[:, 0].tolist() == [1, 2, 4, 5, 1, 0, 0]
