@@ -17,6 +17,7 @@ from crashhunt.executors import PoolExecutor, WorkerSettings, read_map, scratch_
 from crashhunt.ledger import Ledger
 from crashhunt.plan import spec_of, with_settings
 from crashhunt.plugins import locate
+from crashhunt.preflight import Preflight
 from crashhunt.progress import HuntReport, HuntStatus, Progress, StoppedBecause
 from crashhunt.replays import confirm
 from crashhunt.simulators._sumo_says import explained
@@ -194,6 +195,9 @@ class Hunt:
         waiting = iter(number for number in range(settings.trials) if number not in finished)
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))
         executor = PoolExecutor(worker_settings, parallel=parallel, recycle_after=run.recycle_after)
+        preflight = Preflight(
+            settings, settings.trials - len(finished), files=snapshot.argument_files, code=snapshot.code
+        )
         in_flight: set[int] = set()
         heartbeat = 0.0
         try:
@@ -209,7 +213,8 @@ class Hunt:
                     break
                 for result in executor.completed(_TICK_S):
                     in_flight.discard(result.spec.number)
-                    self._take(result, ledger, snapshot, sampler, progress)
+                    for known in preflight.sift(result):
+                        self._take(known, ledger, snapshot, sampler, progress)
                     if result.outcome in settings.crash_on and not run.keep_going:
                         above = min(progress.found) if run.deterministic else -1
                         executor.cancel(above=above)

@@ -59,7 +59,10 @@ class NumpyPolicy:
             self._rows, self._columns, self._scale = int(data["rows"]), data["columns"], data["scale"]
             self._target_speeds = data["target_speeds"].tolist()
             self._hold = max(1, round(float(data["period_s"]) / step_length_s))
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            values = self.evaluate(np.zeros(self._rows * len(self._columns), np.float32))
+            if values.shape != (len(_MEANINGS),):
+                raise ValueError(f"they give values of the shape {values.shape}, not ({len(_MEANINGS)},)")
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise ValueError(f"{path!r} has no weights of a policy: {error}") from error
         self.reset(0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,10 +31,14 @@ class StableBaselines3:
         algorithm: the class of the model, or ``module:Class`` such as ``sb3_contrib:TQC``.
         deterministic: take the most probable action; otherwise draw one.
         observation_space: of the vehicle.
+        action_space: of the vehicle.
 
     Raises:
-        ValueError: there is no such file or algorithm, or the model was trained on other observations.
+        ValueError: there is no such file or algorithm, the file is no model of that algorithm, or the model was trained
+            on other observations or actions.
     """
+
+    libraries = ("stable_baselines3",)  # imported before any trial's time runs
 
     def __init__(
         self,
@@ -41,16 +46,29 @@ class StableBaselines3:
         algorithm: Annotated[str, Argument("algorithm", help=f"its class: {', '.join(_ALGORITHMS)}")] = "PPO",
         deterministic: Annotated[bool, Argument("deterministic", help="the most probable action")] = True,
         observation_space: Space[Any] | None = None,
+        action_space: Space[Any] | None = None,
     ) -> None:
         module, _, name = algorithm.rpartition(":")
         if not module and name not in _ALGORITHMS:
             raise ValueError(f"algorithm {algorithm!r} is none of {', '.join(_ALGORITHMS)}, and not module:Class")
-        kind = getattr(_library(module or "stable_baselines3", "sb3"), name)
-        self._model = kind.load(_existing(path), device="cpu")
+        kind = getattr(_library(module or "stable_baselines3", "sb3"), name, None)
+        if kind is None:
+            raise ValueError(f"algorithm {algorithm!r}: {module} has no class {name!r}")
+        file = _existing(path)
+        try:
+            self._model = kind.load(file, device="cpu")
+        except Exception as error:
+            why = f"{type(error).__name__}: {_line(error)}"
+            raise ValueError(
+                f"{path!r} is no model of {name}, or of another version of its libraries ({why})"
+            ) from error
         self._deterministic = deterministic
         trained = self._model.observation_space
         if observation_space is not None and _shape(trained) != _shape(observation_space):
             raise ValueError(f"the model was trained on {trained}, and the vehicle is shown {observation_space}")
+        decides = self._model.action_space
+        if action_space is not None and _choices(decides) != _choices(action_space):
+            raise ValueError(f"the model was trained to act in {decides}, and the vehicle's actions are {action_space}")
 
     def reset(self, seed: int) -> None:
         """Forget the hidden state, and seed the model."""
@@ -75,10 +93,38 @@ class _Network(ABC):
         path: Annotated[str, Argument("path", help="of the weights, with their layers")],
         flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
         action_space: Space[Any] | None = None,
+        observation_space: Space[Any] | None = None,
     ) -> None:
-        self._load(path)
+        try:
+            self._load(path)
+        except ValueError:
+            raise
+        except Exception as error:
+            raise ValueError(f"{path!r} cannot be loaded: {type(error).__name__}: {_line(error)}") from error
         self._flatten = flatten
         self._space = action_space
+        if observation_space is not None and observation_space.shape is not None:
+            self._try(path, observation_space)
+
+    def _try(self, path: str, shown: Space[Any]) -> None:
+        """Ask once, to find out whether observations go in and actions come out."""
+        blank = np.zeros(shown.shape or (), np.float32)
+        batch = blank.reshape(1, -1) if self._flatten else blank[None]
+        try:
+            values = np.asarray(self._answer(batch))
+        except Exception as error:
+            why = f"{type(error).__name__}: {_line(error)}"
+            raise ValueError(f"{path!r} does not take observations of the shape {batch.shape} ({why})") from error
+        wanted = int(getattr(self._space, "n", 0)) or math.prod(getattr(self._space, "shape", None) or ())
+        if values.shape[:1] != (1,) or (wanted and values[0].size != wanted):
+            raise ValueError(
+                f"{path!r} answers one observation with the shape {values.shape}; (1, {wanted}) is needed for actions "
+                f"in {self._space}"
+            )
+        self._forget(path)
+
+    def _forget(self, path: str) -> None:  # noqa: B027 - most remember nothing
+        """Be as if nobody had asked."""
 
     @abstractmethod
     def _load(self, path: str) -> None:
@@ -108,10 +154,13 @@ class TorchPolicy(_Network):
         path: of the module.
         flatten: whether it expects observations as one row of numbers.
         action_space: of the vehicle.
+        observation_space: of the vehicle.
 
     Raises:
-        ValueError: there is no such file.
+        ValueError: there is no such file, or it takes other observations or answers with another number of values.
     """
+
+    libraries = ("torch",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
         self._torch = _library("torch", "torch")
@@ -120,6 +169,10 @@ class TorchPolicy(_Network):
             self._module = self._torch.export.load(file).module()
         else:
             self._module = self._torch.jit.load(str(file), map_location="cpu").eval()
+
+    def _forget(self, path: str) -> None:
+        if any(True for _ in self._module.buffers()):  # in which a module may remember
+            self._load(path)
 
     def reset(self, seed: int) -> None:
         """Seed the generator of PyTorch."""
@@ -138,10 +191,13 @@ class OnnxPolicy(_Network):
         path: of the model.
         flatten: whether it expects observations as one row of numbers.
         action_space: of the vehicle.
+        observation_space: of the vehicle.
 
     Raises:
-        ValueError: there is no such file.
+        ValueError: there is no such file, or it takes other observations or answers with another number of values.
     """
+
+    libraries = ("onnxruntime",)  # imported before any trial's time runs
 
     def _load(self, path: str) -> None:
         runtime = _library("onnxruntime", "onnx")
@@ -169,6 +225,18 @@ def _existing(path: str) -> Path:
     if not Path(path).is_file():
         raise ValueError(f"there is no file {path!r}")
     return Path(path)
+
+
+def _line(error: BaseException) -> str:
+    """The message of a library in one line of at most 200 characters."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else f"{text[:199]}…"
+
+
+def _choices(space: Any) -> Any:
+    """What tells spaces of actions apart as far as a policy's answers go: kind, shape and number."""
+    sizes = getattr(space, "n", None) if hasattr(space, "n") else getattr(space, "nvec", ())
+    return type(space).__name__, _shape(space), np.asarray(sizes).tolist()
 
 
 def _shape(space: Any) -> Any:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +56,10 @@ class Parts:
         for module in scenario.modules():
             import_module(module)
         for agent in scenario.agents:
-            self._factory(agent)
+            factory, _ = self._factory(agent)
+            for library in getattr(factory, "libraries", ()):  # PyTorch takes longer than a short trial may
+                with suppress(ImportError):  # which the agent itself will tell
+                    importlib.import_module(library)
 
     def simulator(self) -> Simulator:
         """Make a simulator, with a folder for files of its own."""

@@ -149,6 +149,42 @@ class TestOnnxPolicy(_Policy):
         assert [plain.act(seen) - 1 for seen in observations] == [shifted.act(seen) for seen in observations]
 
 
+@pytest.mark.parametrize(
+    ("shown", "actions", "says"),
+    [
+        ((8, 7), spaces.Discrete(9), r"the shape \(1, 5\); \(1, 9\) is needed for actions in Discrete\(9\)"),
+        ((8, 7), BOX, r"\(1, 2\) is needed"),
+        ((5, 5), spaces.Discrete(5), r"does not take observations of the shape \(1, 25\)"),
+    ],
+)
+def test_a_model_of_another_shape_is_refused(linear, shown, actions, says):
+    seen = spaces.Box(-1.0, 1.0, shown, np.float32)
+    OnnxPolicy(linear[1], action_space=spaces.Discrete(5), observation_space=spaces.Box(-1.0, 1.0, (8, 7), np.float32))
+    with pytest.raises(ValueError, match=says):
+        OnnxPolicy(linear[1], action_space=actions, observation_space=seen)
+
+
+def test_a_file_that_is_no_model_is_refused_in_one_line(tmp_path):
+    pytest.importorskip("onnxruntime")
+    (tmp_path / "text.onnx").write_text("hello")
+    with pytest.raises(ValueError, match="cannot be loaded: InvalidProtobuf") as caught:
+        OnnxPolicy(str(tmp_path / "text.onnx"))
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_do_not_fit_together_are_refused(tmp_path):
+    with np.load(WEIGHTS) as file:
+        data = dict(file)
+    last = max(name for name in data if name.startswith("bias_"))[-1]
+    np.savez(tmp_path / "nine.npz", **{**data, f"weight_{last}": np.ones((9, len(data[f"bias_{int(last) - 1}"]))),
+                                       f"bias_{last}": np.ones(9)})  # fmt: skip
+    with pytest.raises(ValueError, match=r"values of the shape \(9,\), not \(5,\)"):
+        NumpyPolicy(str(tmp_path / "nine.npz"))
+    np.savez(tmp_path / "cut.npz", **{**data, "columns": data["columns"][:-1]})
+    with pytest.raises(ValueError, match="no weights of a policy"):
+        NumpyPolicy(str(tmp_path / "cut.npz"))
+
+
 class TestOnnxPolicyThatSteers(_Policy):
     @pytest.fixture
     def form(self):
@@ -195,6 +231,14 @@ class TestStableBaselines3(_Policy):
         other = spaces.Box(-1.0, 1.0, (3,), np.float32)
         with pytest.raises(ValueError, match="was trained on"):
             StableBaselines3(str(tmp_path / "model.zip"), algorithm=algorithm, observation_space=other)
+
+    def test_a_model_of_other_actions_or_of_another_algorithm_is_refused(self, make, request, tmp_path):
+        make()
+        algorithm, file = request.node.callspec.params["make"], str(tmp_path / "model.zip")
+        with pytest.raises(ValueError, match=r"was trained to act in Discrete\(5\)"):
+            StableBaselines3(file, algorithm=algorithm, action_space=spaces.Discrete(9))
+        with pytest.raises(ValueError, match="is no model of"):
+            StableBaselines3(file, algorithm={"PPO": "DQN", "DQN": "PPO"}[algorithm])
 
 
 @pytest.mark.parametrize("kind", [StableBaselines3, TorchPolicy, OnnxPolicy])

@@ -82,15 +82,24 @@ def test_the_log_of_a_dead_process_ends_with_the_step_before(shell):
     assert not recording.all_steps[-1].whole
 
 
-@pytest.mark.parametrize("agent", ["FailsToStart", "DiesAtStart"])
-def test_a_start_up_failure_is_no_crash(shell, agent):
-    done = shell.crashhunt("run", "h", "2", "500", "100", "--agent", f"faulty:{agent}", *QUIET, "--json", expect=3)
+def test_an_agent_that_does_not_start_is_refused_at_once(shell):
+    """It once was so many trials that could not be set up."""
+    done = shell.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:FailsToStart", *QUIET, "--json", expect=2)
+    assert done.json["error"]["message"] == "faulty:FailsToStart does not start: RuntimeError: no weights"
+    assert done.json["error"]["where"] == "faulty.py:93"
+    (hunt,) = shell.crashhunt("status", "h", "--json").json["hunts"]
+    assert (hunt["state"], hunt["trials_run"], hunt["crashes"]) == ("error", 0, 0)
+    assert "no weights" in hunt["detail"]
+
+
+def test_a_start_up_failure_is_no_crash(shell):
+    done = shell.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:DiesAtStart", *QUIET, "--json", expect=3)
     report = done.json
     assert report["stopped_because"] == "no_valid_trial"
     assert set(report["outcomes"]) == {"invalid"}
     assert report["trials_run"] < 50
     assert report["crashes"] == []
-    assert "no weights" in done.err or "exited with 7" in done.err
+    assert "exited with 7" in done.err
 
 
 def test_a_traffic_crash_says_who_hit_whom(shell):

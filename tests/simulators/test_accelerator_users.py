@@ -285,6 +285,7 @@ def played(number, *, fast):
         if when == "first":
             change(rng, None, changes)
         env = gymnasium.make(name, disable_env_checker=True).unwrapped
+        changes.calls.clear()  # making one plays an episode of no seed
         config = {**ENVIRONMENTS[name], "simulation_frequency": 5}
         trace.append(plain(env.reset(seed=number, options={"config": config})[0]))
         if when == "reset":
