@@ -133,9 +133,27 @@ class Story:
                 moment = moments.get(step.step)
                 cells += ["-"] * 5 if moment is None else _cells(moment)
                 cells = cells if drives_into else cells[:-1]
-            mark = "" if step.step != self.escape else "<- the last step after which braking helps"
-            rows.append([*cells, mark])
+            rows.append([*cells, self._mark(step.step, moments.get(step.step))])
         return aligned([header, *rows])
+
+    def _mark(self, step: int, moment: Moment | None) -> str:
+        """What is said beside a row of the table."""
+        if step == self.escape:
+            return "<- the last step after which braking helps"
+        hit = self.bundle.result.collision
+        if hit is None or moment is None or step != self.recording.steps:
+            return ""
+        own, its = self._speeds_at_contact()
+        same = abs(own - moment.speed) < _STANDS and abs(its - moment.other_speed) < _STANDS
+        return "" if same or math.isnan(own) or math.isnan(its) else f"<- they touched at {own:.1f} and {its:.1f} m/s"
+
+    def _speeds_at_contact(self) -> tuple[float, float]:
+        """The agent's and the other's; not a number where nobody knows."""
+        hit = self.bundle.result.collision
+        if hit is None:
+            return math.nan, math.nan
+        pair = hit.collider_speed, hit.victim_speed
+        return pair if hit.role == "collider" else pair[::-1]
 
     def _about_encounter(self, encounter: Encounter) -> list[str]:
         agent, other = encounter.agent, encounter.other
@@ -157,11 +175,8 @@ class Story:
                 ),
                 f"{self._end_s - middle.time_s:.1f} s before, {other} was {where}.",
             ]
-        hit = self.bundle.result.collision
-        assert hit is not None
-        speeds = [hit.collider_speed, hit.victim_speed]
-        if all(map(math.isfinite, speeds)):
-            own, its = speeds if hit.role == "collider" else reversed(speeds)
+        own, its = self._speeds_at_contact()
+        if math.isfinite(own) and math.isfinite(its):
             sentences.append(f"When they touched, {agent} drove {own:.1f} m/s and {other} {its:.1f} m/s.")
         changed = self._last_lane_change()
         if changed is not None:

@@ -121,6 +121,27 @@ class SimulatorContract:
                     form.encode(nonsense)
         simulator.close()
 
+    def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
+        """Where a simulator offers ``full_braking``, its action is inside the space, and slows the vehicle down."""
+        simulator = make()
+        simulator.reset(seed=1)
+        offered: Callable[[str], Any] = getattr(simulator, "full_braking", lambda _: None)
+        for agent in simulator.agents:
+            braking = offered(agent)
+            if any(offered(other) is None for other in simulator.agents):
+                continue
+            simulator.reset(seed=1)
+            before = simulator.scene().speeds[simulator.scene().roster.index[agent]]
+            for _ in range(3):
+                if agent in simulator.agents:
+                    actions = {a: simulator.actions[a].encode(offered(a).action) for a in simulator.agents}
+                    simulator.step(actions)
+            scene = simulator.scene()
+            row = scene.roster.index.get(agent)
+            assert row is None or scene.speeds[row] <= before + 1e-6
+            assert braking.deceleration is None or braking.deceleration > 0
+        simulator.close()
+
     def test_closing_twice_is_fine(self, make: Make) -> None:
         """Closing lets go of everything, once."""
         simulator = make()
