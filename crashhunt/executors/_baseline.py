@@ -148,6 +148,9 @@ class Baseline:
                 self._walk(name, module, 0)
 
     def _is_users(self, module: object) -> bool:
+        # crashhunt itself is in the folders of code too, where it comes from a snapshot.
+        if getattr(module, "__name__", "").partition(".")[0] == "crashhunt":
+            return False
         file = getattr(module, "__file__", None)
         return isinstance(file, str) and file.startswith(self._code) and "site-packages" not in file
 

@@ -188,7 +188,7 @@ def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Es
     """Until when braking would have avoided a crash, by trials in this process, whose simulator is warm."""
     from crashhunt.escape import find_escape
 
-    if result.collision is None or worker.change:  # which the further trials would depend on
+    if result.collision is None or worker.change:  # on which the further trials would depend
         return None
     braking = worker.full_braking(result.collision.agent)
     if braking is None:
@@ -199,6 +199,8 @@ def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Es
         return Recording(read_black_box(scratch_of(settings.scratch, number) / BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
+        if worker.change:
+            raise BundleError("the trial before has changed this process")
         number = next(numbers)
         done = worker.run(replace(spec, number=number))
         return done, recording(number)
