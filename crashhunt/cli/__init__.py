@@ -26,6 +26,7 @@ from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
 from crashhunt.errors import CrashhuntError, UsageError, remedy
+from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -82,7 +83,7 @@ def _run(words: Sequence[str]) -> int:
 
 def _report(error: CrashhuntError, *, as_json: bool) -> int:
     with suppress(OSError):
-        print(f"crashhunt: {error}", file=sys.stderr, flush=True)
+        print(one_line(f"crashhunt: {error}"), file=sys.stderr, flush=True)
     if as_json:
         try:
             print(json.dumps(error.to_json()), flush=True)

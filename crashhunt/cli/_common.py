@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt._names import did_you_mean, one_of
 from crashhunt.errors import UsageError
+from crashhunt.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -129,7 +130,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
 
 def say(text: str, *, as_json: bool) -> None:
     """Print what is for people."""
-    print(text, file=sys.stderr if as_json else sys.stdout)
+    print(visible(text), file=sys.stderr if as_json else sys.stdout)
 
 
 def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str]:

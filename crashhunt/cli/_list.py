@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json
+from crashhunt.text import one_line, visible
 
 if TYPE_CHECKING:
     import argparse
@@ -42,6 +43,6 @@ def _print_listing(name: str, entries: list[dict[str, Any]], *, as_json: bool) -
 
     for entry in entries:
         if "warning" in entry:
-            print(f"crashhunt: warning: {entry['warning']}", file=sys.stderr)
-    print(json.dumps({name: entries}) if as_json else describe(entries))
+            print(one_line(f"crashhunt: warning: {entry['warning']}"), file=sys.stderr)
+    print(json.dumps({name: entries}) if as_json else visible(describe(entries)))
     return 0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import chosen_runs, integer
 from crashhunt.errors import UsageError
+from crashhunt.text import one_line, visible
 
 if TYPE_CHECKING:
     import argparse
@@ -51,10 +52,15 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
             for title, text in reader.fresh():
                 found = True
                 where = title if name == "." else f"{name}: {title}"
-                print(f"==> {where} <==\n{text.rstrip()}\n", flush=True)
+                print(visible(f"==> {one_line(where)} <==\n{_unwound(text).rstrip()}\n"), flush=True)
         if not running:
             break
         time.sleep(0.5)
     if not found:
         print("there is nothing to show", file=sys.stderr)
     return 0
+
+
+def _unwound(text: str) -> str:
+    """A progress bar that has written over its own line, as the lines that there were."""
+    return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.cli._common import add_json, integer, pairs
 from crashhunt.errors import CrashhuntError
+from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     import argparse
@@ -134,7 +135,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     )
     console = Console(stderr=options.json, highlight=False)
     for note in hunt.scenario.notes:
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(one_line(note), markup=False, soft_wrap=True)
     agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
     with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}") as watcher:
         report = hunt.run(watcher)

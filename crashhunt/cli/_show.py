@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, opened_crash
 from crashhunt.errors import UsageError
+from crashhunt.text import visible
 
 if TYPE_CHECKING:
     import argparse
@@ -43,5 +44,5 @@ def _show(options: argparse.Namespace, _words: list[str]) -> int:
             raise UsageError(f"{name} is {value:g}", fix="give a number above 0")
     with opened_crash(options.directory, options.crash) as (bundle, _):
         story = Story(bundle, last_s=options.last_seconds, braking=options.braking)
-    print(json.dumps(story.to_json()) if options.json else story.describe())
+    print(json.dumps(story.to_json()) if options.json else visible(story.describe()))
     return 0

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json
+from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     import argparse
@@ -87,7 +88,7 @@ def states_table(states: list[HuntState]) -> Table:
     for state in states:
         said = ", ".join(f"{name} {count}" for name, count in state.outcomes.items())
         table.add_row(
-            Text(state.dir),
+            Text(one_line(state.dir)),
             Text(state.state, style=_COLORS.get(state.state, "")),
             f"{state.trials_run}/{state.trials_planned}",
             f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
@@ -104,7 +105,8 @@ def show_states(states: list[HuntState], console: Console) -> None:
     console.print(states_table(states))
     for state in states:
         if state.detail:
-            console.print(f"{state.dir}: {state.detail.splitlines()[0]}", markup=False, soft_wrap=True)
+            why = one_line(state.detail.splitlines()[0])
+            console.print(f"{one_line(state.dir)}: {why}", markup=False, soft_wrap=True)
 
 
 def _exit_code(states: list[HuntState]) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt._names import one_of
 from crashhunt.errors import UsageError
+from crashhunt.text import visible
 
 if TYPE_CHECKING:
     import argparse
@@ -51,7 +53,12 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     if options.out is None:
         if options.format == "parquet":
             raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")
-        write_text(hunt, sys.stdout, options.format, outcomes=outcomes)
+        if not sys.stdout.isatty():
+            write_text(hunt, sys.stdout, options.format, outcomes=outcomes)
+            return 0
+        shown = io.StringIO()  # of others, for a terminal
+        write_text(hunt, shown, options.format, outcomes=outcomes)
+        print(visible(shown.getvalue()), end="")
         return 0
     if options.format == "parquet":
         count = write_parquet(hunt, options.out, outcomes=outcomes)

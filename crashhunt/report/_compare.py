@@ -12,6 +12,7 @@ import numpy as np
 from crashhunt.report._table import aligned
 from crashhunt.report._units import argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
+from crashhunt.text import in_lines
 from crashhunt.trial import Outcome
 from crashhunt.whole_file import whole_file
 
@@ -72,7 +73,7 @@ def describe_comparison(found: Comparison) -> str:
         lines += ["", pair.verdict]
         if pair.caution:
             lines.append(f"  but {pair.caution}")
-    return "\n".join(lines)
+    return in_lines(lines)
 
 
 def comparison_page(found: Comparison, path: Path) -> None:

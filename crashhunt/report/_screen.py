@@ -14,6 +14,7 @@ from rich.text import Text
 
 from crashhunt.recording import Phase
 from crashhunt.space import without_folder
+from crashhunt.text import one_line
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class Watcher:
 
     def __init__(self, console: Console, title: str) -> None:
         self._console = console
-        self._title = title
+        self._title = one_line(title)
         self._last_line = -math.inf
         self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
 
@@ -77,7 +78,7 @@ class Watcher:
         # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.nearest is not None:
-            near = Text(f"nearest miss: {_near(status.nearest)}", overflow="fold")
+            near = Text(one_line(f"nearest miss: {_near(status.nearest)}"), overflow="fold")
             if len(self._console.render_lines(near)) + len(status.workers) > left:
                 near = Text(near.plain, no_wrap=True, overflow="ellipsis")
             left -= len(self._console.render_lines(near))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.encounter import Encounter, last_escape
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.text import in_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -109,7 +110,7 @@ class Story:
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
         lines += ["", *self.words(), "", *self.table()]
-        return "\n".join(lines)
+        return in_lines(lines)
 
     def table(self) -> list[str]:
         """Return the last steps as a table."""

@@ -7,6 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.report._screen import format_arguments, format_seconds
+from crashhunt.text import in_lines
 
 if TYPE_CHECKING:
     from crashhunt.bundle import Bundle
@@ -47,7 +48,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         if len(report.crashes) > 1:
             command += ["--crash", first.id]
         lines += ["", f"Replay it:  {shlex.join(command)}"]
-    return "\n".join(lines)
+    return in_lines(lines)
 
 
 def describe_replay(report: ReplayReport) -> str:
@@ -74,7 +75,7 @@ def describe_replay(report: ReplayReport) -> str:
     if times > 1:
         counts = ", ".join(f"{count} {verdict.replace('_', ' ')}" for verdict, count in report.verdicts.items())
         lines.append(f"of {times} runs: {counts}")
-    return "\n".join(lines)
+    return in_lines(lines)
 
 
 def _verdict(report: ReplayReport) -> list[str]:

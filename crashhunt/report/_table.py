@@ -9,6 +9,7 @@ from crashhunt._names import did_you_mean
 from crashhunt.encounter import Encounter
 from crashhunt.errors import UsageError
 from crashhunt.oracles import approaches
+from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,7 +99,7 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
             cell.ljust(width) if column < left else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=False))
         ]
-        lines.append("  ".join([*cells, *row[count:]]).rstrip())
+        lines.append(one_line("  ".join([*cells, *row[count:]])))
     return lines
 
 
