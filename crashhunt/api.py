@@ -39,6 +39,7 @@ def prepare(
     *,
     scenario: Path | str = "loop",
     ego: str = "",
+    action: str = "",
     agent: str | type | Callable[..., Any] | None = None,
     agents: Mapping[str, str | type | Callable[..., Any]] | None = None,
     arguments: Mapping[str, Spec] | None = None,
@@ -66,6 +67,7 @@ def prepare(
         max_steps: the bound on each, in steps.
         scenario: a shipped name, or a path.
         ego: which vehicle of a bare ``.sumocfg``.
+        action: how agents act on SUMO, ``continuous`` or ``meta``; by default as the scenario says.
         agent: who drives, where there is one controlled vehicle: ``module:attribute``, or a class or function of a
             module that workers can import.
         agents: vehicle to who drives it, where there are several.
@@ -96,6 +98,7 @@ def prepare(
         max_steps=max_steps,
         scenario=scenario,
         ego=ego,
+        action=action,
         agents={name: _locator(who) for name, who in drivers.items()},
         arguments={name: _spec(value) for name, value in (arguments or {}).items()},
         scenario_arguments={name: _spec(value) for name, value in (scenario_arguments or {}).items()},

@@ -13,7 +13,7 @@ import numpy as np
 from crashhunt._names import one_of
 from crashhunt.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.plugins import locate, signature_of
-from crashhunt.scenario import Scenario, load_scenario
+from crashhunt.scenario import Scenario, load_scenario, with_action
 from crashhunt.settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.simulators._versions import ACCELERATED
 from crashhunt.snapshot import scenario_digest
@@ -41,6 +41,7 @@ class Request:
         max_steps: the bound on each, in steps.
         scenario: a shipped name, or a path.
         ego: which vehicle of a bare ``.sumocfg``.
+        action: how agents act on SUMO, ``continuous`` or ``meta``; empty: as the scenario says.
         agents: agent id to locator; the id may be empty where the scenario has one controlled vehicle.
         arguments: ``NAME`` or ``AGENT.NAME`` to specification.
         scenario_arguments: name to specification.
@@ -55,6 +56,7 @@ class Request:
     max_steps: int
     scenario: str | Path = "loop"
     ego: str = ""
+    action: str = ""
     agents: Mapping[str, str] = field(default_factory=dict)
     arguments: Mapping[str, str] = field(default_factory=dict)
     scenario_arguments: Mapping[str, str] = field(default_factory=dict)
@@ -74,7 +76,9 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     _check_numbers(request)
     run = replace(request.run, parallel=request.run.parallel or len(os.sched_getaffinity(0)))  # of this machine
     scenario = load_scenario(request.scenario, ego=request.ego)
-    scenario = scenario.with_agents(_locators(request, scenario))
+    scenario = _acting(
+        scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
+    )
     sampler = locate("samplers", request.sampler)
     hunted = not getattr(sampler, "only_asked", False)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
@@ -91,6 +95,9 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
         run=run,
     )
+    if request.action:
+        acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
+        settings = replace(settings, agents=acting)
     scenario = _noted(scenario, run)
     sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
     return scenario, settings
@@ -118,7 +125,20 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
         )
     if scenario.highway is not None and not settings.run.accelerate:
         scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
+    if scenario.sumo is not None:  # elsewhere than it was hunted, it may be another simulator's
+        scenario = _acting(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
+
+
+def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
+    """Return the scenario with the forms of action that are asked for; an empty one is as the scenario says."""
+    for agent, action in actions.items():
+        if action and scenario.sumo is None:
+            fix = "leave it out; the environment has its own"
+            raise UsageError(f"--action {action} is for SUMO, and {scenario.name} is not", fix=fix)
+        if action:
+            scenario = with_action(scenario, agent, action)
+    return scenario
 
 
 def _check_numbers(request: Request) -> None:

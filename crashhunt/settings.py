@@ -40,10 +40,11 @@ class ArgumentSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSettings:
-    """``[agents.ID]``: who drives a vehicle, and what is tried for its arguments."""
+    """``[agents.ID]``: who drives a vehicle, and what is tried for its arguments; how it acts, where that was asked."""
 
     agent: str
     arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
+    action: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

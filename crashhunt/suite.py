@@ -39,6 +39,7 @@ class SuiteEntry:
         id: names its folder; unique in the suite.
         scenario: a shipped name, or a path from the folder of the file.
         ego: which vehicle of a bare ``.sumocfg``.
+        action: how agents act on SUMO, ``continuous`` or ``meta``; by default as the scenario says.
         agent: who drives, where the scenario has one controlled vehicle.
         agents: vehicle to who drives it, where it has several.
         arguments: ``NAME`` or ``AGENT.NAME`` to a value or a specification, as in ``--arg``.
@@ -60,6 +61,7 @@ class SuiteEntry:
     id: str = ""
     scenario: str = "loop"
     ego: str = ""
+    action: str = ""
     agent: str = ""
     agents: dict[str, str] = field(default_factory=dict)
     arguments: dict[str, Plain] = field(default_factory=dict)
@@ -222,6 +224,7 @@ class Suite:
             max_steps=entry.max_steps,
             scenario=scenario,
             ego=entry.ego,
+            action=entry.action,
             agents=entry.agents or ({"": entry.agent} if entry.agent else {}),
             arguments={name: _spec(value) for name, value in entry.arguments.items()},
             scenario_arguments={name: _spec(value) for name, value in entry.scenario_arguments.items()},

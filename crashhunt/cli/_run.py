@@ -42,6 +42,11 @@ def add_run(commands: Any) -> None:
         help="for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one; default: the first",
     )  # fmt: skip
     what.add_argument(
+        "--action", metavar="FORM", default="",
+        help="on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions); default: as the "
+        "scenario says, and continuous for a .sumocfg",
+    )  # fmt: skip
+    what.add_argument(
         "--agent", metavar="[ID=]MODULE:ATTR", action="append", default=[],
         help="who drives (see crashhunt agents); ID= where the scenario has several controlled vehicles",
     )  # fmt: skip
@@ -114,6 +119,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         options.max_steps,
         scenario=options.scenario,
         ego=options.ego,
+        action=options.action,
         agents=pairs(options.agent, "--agent", named=False),
         arguments=pairs(options.arg, "--arg"),
         scenario_arguments=pairs(options.sets, "--set"),

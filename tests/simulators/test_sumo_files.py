@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import gzip
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crashhunt.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.errors import InvalidEpisodeError, ScenarioError, UsageError
+from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario, shipped_folder
 from crashhunt.simulators._sumo_files import StagedFiles
 from crashhunt.simulators._sumo_options import canonical, is_true
@@ -240,6 +242,20 @@ def test_a_traffic_light_of_the_network_writes_nothing_either(town, tmp_path):
     (town / "net.net.xml").write_text(net.replace("</net>", f"{light}</net>"))
     options = staged(load_scenario(config(town, "")), tmp_path / "stage")
     assert 'value="/dev/null"' in Path(options["net-file"]).read_text()
+
+
+def test_the_form_of_action_of_a_bare_configuration(town):
+    path = config(town, "")
+    asked = Request(trials=1, max_steps=1, scenario=path, action="meta", arguments={"speed": "9"})
+    scenario, settings = plan(asked)
+    assert [setup.action for setup in scenario.agents.values()] == ["meta"]
+    assert [setup.action for setup in with_settings(load_scenario(path), settings).agents.values()] == ["meta"]
+    _, other = plan(replace(asked, action="", seed=settings.seed))
+    assert other.differences(settings) == ["agents.f.0.action was None and is now meta"]
+    with pytest.raises(ScenarioError, match="give continuous or meta"):
+        plan(replace(asked, action="telepathic"))
+    with pytest.raises(UsageError, match="is for SUMO"):
+        plan(Request(trials=1, max_steps=1, scenario="merge-highway-env", action="meta"))
 
 
 quoted = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs"), exclude_characters="<&\"'"), max_size=9)
