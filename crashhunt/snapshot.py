@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.environment import environment
-from crashhunt.errors import BundleError, SnapshotError
+from crashhunt.errors import BundleError, SnapshotError, UsageError
 from crashhunt.scenario import Scenario, load_scenario
 from crashhunt.settings import HuntSettings, read_settings, write_settings
 from crashhunt.simulators._sumo_xml import movable
@@ -36,11 +36,18 @@ class SnapshotOptions:
         code: whether it has code at all; without, a replay runs what is current.
         roots: files and folders besides what is found.
         limit_mb: how large it may be, in MB.
+
+    Raises:
+        UsageError: the limit is none.
     """
 
     code: bool = True
     roots: tuple[Path, ...] = ()
     limit_mb: float = 500.0
+
+    def __post_init__(self) -> None:
+        if not self.limit_mb > 0:  # nor what is not a number
+            raise UsageError(f"--snapshot-limit is {self.limit_mb:g}", fix="give MB above 0, or --no-snapshot")
 
 
 class Snapshot:

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from crashhunt.archive import Archive
     from crashhunt.bundle import Bundle
 
-__all__ = ["Parser", "add_crash", "add_json", "chosen_runs", "integer", "opened_crash", "opened_hunt", "pairs", "say"]
+__all__ = [
+    "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt", "pairs",
+    "say",
+]  # fmt: skip
 
 
 class Parser(argparse.ArgumentParser):
@@ -67,7 +70,12 @@ def add_crash(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "directory", metavar="DIR", type=Path, help="of the hunt, of one crash, or a file that crashhunt export wrote"
     )
-    parser.add_argument("--crash", metavar="ID", default="", help="which one; default: the one with the fewest steps")
+    parser.add_argument(
+        "--crash",
+        metavar="ID",
+        default="",
+        help="its id, or its trial's number; default: the one with the fewest steps",
+    )
 
 
 @contextmanager
@@ -158,3 +166,11 @@ def integer(text: str) -> int:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+
+
+def number(text: str) -> float:
+    """Read a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import integer
+from crashhunt.cli._common import integer, number
 from crashhunt.cli._progress import shown_progress
 from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
@@ -37,9 +37,9 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     film.add_argument("--video", metavar="FILE", type=Path, help="write an MP4 file")
     film.add_argument("--gif", metavar="FILE", type=Path, help="write an animated GIF")
     film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
-    film.add_argument("--fps", metavar="N", type=float, default=0.0, help="pictures a second; default: one a step")
+    film.add_argument("--fps", metavar="N", type=number, default=0.0, help="pictures a second; default: one a step")
     film.add_argument("--size", metavar="WxH", default="960x540", help="of the scene, in pixels; default: 960x540")
-    film.add_argument("--last-seconds", metavar="S", type=float, default=0.0, help="only the end of it")
+    film.add_argument("--last-seconds", metavar="S", type=number, default=0.0, help="only the end of it")
     film.add_argument(
         "--last-step-repeats", metavar="N", type=integer, default=10, help="of the last picture; default: 10"
     )

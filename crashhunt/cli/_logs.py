@@ -40,6 +40,8 @@ def _logs(options: argparse.Namespace, _words: list[str]) -> int:
 
     if options.errors_only and options.type not in (None, "error"):
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")
+    if options.trial is not None and options.trial < 0:
+        raise UsageError(f"--trial is {options.trial}", fix="give at least 0")
     hunts = chosen_runs(options.directory, [options.run] if options.run else [])
     kinds: tuple[LogKind, ...] = ("run", "error", "state")
     if options.errors_only or options.type is not None:

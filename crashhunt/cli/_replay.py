@@ -8,7 +8,7 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, pairs, say
+from crashhunt.cli._common import add_crash, add_json, integer, number, opened_crash, pairs, say
 from crashhunt.cli._film import (
     add_film_options,
     film_options,
@@ -63,7 +63,9 @@ def add_replay(commands: Any) -> None:
     replay.add_argument(
         "--no-accelerate", action="store_true", help="run highway-env as it is, without the accelerator"
     )
-    replay.add_argument("--times", metavar="N", type=integer, default=1, help="repeat, and say how many runs agreed")
+    replay.add_argument(
+        "--times", metavar="N", type=integer, default=1, help="how often, to see whether all agree; default: 1"
+    )
     replay.add_argument(
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
         help="the verdict for which the exit code is 0; default: reproduced",
@@ -89,7 +91,7 @@ def add_replay(commands: Any) -> None:
         help="open the simulator's own window (sumo-gui), follow the agent, and pause before the crash",
     )  # fmt: skip
     look.add_argument(
-        "--sleep", metavar="S", type=float,
+        "--sleep", metavar="S", type=number,
         help="with --gui: wall time between two steps, in s; default: as long as a step simulates",
     )  # fmt: skip
     add_film_options(replay)
@@ -169,12 +171,14 @@ def _replay_one(
 ) -> tuple[ReplayReport, dict[str, Any]]:
     from crashhunt.escape import partner
     from crashhunt.replays import replay
-    from crashhunt.report import describe_replay, format_table, steps_table
+    from crashhunt.report import check_fields, describe_replay, format_table, steps_table
 
+    fields = re.split(r",(?![^\[]*\])", options.fields)  # not at the comma of observation[ROW,NAME]
+    if options.fields and chosen.code != "current":  # today's code may be shown other observations
+        check_fields(bundle.recording(), fields, bundle.driver)
     report = replay(bundle, chosen)
     answer = report.to_json()
     if options.fields:
-        fields = re.split(r",(?![^\[]*\])", options.fields)  # not at the comma of observation[ROW,NAME]
         table = steps_table(report.recording, fields, bundle.driver, partner(bundle.result))
         say("\n".join([*format_table(table), ""]), as_json=options.json)
         answer["table"] = table
@@ -225,7 +229,8 @@ def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
     crash = bundle.result.steps
     if options.before is not None:
         if not 0 <= options.before < crash:
-            raise UsageError(f"--before is {options.before}, and the crash is at step {crash}", fix="give less")
+            fix = f"give 0 to {crash - 1}" if crash else "leave it out"
+            raise UsageError(f"--before is {options.before}, and the crash is at step {crash}", fix=fix)
         return crash - int(options.before)
     if options.until is not None:
         if options.until < 1:

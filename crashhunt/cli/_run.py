@@ -8,7 +8,7 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from crashhunt.cli._common import add_json, integer, pairs
+from crashhunt.cli._common import add_json, integer, number, pairs
 from crashhunt.errors import CrashhuntError
 from crashhunt.text import one_line
 
@@ -48,7 +48,8 @@ def add_run(commands: Any) -> None:
     )  # fmt: skip
     what.add_argument(
         "--agent", metavar="[ID=]MODULE:ATTR", action="append", default=[],
-        help="who drives (see crashhunt agents); ID= where the scenario has several controlled vehicles",
+        help="who drives: a class or function, or a name that crashhunt agents lists; ID= where the scenario has "
+        "several controlled vehicles",
     )  # fmt: skip
     what.add_argument(
         "--arg", metavar="NAME=SPEC", action="append", default=[],
@@ -76,7 +77,7 @@ def add_run(commands: Any) -> None:
         help="at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
     )  # fmt: skip
     how.add_argument(
-        "--timeout", metavar="S", type=float, default=60.0, help="wall-clock limit of a trial, in s; default: 60"
+        "--timeout", metavar="S", type=number, default=60.0, help="wall-clock limit of a trial, in s; default: 60"
     )
     how.add_argument("--keep-trials", action="store_true", help="keep the logs of every trial, not of crashes only")
     how.add_argument(
@@ -92,7 +93,11 @@ def add_run(commands: Any) -> None:
         help="a file or folder that the snapshot takes in besides the agent's own project; may be repeated",
     )  # fmt: skip
     how.add_argument(
-        "--snapshot-limit", metavar="MB", type=float, default=500.0, help="how large a snapshot may be; default: 500"
+        "--snapshot-limit",
+        metavar="MB",
+        type=number,
+        default=500.0,
+        help="the most that a snapshot may have; default: 500",
     )
     how.add_argument("--no-snapshot", action="store_true", help="keep no code; a replay then runs what is current")
     how.add_argument("--overwrite", action="store_true", help="begin anew, whatever hunt is in DIR")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.cli._common import add_crash, add_json, opened_crash
+from crashhunt.cli._common import add_crash, add_json, number, opened_crash
 from crashhunt.errors import UsageError
 from crashhunt.text import visible
 
@@ -25,11 +25,11 @@ def add_show(commands: Any) -> None:
         "running it. Runs no code of the bundle.",
     )
     add_crash(show)
-    show.add_argument("--last-seconds", metavar="S", type=float, default=5.0, help="how much of it; default: 5")
+    show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="how much of it; default: 5")
     show.add_argument(
         "--braking",
         metavar="A",
-        type=float,
+        type=number,
         help="calculate until when braking at so many m/s² would have helped, had the other one moved as it did",
     )
     add_json(show)

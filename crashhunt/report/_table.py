@@ -16,13 +16,33 @@ if TYPE_CHECKING:
 
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
-__all__ = ["NEAREST", "aligned", "format_table", "steps_table"]
+__all__ = ["NEAREST", "aligned", "check_fields", "format_table", "steps_table"]
 
 _SCENE = ("x", "y", "heading", "speed")
 NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
 """What is measured to whoever is the nearest, as of every trial."""
 
 _TO_OTHER = {"gap_to_other_m": "gap_m", "time_to_other_s": "time_to_collision_s", "closing_speed": "closing_speed"}
+
+
+def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> list[str]:
+    """Return the columns that fields stand for, of what an agent of a recording was shown and did.
+
+    Raises:
+        UsageError: a field does not exist, with those that do.
+    """
+    channel = next(found for found in recording.prologue.agents if found.id == agent)
+    actions, observed = _actions(channel), _observed(channel)
+    known = [*_SCENE, "reward", *NEAREST, *_TO_OTHER, *actions, *observed]
+    names: list[str] = []
+    for field in fields:
+        name = field.replace(" ", "")
+        if name != "action" and name not in known:
+            hint = did_you_mean(name, known)
+            shown = ", ".join([*_SCENE, "reward", *NEAREST, *_TO_OTHER, "action", *actions, *list(observed)[:3]])
+            raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
+        names += actions if name == "action" else (name,)
+    return names
 
 
 def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[dict[str, Any]]:
@@ -41,17 +61,8 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
         UsageError: a field does not exist, with those that do.
     """
     channel = next(found for found in recording.prologue.agents if found.id == agent)
-    actions = channel.action_names or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
-    observed = _observed(channel)
-    known = [*_SCENE, "reward", *NEAREST, *_TO_OTHER, *actions, *observed]
-    names: list[str] = []
-    for field in fields:
-        name = field.replace(" ", "")
-        if name != "action" and name not in known:
-            hint = did_you_mean(name, known)
-            shown = ", ".join([*_SCENE, "reward", *NEAREST, *_TO_OTHER, "action", *actions, *list(observed)[:3]])
-            raise UsageError(f"--print: there is no field {field!r}", fix=f"{hint} there are {shown}, …".lstrip())
-        names += actions if name == "action" else (name,)
+    actions, observed = _actions(channel), _observed(channel)
+    names = check_fields(recording, fields, agent)
     measured: dict[str, Any] = {}
     if set(names) & set(NEAREST):
         frames = [step.scene.frame for step in recording.all_steps if step.scene is not None]
@@ -101,6 +112,10 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 0) -> list[str]:
         ]
         lines.append(one_line("  ".join([*cells, *row[count:]])))
     return lines
+
+
+def _actions(channel: AgentChannel) -> tuple[str, ...]:
+    return tuple(channel.action_names) or tuple(f"action[{n}]" for n in range(math.prod(channel.action_shape)))
 
 
 def _observed(channel: AgentChannel) -> dict[str, tuple[int, ...]]:
