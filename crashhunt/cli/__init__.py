@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt import __version__
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
+from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._export import add_export
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._logs import add_logs
@@ -72,7 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def _run(words: Sequence[str]) -> int:
     try:
         _check_names(words)
-        options = _parser().parse_args(words)
+        parser = _parser()
+        complete(parser)
+        options = parser.parse_args(words)
         code: int = options.command(options, words)
     except CrashhuntError as error:
         return _report(error, as_json="--json" in words)
@@ -135,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_compare, add_lists,
+        add_compare, add_lists, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

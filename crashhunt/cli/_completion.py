@@ -1,0 +1,157 @@
+"""Shell completion: ``crashhunt completion SHELL``, and what there is to complete."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    Completer = Callable[..., Iterable[str]]
+
+__all__ = ["add_completion", "complete"]
+
+_HOW = """\
+put one of these lines where your shell starts:
+  ~/.bashrc                      eval "$(crashhunt completion bash)"
+  ~/.zshrc, after compinit       eval "$(crashhunt completion zsh)"
+  ~/.config/fish/config.fish     crashhunt completion fish | source
+"""
+
+
+def add_completion(commands: Any) -> None:
+    """Add the command."""
+    completion = commands.add_parser(
+        "completion",
+        help="print a script that has the tab key complete commands, options, names and crashes",
+        description="Print a script that has the tab key of a shell complete commands, options, scenarios, agents, "
+        "samplers, arguments, outcomes, directories and the crashes in them.",
+        epilog=_HOW,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
+    completion.set_defaults(command=_completion)
+
+
+def _completion(options: argparse.Namespace, _words: list[str]) -> int:
+    from argcomplete.shell_integration import shellcode
+
+    print(shellcode(["crashhunt"], shell=options.shell))
+    return 0
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell, if it is the shell that has called, and end the process; else do nothing."""
+    if "_ARGCOMPLETE" not in os.environ:
+        return
+    from argcomplete import autocomplete
+    from argcomplete.completers import SuppressCompleter
+
+    _attach(parser)
+    autocomplete(parser, always_complete_options=False, default_completer=SuppressCompleter())
+
+
+def _attach(parser: argparse.ArgumentParser) -> None:
+    known: dict[str, Completer] = {
+        "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(".toml", ".sumocfg")(prefix)],
+        "--agent": lambda **_: _registered("agents"),
+        "--sampler": lambda **_: _registered("samplers"),
+        "--crash-on": _several(lambda **_: _outcomes(crashes=True)),
+        "--outcome": _several(lambda **_: _outcomes(crashes=False)),
+        "--print": _several(lambda **_: _FIELDS),
+        "--crash": _several(_crashes),
+        "--run": _runs,
+        "--arg": lambda parsed_args, **_: [f"{name}=" for name in _arguments(parsed_args, of_agents=True)],
+        "--set": lambda parsed_args, **_: [f"{name}=" for name in _arguments(parsed_args, of_agents=False)],
+        "DIR": _paths(".zip"),
+    }
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for inner in action.choices.values():
+                _attach(inner)
+            continue
+        name = action.option_strings[0] if action.option_strings else str(action.metavar)
+        completer = known.get(name) or (_paths("") if action.type is Path else None)
+        if completer is not None:
+            action.completer = completer  # type: ignore[attr-defined]
+
+
+_FIELDS = ("x", "y", "heading", "speed", "reward", "time_to_collision_s", "gap_m", "required_deceleration", "action")
+
+
+def _scenarios() -> list[str]:
+    from crashhunt.scenario import shipped_scenarios
+
+    return list(shipped_scenarios())
+
+
+def _registered(group: Any) -> list[str]:
+    from crashhunt.plugins import registered
+
+    return list(registered(group))
+
+
+def _outcomes(*, crashes: bool) -> list[str]:
+    from crashhunt.trial import CRASHES, Outcome
+
+    return [str(outcome) for outcome in (CRASHES if crashes else Outcome)]
+
+
+def _crashes(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    folder = getattr(parsed_args, "directory", None)
+    return sorted(path.parent.name for path in Path(folder).glob("crashes/*/crash.json")) if folder else []
+
+
+def _runs(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    folder = getattr(parsed_args, "directory", None)
+    if not folder:
+        return []
+    return sorted(path.parent.relative_to(folder).as_posix() for path in Path(folder).glob("*/*/hunt.toml"))
+
+
+def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]:
+    """What the scenario says of arguments; it is only read, as a shell does not wait."""
+    from crashhunt.scenario import shipped_folder
+
+    name = getattr(parsed_args, "scenario", None) or "loop"
+    for file in (shipped_folder() / name / "scenario.toml", Path(name) / "scenario.toml", Path(name)):
+        try:
+            said = tomllib.loads(file.read_text(encoding="utf-8"))
+            tables = [agent.get("arguments", {}) for agent in said.get("agents", {}).values()]
+            return list(dict.fromkeys(key for table in tables for key in table)) if of_agents else [*said["arguments"]]
+        except (OSError, ValueError, KeyError, AttributeError):
+            continue
+    return ["scale"] if name.endswith(".sumocfg") and not of_agents else []
+
+
+def _several(one: Completer) -> Completer:
+    """Complete the last of several that commas part."""
+
+    def last(prefix: str, **given: Any) -> list[str]:
+        before = prefix.rpartition(",")[0]
+        taken = before.split(",")
+        return [f"{before},{name}" if before else name for name in one(prefix=prefix, **given) if name not in taken]
+
+    return last
+
+
+def _paths(*endings: str) -> Completer:
+    """Complete folders, and files with one of some endings."""
+
+    def inside(prefix: str, **_: Any) -> list[str]:
+        folder, _slash, start = prefix.rpartition("/")
+        place = Path(folder or ("/" if prefix.startswith("/") else ".")).expanduser()
+        try:
+            found = sorted(path for path in place.iterdir() if path.name.startswith(start))
+        except OSError:
+            return []
+        hidden = start.startswith(".")
+        names = [(path.name, path.is_dir()) for path in found if hidden or not path.name.startswith(".")]
+        before = prefix[: len(prefix) - len(start)]
+        return [f"{before}{name}{'/' * is_dir}" for name, is_dir in names if is_dir or name.endswith(endings)]
+
+    return inside

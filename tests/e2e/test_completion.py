@@ -1,0 +1,68 @@
+"""The tab key, in a real bash that has read the script."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+from conftest import CRASHHUNT, needed
+
+# Everything that bash would set when somebody presses the key at the end of the line.
+ASK = """
+eval "$(crashhunt completion bash)"
+COMP_LINE=$1 COMP_POINT=${#1} COMP_TYPE=9
+complete -p crashhunt | grep -q _python_argcomplete || exit 3
+_python_argcomplete crashhunt
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture
+def press(toy):
+    bash = needed("bash")
+    environment = {**toy.environment, "PATH": f"{CRASHHUNT.parent}:{toy.environment['PATH']}"}
+
+    def ask(line: str) -> list[str]:
+        done = subprocess.run(
+            [bash, "-c", ASK, "bash", line], cwd=toy.folder, env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stderr == ""
+        return [word.strip() for word in done.stdout.splitlines() if word.strip()]
+
+    return ask
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("crashhunt rep", ["replay", "report"]),
+        ("crashhunt suite ", ["run", "defaults"]),
+        ("crashhunt run out 1 1 9 --scen", ["--scenario"]),
+        ("crashhunt run out 1 1 9 --scenario merge", ["merge", "merge-highway-env"]),
+        ("crashhunt run out 1 1 9 --scenario to", ["toy/"]),
+        ("crashhunt run out 1 1 9 --agent id", ["idm"]),
+        ("crashhunt run out 1 1 9 --sampler s", ["sweep"]),
+        ("crashhunt run out 1 1 9 --crash-on hang,col", ["hang,collision"]),
+        ("crashhunt run out 1 1 9 --scenario toy --set g", ["gap_m="]),
+        ("crashhunt run out 1 1 9 --scenario merge --arg head", ["headway_s="]),
+        ("crashhunt trials h --outcome sur", ["survived"]),
+        ("crashhunt replay h --crash ", ["000004-collision", "000017-hang"]),
+        ("crashhunt replay h --code c", ["current"]),
+        ("crashhunt show ", ["h/", "h.zip", "toy/"]),
+        ("crashhunt export h f", ["faulty.py"]),
+        ("crashhunt run out 1 1 9 --seed ", []),
+    ],
+)
+def test_the_tab_key_completes(press, toy, line, found):
+    for name in ("000004-collision", "000017-hang"):
+        (toy.folder / "h" / "crashes" / name).mkdir(parents=True)
+        (toy.folder / "h" / "crashes" / name / "crash.json").touch()
+    (toy.folder / "h.zip").touch()
+    assert sorted(press(line)) == sorted(found)
+
+
+def test_every_shell_gets_a_script_and_others_a_word(toy):
+    for shell, says in (("zsh", "compdef"), ("fish", "complete --command crashhunt")):
+        assert says in toy.crashhunt("completion", shell).out
+    refused = toy.crashhunt("completion", "csh", expect=2)
+    assert "give one of bash, zsh, fish" in refused.err
