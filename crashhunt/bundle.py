@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt._names import listed, near_path, one_of
 from crashhunt.environment import versions
 from crashhunt.errors import BundleError
+from crashhunt.events import Event
 from crashhunt.executors import BLACK_BOX, OUTPUT
 from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
 from crashhunt.trial import ClosestApproach, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
@@ -59,8 +60,8 @@ class Bundle:
     @property
     def driver(self) -> str:
         """The agent that it is about; of one that is about none, the first."""
-        hit, failure = self.result.collision, self.result.failure
-        about = hit.agent if hit else failure.agent if failure else ""
+        result = self.result
+        about = next((found.agent for found in (result.collision, result.event, result.failure) if found), "")
         return about or next(iter(self.result.spec.arguments), "")
 
     def recording(self) -> Recording:
@@ -108,6 +109,8 @@ class Bundle:
             "collision": result.to_json()["collision"],
             "failure": result.to_json()["failure"],
             "escape": result.to_json()["escape"],
+            "event": result.to_json()["event"],
+            "events": result.to_json()["events"],
             "closest_approach": result.closest.to_json(),
             "digest": result.digest,
             "snapshot": self.snapshot,
@@ -133,7 +136,7 @@ def read_bundle(path: Path) -> Bundle:
             raise BundleError(
                 f"schema {data['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(file)
             )
-        hit, failure, escape = data["collision"], data["failure"], data.get("escape")
+        hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
         result = TrialResult(
             TrialSpec(
                 data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
@@ -146,6 +149,8 @@ def read_bundle(path: Path) -> Bundle:
             collision=Collision.from_json(hit) if hit else None,
             failure=Failure(**failure) if failure else None,
             escape=Escape(**escape) if escape else None,
+            event=Event.from_json(event) if event else None,
+            events=data.get("events"),
         )
         return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"])
     except OSError as error:

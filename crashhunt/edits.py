@@ -44,7 +44,7 @@ def edited_spec(
     for agent, chosen in settings.agents.items():
         if agent in original.agents and chosen.agent != original.agents[agent].agent:
             edits.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
-    for name in ("max_steps", "crash_on", "oracles"):
+    for name in ("max_steps", "crash_on", "events", "oracles"):
         was, now = getattr(original, name), getattr(settings, name)
         if was != now:
             edits.append(f"{name} was {_plain(was)} and is {_plain(now)}")

@@ -7,6 +7,7 @@ import random
 import sys
 import time
 import traceback
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
-from crashhunt.oracles import ApproachMeter, Finding, Oracle, merge_findings
+from crashhunt.oracles import ApproachMeter, Finding, Oracle, TrafficEvents, merge_findings
 from crashhunt.recording import (
     AgentChannel,
     BlackBox,
@@ -26,6 +27,7 @@ from crashhunt.recording import (
     encode_actors,
     encode_events,
     encode_heights,
+    encode_notes,
     encode_spines,
 )
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
@@ -51,6 +53,7 @@ class _Scribe:
     box: BlackBox
     numbers: dict[Actor, int] = field(default_factory=dict)
     roster: Roster | None = None
+    events: Counter[str] = field(default_factory=Counter)
 
     def begin(self, simulator: Simulator) -> tuple[str, ...]:
         """Record who takes part; return the agents in the order of their numbers."""
@@ -91,6 +94,9 @@ class _Scribe:
             self.box.append(Tag.HEIGHTS, 0, encode_heights(scene))
         if scene.spines:
             self.box.append(Tag.SPINES, 0, encode_spines(scene))
+        if scene.events:
+            self.box.note(encode_notes(scene.events))
+            self.events.update([event.kind for event in scene.events])
         self.box.step(step, scene, rewards)
 
 
@@ -111,7 +117,7 @@ def run_episode(
         make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
         box: what records it; `BlackBox.begin` has been called.
         oracles: what decides whether a step is a crash.
-        crash_on: what ends the episode; a traffic crash of another kind is recorded, and the episode goes on.
+        crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -123,6 +129,8 @@ def run_episode(
     setup_s = 0.0
     seed_everything(spec.seed)
     agents: dict[str, Agent] = {}
+    if any(outcome.is_traffic_event for outcome in crash_on):
+        oracles = [*oracles, TrafficEvents()]
     run = _Run(spec, simulator, box, tuple(oracles), frozenset(crash_on))
     try:
         result = run.set_up(make_agent, agents)
@@ -192,8 +200,8 @@ class _Run:
         finding = self._check(scene)
         if finding is not None:
             hit = finding.collision
-            message = f"{hit.collider} and {hit.victim} overlap before the first step"
-            failure = Failure("invalid", message)
+            what = f"{hit.collider} and {hit.victim} overlap" if hit else finding.event.what if finding.event else ""
+            failure = Failure("invalid", f"{what} before the first step")
             return self._result(Outcome.INVALID, collision=hit, failure=failure)
         return None
 
@@ -235,7 +243,7 @@ class _Run:
                 self.meter.measure(box.take_frames())
             finding = self._check(scene)
             if finding is not None:
-                return self._result(finding.outcome, collision=finding.collision)
+                return self._result(finding.outcome, collision=finding.collision, event=finding.event)
             if len(simulator.agents) != len(active) or True in truncations.values():
                 present = set(simulator.agents)
                 active = tuple(number for number in everybody if names[number] in present)
@@ -247,11 +255,12 @@ class _Run:
         """Add what is measured over the whole recording."""
         self.meter.measure(self.box.take_frames())
         self.box.mark(Phase.DONE)
-        digest = digest_of(self.box.committed()) if result.outcome is not Outcome.INVALID else ""
+        digest = digest_of(*self.box.evidence()) if result.outcome is not Outcome.INVALID else ""
         closest = self.meter.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
-        return replace(result, digest=digest, closest=closest)
+        events = dict(self.scribe.events) if hasattr(self.simulator, "told_events") else None
+        return replace(result, digest=digest, closest=closest, events=events)
 
     def failed(self, error: BaseException) -> TrialResult:
         """What comes of an episode that could not go on, and neither agent nor simulator said why."""

@@ -169,6 +169,7 @@ class Hunt:
             tuple(crashes),
             reason,
             tuple(progress.notes),
+            ledger.traffic_events(),
         )
 
     def _hunt(

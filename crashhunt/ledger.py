@@ -194,6 +194,16 @@ class Ledger:
         self._compare_seal(seal, "outcomes", found)
         return found
 
+    def traffic_events(self) -> dict[str, tuple[int, int]]:
+        """Return how many traffic events of each kind there were, and in how many trials."""
+        # Most rows have none, and looking for a text in them takes a tenth of the time of parsing them.
+        has_some = """instr(trials.result, '"events": {"') AND json_valid(trials.result)"""
+        rows = self._select(
+            "SELECT event.key, sum(event.value), count(*) FROM trials, "
+            f"json_each(iif({has_some}, trials.result, '{{}}'), '$.events') AS event GROUP BY event.key"
+        )
+        return {kind: (count, trials) for kind, count, trials in rows}
+
     def steps_total(self) -> int:
         """Return how many steps were run in all."""
         seal = self._seal()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 from dataclasses import dataclass, field, replace
@@ -12,13 +13,14 @@ import numpy as np
 
 from crashhunt._names import one_of
 from crashhunt.errors import ArgumentError, ScenarioError, UsageError
+from crashhunt.events import LIMITS, TOLD_BY
 from crashhunt.plugins import locate, signature_of
 from crashhunt.scenario import Scenario, load_scenario, with_action
 from crashhunt.settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.simulators._versions import ACCELERATED
 from crashhunt.snapshot import scenario_digest
 from crashhunt.space import Argument, Constant, parse_spec
-from crashhunt.trial import CRASHES, Outcome, TrialSpec
+from crashhunt.trial import CRASHES, EVENTS, Outcome, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.plugins import Signature
     from crashhunt.samplers import Sampler
 
-__all__ = ["Request", "plan", "spec_of", "with_settings"]
+__all__ = ["Request", "parse_crash_on", "plan", "spec_of", "with_settings"]
 
 _ZERO = {"PARALLEL": " (0: one per core)", "--recycle-after": " (0: never)"}  # what nought means, where it may be given
 
@@ -48,7 +50,7 @@ class Request:
         sampler: its name.
         points: how many values grid and sweep try of a range without a step.
         seed: of the hunt; drawn where it is None.
-        crash_on: the outcomes that count.
+        crash_on: the outcomes that count; a traffic event may have a limit, as in ``not_moving:30``.
         run: how it is run.
     """
 
@@ -82,6 +84,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     sampler = locate("samplers", request.sampler)
     hunted = not getattr(sampler, "only_asked", False)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
+    crash_on, limits = parse_crash_on(request.crash_on)
     settings = HuntSettings(
         scenario=str(request.scenario),
         scenario_digest=scenario_digest(scenario),
@@ -90,7 +93,8 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         seed=request.seed if request.seed is not None else secrets.randbits(32),
         sampler=request.sampler,
         points=request.points,
-        crash_on=_crash_on(request.crash_on),
+        crash_on=crash_on,
+        events=limits,
         agents=_agents(request, scenario, signatures, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
         run=run,
@@ -98,7 +102,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     if request.action:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
-    scenario = _noted(scenario, run)
+    scenario = _with_untold(_noted(scenario, run), crash_on)
     sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
     return scenario, settings
 
@@ -125,6 +129,8 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
         )
     if scenario.highway is not None and not settings.run.accelerate:
         scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
+    if settings.events:
+        scenario = replace(scenario, events={**scenario.events, **settings.events})
     if scenario.sumo is not None:  # elsewhere than it was hunted, it may be another simulator's
         scenario = _acting(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
@@ -139,6 +145,19 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
         if action:
             scenario = with_action(scenario, agent, action)
     return scenario
+
+
+def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
+    """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
+    told = TOLD_BY.get(scenario.simulator)
+    never = [kind for kind in crash_on if kind.is_traffic_event and told is not None and kind not in told]
+    if not never:
+        return scenario
+    names = ",".join(never)
+    if len(never) == len(crash_on):
+        fix = f"it tells {', '.join(told)}" if told else "leave it out"
+        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never tells that", fix=fix)
+    return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never tells {names}"))
 
 
 def _check_numbers(request: Request) -> None:
@@ -156,14 +175,38 @@ def _check_numbers(request: Request) -> None:
         raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
 
 
-def _crash_on(names: Sequence[str]) -> tuple[Outcome, ...]:
-    crashes = [str(outcome) for outcome in CRASHES]
-    for name in names:
+def parse_crash_on(words: Sequence[str]) -> tuple[tuple[Outcome, ...], dict[str, float]]:
+    """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
+
+    Raises:
+        UsageError: there is no such outcome or limit.
+    """
+    crashes = [str(outcome) for outcome in (*CRASHES, *EVENTS)]
+    names, limits = [], {}
+    for word in words:
+        name, colon, limit = str(word).partition(":")
         if name not in crashes:
             raise UsageError(f"--crash-on {name!r} is not a crash", fix=one_of(name, crashes, give="give some of"))
+        if colon:
+            limits[name] = _limit(name, limit)
+        names.append(name)
     if not names:
         raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
-    return tuple(outcome for outcome in CRASHES if outcome in names)
+    return tuple(outcome for outcome in (*CRASHES, *EVENTS) if outcome in names), limits
+
+
+def _limit(name: str, text: str) -> float:
+    if name not in LIMITS:
+        raise UsageError(f"--crash-on {name}:{text}: {name} has no limit", fix=f"{' and '.join(LIMITS)} have one")
+    unit = LIMITS[name][1]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
+        raise UsageError(f"--crash-on {name}:{text}: {text!r} is no limit", fix=fix)
+    return value
 
 
 def _locators(request: Request, scenario: Scenario) -> dict[str, str]:

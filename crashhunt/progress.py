@@ -61,6 +61,7 @@ class HuntReport:
         crashes: what was found, the one with the fewest steps first.
         reason: in words, where not one trial was valid.
         notes: what people should know about how it went, such as trials that were run again.
+        events: traffic events of all trials: kind to how many, and in how many trials.
     """
 
     directory: Path
@@ -72,6 +73,7 @@ class HuntReport:
     crashes: tuple[Bundle, ...]
     reason: str = ""
     notes: tuple[str, ...] = ()
+    events: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``run --json`` prints."""
@@ -84,6 +86,7 @@ class HuntReport:
             "stopped_because": self.stopped_because,
             "wall_s": round(self.wall_s, 3),
             "steps_total": self.steps_total,
+            "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
             "crashes": [bundle.summary() for bundle in self.crashes],
             "notes": list(self.notes),
         }

@@ -97,7 +97,7 @@ def _request_of(settings: HuntSettings) -> Request:
         sampler=settings.sampler,
         points=settings.points,
         seed=settings.seed,
-        crash_on=settings.crash_on,
+        crash_on=settings.crash_on_words,
         run=settings.run,
     )
 

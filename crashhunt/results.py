@@ -20,6 +20,7 @@ from crashhunt.plan import with_settings
 from crashhunt.settings import HuntSettings, read_settings
 from crashhunt.snapshot import Snapshot, latest_snapshot
 from crashhunt.status import HuntState, find_hunts, hunt_state
+from crashhunt.trial import EVENTS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +35,7 @@ __all__ = ["FACTS", "HuntResults", "SuiteResults", "UnfinishedWarning", "columns
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
-    "wall_s", "digest",
+    "wall_s", "digest", *map(str, EVENTS),
 )  # fmt: skip
 
 
@@ -218,6 +219,9 @@ def _row(data: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
     """A trial as a row of the table; None where it has no such value."""
     spec = data["spec"]
     values = {**data, **data["closest"], "number": spec["number"], "seed": spec["seed"]}
+    events = data.get("events")
+    if events is not None:  # somebody has looked for them
+        values |= {**dict.fromkeys(EVENTS, 0), **events}
     for agent, given in spec["arguments"].items():
         for name, value in given.items():
             values[f"{agent}.{name}"] = value

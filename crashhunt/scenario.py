@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from crashhunt._names import did_you_mean, listed, near_path
 from crashhunt.errors import ArgumentError, ScenarioError
+from crashhunt.events import LIMITS
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_names import check_names
 from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true
@@ -57,6 +58,7 @@ class Scenario:
         sumo: files and options, where the simulator is SUMO.
         highway: the environment, where it is highway-env.
         gym: the environment, where it is another one of Gymnasium.
+        events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
         schema: of the file format.
         name: what people call it; the folder's name by default.
         folder: where its files are; not part of the file.
@@ -75,6 +77,7 @@ class Scenario:
     sumo: SumoSetup | None = None
     highway: HighwaySetup | None = None
     gym: GymSetup | None = None
+    events: dict[str, float] = field(default_factory=dict)
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()
@@ -268,6 +271,11 @@ def _check(scenario: Scenario, where: str) -> None:
         _check_sumo(scenario, scenario.sumo, where)
     elif scenario.simulator in _TABLES:
         _check_environment(scenario, where)
+    for kind, limit in scenario.events.items():
+        if kind not in LIMITS:
+            _refuse(where, "events", kind, "has no limit", f"give some of {', '.join(LIMITS)}")
+        if not 0 < limit < float("inf"):
+            _refuse(where, f"events.{kind}", limit, "is no limit", f"give {LIMITS[kind][1]} above 0")
 
 
 def _check_arguments(scenario: Scenario, *, kept: bool) -> None:

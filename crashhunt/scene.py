@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.events import Event
+
 __all__ = [
     "PERSON",
     "Actor",
@@ -196,6 +198,7 @@ class Scene:
             contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
 
     Attributes:
+        events: what else happened in this step.
         agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
         previous: the scene one step before; None at the start. It has no previous one itself, so that nothing piles up.
     """
@@ -204,6 +207,7 @@ class Scene:
         "_neighbors",
         "agent_lanes",
         "contacts",
+        "events",
         "grades",
         "headings",
         "heights",
@@ -246,6 +250,7 @@ class Scene:
         self.grades = grades
         self.spines = spines
         self.swept = swept
+        self.events: tuple[Event, ...] = ()
         self.agent_lanes: dict[str, str] = {}
         self.previous: Scene | None = None
         self._neighbors: dict[int, list[tuple[float, int]]] = {}

@@ -86,6 +86,7 @@ class HuntSettings:
         oracles: names of registered oracles, or ``module:attribute``.
         agents: agent id to who drives it.
         scenario_arguments: what is tried for the scenario's arguments.
+        events: limits of traffic events that were asked for, such as ``not_moving`` in s.
         run: how it is run.
         schema: of the file format.
     """
@@ -101,8 +102,14 @@ class HuntSettings:
     oracles: tuple[str, ...] = ("reported-collision", "overlap", "off-road")
     agents: dict[str, AgentSettings] = field(default_factory=dict)
     scenario_arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
+    events: dict[str, float] = field(default_factory=dict)
     run: RunSettings = field(default_factory=RunSettings)
     schema: Literal[1] = 1
+
+    @property
+    def crash_on_words(self) -> tuple[str, ...]:
+        """What ``--crash-on`` was given, limits included."""
+        return tuple(f"{kind}:{self.events[kind]:g}" if kind in self.events else str(kind) for kind in self.crash_on)
 
     @property
     def space(self) -> Space:
@@ -142,6 +149,8 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str]) -> No
     import tomli_w
 
     data = _without_none(asdict(settings))
+    if not settings.events:
+        del data["events"]
     # No line break of an argument may end the comment.
     line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     text = f"# {line}\n{tomli_w.dumps(data)}"

@@ -312,6 +312,8 @@ def _as_dict(scenario: Scenario) -> dict[str, Any]:
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
 
     data: dict[str, Any] = plain(asdict(replace(scenario, folder=Path())))
+    if not data["events"]:
+        del data["events"]  # which an earlier crashhunt does not know
     return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}
 
 

@@ -10,6 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from crashhunt.errors import UsageError
 from crashhunt.results import HuntResults, columns_of
+from crashhunt.trial import EVENTS
 from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
         specs |= {f"{agent}.{name}": spec for name, spec in chosen.arguments.items()}
     known = {"int": "Int64", "float": "Float64", "bool": "Boolean", "str": "String"}
     kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
+    kinds |= dict.fromkeys(EVENTS, "Int64")
     columns = columns_of(settings)
     for name in columns:
         kind = specs[name].kind if name in specs else "float"

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.events import EVENT_WORDS, Event
 from crashhunt.integrity import typed
 from crashhunt.text import encodable
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CRASHES",
+    "EVENTS",
     "ClosestApproach",
     "Collision",
     "Escape",
@@ -38,6 +40,13 @@ class Outcome(StrEnum):
     FINISHED = "finished"
     COLLISION = "collision"
     OFF_ROAD = "off_road"
+    RED_LIGHT = "red_light"
+    WRONG_WAY = "wrong_way"
+    OFF_ROUTE = "off_route"
+    NOT_MOVING = "not_moving"
+    OTHERS_COLLIDED = "others_collided"
+    HARD_BRAKING = "hard_braking"
+    TELEPORT = "teleport"
     AGENT_ERROR = "agent_error"
     SIMULATOR_ERROR = "simulator_error"
     PROCESS_DIED = "process_died"
@@ -50,20 +59,30 @@ class Outcome(StrEnum):
         return self in (Outcome.COLLISION, Outcome.OFF_ROAD)
 
     @property
+    def is_traffic_event(self) -> bool:
+        """Whether it is something of the traffic that ends a trial only where somebody asked for it."""
+        return str(self) in EVENT_WORDS
+
+    @property
     def is_software_fault(self) -> bool:
         """Whether a program failed, not the driving."""
         return self in (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
 
     @property
     def category(self) -> str:
-        """What a report calls it: ``traffic crash``, ``software fault`` or ``no crash``."""
+        """What a report calls it: ``traffic crash``, ``traffic event``, ``software fault`` or ``no crash``."""
         if self.is_traffic_crash:
             return "traffic crash"
+        if self.is_traffic_event:
+            return "traffic event"
         return "software fault" if self.is_software_fault else "no crash"
 
 
 CRASHES = tuple(outcome for outcome in Outcome if outcome.is_traffic_crash or outcome.is_software_fault)
 """The outcomes that count as a crash unless ``--crash-on`` says otherwise."""
+
+EVENTS = tuple(outcome for outcome in Outcome if outcome.is_traffic_event)
+"""The outcomes that count as a crash only where ``--crash-on`` names them; they are recorded in any case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,12 +262,14 @@ class TrialResult:
         digest: BLAKE2b over everything recorded, in hexadecimal; equal digests mean runs equal to the bit.
         closest: how near to a crash it came.
         collision: the evidence of a traffic crash.
+        event: the evidence of a traffic event that somebody asked for.
         failure: the evidence of a software fault, or why the episode is invalid.
         wall_s: how long it took, in s of wall time.
         setup_s: the part of it before the first step.
         worker: the process id.
         kept: whether the worker left its scratch folder for the hunt to collect.
         escape: until when braking would have avoided it; None where nobody tried, or where it cannot be told.
+        events: how many traffic events of which kind there were; None where nobody looked.
     """
 
     spec: TrialSpec
@@ -264,6 +285,8 @@ class TrialResult:
     worker: int = 0
     kept: bool = False
     escape: Escape | None = None
+    event: Event | None = None
+    events: Mapping[str, int] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -276,12 +299,14 @@ class TrialResult:
             "collision": finite(asdict(self.collision)) if self.collision else None,
             "failure": asdict(self.failure) if self.failure else None,
             "escape": asdict(self.escape) if self.escape else None,
+            "event": self.event.to_json() if self.event else None,
+            "events": dict(self.events) if self.events is not None else None,
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TrialResult:
         """Rebuild what `to_json` returned."""
-        hit, failure, escape = data["collision"], data["failure"], data.get("escape")
+        hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=Outcome(data["outcome"]),
@@ -289,6 +314,8 @@ class TrialResult:
             collision=Collision.from_json(hit) if hit else None,
             failure=Failure(**failure) if failure else None,
             escape=Escape(**escape) if escape else None,
+            event=Event.from_json(event) if event else None,
+            events=data.get("events"),
             **{name: data[name] for name in _PLAIN},
         )
 
@@ -303,6 +330,8 @@ class TrialResult:
                 return f"{hit.agent} {what} at step {self.steps}"
             verb = "drove into" if hit.role == "collider" else "was hit by"
             return f"{hit.agent} {verb} {other} at step {self.steps}"
+        if self.event is not None:
+            return f"{self.event.what}, at step {self.steps}"
         if self.failure is not None:
             failure = self.failure
             if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
@@ -338,6 +367,11 @@ _COLLISION: dict[str, Any] = {
 }
 _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
 _ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
+_EVENT: dict[str, Any] = {
+    **dict.fromkeys(("kind", "agent", "what", "lane"), str),
+    **dict.fromkeys(("x", "y", "speed"), float | None),
+    "others": list[str],
+}
 
 
 def check_plain(data: Mapping[str, Any]) -> None:
@@ -348,12 +382,14 @@ def check_plain(data: Mapping[str, Any]) -> None:
     """
     typed(data, {"outcome": str, "steps": int, "sim_time_s": float, "digest": str, "wall_s": float, "spec": dict})
     typed(data["spec"], _SPEC)
-    check_parts(data["closest"], data["collision"], data["failure"], data.get("escape"))
+    typed({"events": data.get("events")}, {"events": dict | None})  # which there was not always
+    typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
+    check_parts(data["closest"], data["collision"], data["failure"], data.get("escape"), data.get("event"))
     if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
         raise ValueError("a number is below 0")
 
 
-def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None) -> None:
+def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, event: Any = None) -> None:
     """See the same of what a trial ended with, where anything is there.
 
     Raises:
@@ -362,6 +398,7 @@ def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None) 
     for name, part, types in (
         ("closest", closest, _CLOSEST), ("collision", collision, _COLLISION), ("failure", failure, _FAILURE),
         ("escape", escape, _ESCAPE),
+        ("event", event, _EVENT),
     ):  # fmt: skip
         typed({name: part}, {name: dict if name == "closest" else dict | None})
         if part is not None:

@@ -69,7 +69,8 @@ def add_run(commands: Any) -> None:
     how.add_argument(
         "--crash-on", metavar="KIND,…",
         help="the outcomes that count as a crash: collision, off_road, agent_error, simulator_error, process_died, "
-        "hang; default: all",
+        "hang, which are the default; and traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, or "
+        "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
     )  # fmt: skip
     how.add_argument("--keep-going", action="store_true", help="collect all crashes instead of stopping at the first")
     how.add_argument(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from crashhunt.events import Event
     from crashhunt.scene import Scene
     from crashhunt.trial import Collision, Outcome
 
@@ -16,15 +17,17 @@ __all__ = ["Finding", "Oracle", "merge_findings"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A traffic crash that an oracle saw.
+    """A traffic crash or a traffic event that an oracle saw.
 
     Args:
-        outcome: ``collision`` or ``off_road``.
-        collision: the evidence.
+        outcome: ``collision``, ``off_road``, or the kind of an event.
+        collision: the evidence of a crash.
+        event: the evidence of an event.
     """
 
     outcome: Outcome
-    collision: Collision
+    collision: Collision | None = None
+    event: Event | None = None
 
 
 class Oracle(Protocol):
@@ -42,7 +45,10 @@ def merge_findings(findings: Sequence[Finding]) -> Finding | None:
     if not findings:
         return None
     first = findings[0]
+    if first.collision is None:
+        return first
     parties = {first.collision.collider, first.collision.victim}
-    same = [other for other in findings if {other.collision.collider, other.collision.victim} == parties]
-    seen_by = tuple(sorted({name for other in same for name in other.collision.seen_by}))
+    hits = [other.collision for other in findings if other.collision is not None]
+    same = [hit for hit in hits if {hit.collider, hit.victim} == parties]
+    seen_by = tuple(sorted({name for hit in same for name in hit.seen_by}))
     return Finding(first.outcome, replace(first.collision, seen_by=seen_by))

@@ -25,6 +25,7 @@ from crashhunt.recording._recording import (
     encode_actors,
     encode_events,
     encode_heights,
+    encode_notes,
     encode_spines,
 )
 
@@ -48,6 +49,7 @@ __all__ = [
     "encode_actors",
     "encode_events",
     "encode_heights",
+    "encode_notes",
     "encode_spines",
     "first_divergence",
     "foxglove_layout",

@@ -58,6 +58,7 @@ class Tag(IntEnum):
     EVENTS = 8  # JSON: what touched, who left the road
     HEIGHTS = 9  # float64[]: z of each actor, then the grade at each; only where the map is not flat
     SPINES = 10  # of each long vehicle that is bent: uint32 row, uint32 points, float64 x, y and z of each
+    NOTES = 11  # JSON: traffic events. What we conclude from an episode is no part of it, nor of its digest
 
 
 class Phase(IntEnum):
@@ -121,6 +122,7 @@ class BlackBox:
         self._roster: object = None
         self._steps: dict[int, struct.Struct] = {}
         self._trail: list[tuple[Roster, int, Scene | None]] = []
+        self._notes: list[tuple[int, int]] = []
         try:
             self._reserve(_FIRST)
         except RecorderError:
@@ -134,6 +136,7 @@ class BlackBox:
         self._step = 0
         self._roster = None
         self._trail.clear()
+        self._notes.clear()
 
     def prologue(self, payload: bytes, agents: int) -> None:
         """Record what the trial consists of; ``agents`` is how many rewards each step has."""
@@ -151,6 +154,12 @@ class BlackBox:
         self._map[start : start + length] = payload
         self._finish(start + length)
         self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
+
+    def note(self, payload: bytes) -> None:
+        """Record what is no part of the digest."""
+        begins = self._offset
+        self.append(Tag.NOTES, 0, payload)
+        self._notes.append((begins, self._offset))
 
     def observation(self, agent: int, array: NDArray[np.generic]) -> None:
         """Record what an agent is about to be shown."""
@@ -222,6 +231,12 @@ class BlackBox:
     def committed(self) -> memoryview:
         """The bytes of all records so far."""
         return memoryview(self._map)[_FIRST : self._offset]
+
+    def evidence(self) -> list[memoryview]:
+        """The bytes of all records so far over which the digest runs."""
+        whole = memoryview(self._map)
+        edges = [_FIRST, *chain.from_iterable(self._notes), self._offset]
+        return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
         """Write to nowhere from now on: this process is a copy of the one that records."""

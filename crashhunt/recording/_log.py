@@ -40,6 +40,7 @@ _TEXTS = {
     Tag.ACTORS: "/scene/actor_definitions",
     Tag.LANES: "/scene/lanes",
     Tag.EVENTS: "/events",
+    Tag.NOTES: "/traffic_events",
 }
 
 

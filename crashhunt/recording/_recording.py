@@ -12,6 +12,7 @@ import numpy as np
 
 from crashhunt._names import one_of
 from crashhunt.errors import BundleError
+from crashhunt.events import Event
 from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.scene import Actor, Contact, Roster, Scene
 
@@ -32,6 +33,7 @@ __all__ = [
     "encode_actors",
     "encode_events",
     "encode_heights",
+    "encode_notes",
     "encode_spines",
     "pack_spines",
 ]
@@ -138,6 +140,11 @@ def decode_spines(payload: bytes) -> dict[int, Spine]:
     return found
 
 
+def encode_notes(events: Iterable[Event]) -> bytes:
+    """Return the payload that says what else happened in the traffic."""
+    return json.dumps([event.to_json() for event in events]).encode()
+
+
 @dataclass(slots=True)
 class StepRecord:
     """What was recorded of one step.
@@ -193,7 +200,7 @@ class Recording:
     @property
     def digest(self) -> str:
         """The trace digest, in hexadecimal."""
-        return digest_of(b"".join(record.encode() for record in self.records))
+        return digest_of(b"".join(record.encode() for record in self.records if record.tag != Tag.NOTES))
 
     @property
     def steps(self) -> int:
@@ -244,6 +251,7 @@ class Recording:
         events: dict[str, Any] = {}
         heights: list[float] = []
         spines: dict[int, Spine] = {}
+        notes: tuple[Event, ...] = ()
         for record in self.records[1:]:
             tag, aux, payload = record
             if tag == Tag.OBSERVATION:
@@ -265,6 +273,8 @@ class Recording:
                 heights = np.frombuffer(payload, "<f8").tolist()
             elif tag == Tag.SPINES:
                 spines = decode_spines(payload)
+            elif tag == Tag.NOTES:
+                notes = tuple(Event.from_json(note) for note in json.loads(payload))
             elif tag == Tag.STEP:
                 step, time_s = _STEP_HEAD.unpack_from(payload)
                 rewards = np.frombuffer(payload, "<f8", len(agents), _STEP_HEAD.size)
@@ -284,14 +294,19 @@ class Recording:
                     time_s, roster, points, headings, speeds, contacts, off_road, lanes,
                     heights[:count], heights[count:], spines,
                 )  # fmt: skip
+                current.scene.events = notes
                 current.scene.previous = self.all_steps[-1].scene if self.all_steps else None
                 current.rewards = {agent.id: float(reward) for agent, reward in zip(agents, rewards, strict=True)}
                 self.all_steps.append(current)
-                current, lanes, events, heights, spines = StepRecord(step + 1), (), {}, [], {}
+                current, lanes, events, notes = StepRecord(step + 1), (), {}, ()
+                heights, spines = [], {}
         if current.observations or current.actions:
             self.all_steps.append(current)
 
 
-def digest_of(records: bytes | memoryview) -> str:
+def digest_of(*records: bytes | memoryview) -> str:
     """Return the trace digest of encoded records: BLAKE2b of 16 bytes, in hexadecimal."""
-    return hashlib.blake2b(records, digest_size=16).hexdigest()
+    digest = hashlib.blake2b(digest_size=16)
+    for part in records:
+        digest.update(part)
+    return digest.hexdigest()

@@ -64,6 +64,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
     _write_map(log, recording, scenes, lanes)
     _write_scenes(log, recording, scenes, crash)
     _write_metrics(log, recording.agents[0], scenes)
+    _write_events(log, scenes)
     if crash is not None:
         _write_crash(log, recording, scenes[-1], crash)
 
@@ -261,6 +262,17 @@ def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
         speed = scene.speeds[row] if row is not None else math.nan
         metrics = schemas.Metrics(speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake)
         log.write("/metrics", schemas.Metrics, metrics.SerializeToString(), to_ns(scene.time_s))
+
+
+def _write_events(log: LogWriter, scenes: Sequence[Scene]) -> None:
+    """What happened in the traffic, as lines of the log."""
+    from crashhunt.recording._log import to_ns
+
+    for scene in scenes:
+        for event in scene.events:
+            line = Log(level=Log.WARNING, message=f"{event.kind}: {event.what}", name="crashhunt")
+            _stamp(line.timestamp, scene.time_s)
+            log.write("/log", Log, line.SerializeToString(), to_ns(scene.time_s))
 
 
 def _write_crash(log: LogWriter, recording: Recording, scene: Scene, crash: TrialResult) -> None:

@@ -30,7 +30,12 @@ __all__ = ["Watcher", "format_arguments", "format_seconds"]
 
 _LINE_EVERY_S = 5.0
 _LEAST_BAR = 8
-_STYLES = {"traffic crash": "bold red", "software fault": "bold magenta", "no crash": "green"}
+_STYLES = {
+    "traffic crash": "bold red",
+    "traffic event": "bold yellow",
+    "software fault": "bold magenta",
+    "no crash": "green",
+}
 
 
 class Watcher:

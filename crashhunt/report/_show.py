@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.encounter import Encounter, last_escape
+from crashhunt.report._events import about_events
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 from crashhunt.text import in_lines
@@ -97,10 +98,12 @@ class Story:
         sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
         if self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
+        sentences += about_events(recording, self._first_step(), besides=result.event)
         hit = result.collision
-        if hit is not None and hit.role == "alone":
+        if result.event is not None or (hit is not None and hit.role == "alone"):
             before = self._action(end)
-            sentences.append(f"Its last decision was {_words(before, self._names())}.")
+            whose = "Its" if result.event is None else f"{self.agent}'s"
+            sentences.append(f"{whose} last decision was {_words(before, self._names())}.")
         if result.failure is not None:
             sentences += self._about_failure()
         return sentences

@@ -6,6 +6,7 @@ import math
 import shlex
 from typing import TYPE_CHECKING
 
+from crashhunt.events import event_counts
 from crashhunt.report._screen import format_arguments, format_seconds
 from crashhunt.text import in_lines
 
@@ -38,6 +39,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because == "all_trials":
         lines.append("No crash was found.")
+    lines += _describe_events(report)
     for bundle in report.crashes[:_SHOWN]:
         lines += ["", *_describe_crash(bundle)]
     if len(report.crashes) > _SHOWN:
@@ -49,6 +51,18 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
             command += ["--crash", first.id]
         lines += ["", f"Replay it:  {shlex.join(command)}"]
     return in_lines(lines)
+
+
+def _describe_events(report: HuntReport) -> list[str]:
+    """What happened in the traffic that the hunt was not after, and how to be after it."""
+    others = {kind: found for kind, found in report.events.items() if kind not in report.settings.crash_on}
+    if not others:
+        return []
+    told = ", ".join(
+        f"{event_counts({kind: count})} in {trials} {'trial' if trials == 1 else 'trials'}"
+        for kind, (count, trials) in others.items()
+    )
+    return [f"Also: {told}; --crash-on {','.join(others)} hunts for that."]
 
 
 def describe_replay(report: ReplayReport) -> str:
@@ -138,7 +152,10 @@ def _describe_crash(bundle: Bundle) -> list[str]:
 
 def _evidence(result: TrialResult) -> list[str]:
     lines = []
-    hit, failure = result.collision, result.failure
+    hit, failure, event = result.collision, result.failure, result.event
+    if event is not None and math.isfinite(event.x):
+        where = f"at ({event.x:.1f}, {event.y:.1f})" + (f" on lane {event.lane}" if event.lane else "")
+        lines.append(f"{event.agent} {where}, at {event.speed:.1f} m/s")
     if hit is not None:
         where = f"at ({hit.x:.1f}, {hit.y:.1f})" + (f" on lane {hit.lane}" if hit.lane else "")
         speeds = f"{hit.collider} at {hit.collider_speed:.1f} m/s"

@@ -62,6 +62,7 @@ class Simulator(Protocol):
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     A simulator whose observations are structured hands out flattened arrays, and offers ``shown_spaces``: for each such
     agent the Dict or Tuple space into which its observations are unflattened before the agent is shown them.
+    One that looks for traffic events offers ``told_events``, their kinds, and puts them into its scenes.
     A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`. One that
     has a window of its own offers ``open_window()``, called before the first `reset`, ``follow(agent, other)``, which
     marks the two and keeps the agent in view, and ``window_open``; none of them changes what is simulated. One that

@@ -12,11 +12,13 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.events import TOLD_BY
 from crashhunt.scene import PERSON, Lane, is_person
 from crashhunt.setups import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators._sumo_events import SumoEvents
 from crashhunt.simulators._sumo_files import StagedFiles
 from crashhunt.simulators._sumo_sight import Sight
 
@@ -69,6 +71,9 @@ class SumoSimulator:
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
+        self._events = SumoEvents(scenario.step_length_s, scenario.events)
+
+    told_events = TOLD_BY["sumo"]
 
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo brings along."""
@@ -114,7 +119,9 @@ class SumoSimulator:
         self._sight.reset()
         self._off_road: list[str] = []
         self._look()
-        return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}, {}
+        observations = {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
+        self._events.begin(self._scene, self.agents, self._scenario.agents)
+        return observations, {}
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
@@ -139,6 +146,7 @@ class SumoSimulator:
                 observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
                 rewards[agent] = 0.0 if row is None else scene.speeds[row] * self.step_length_s
                 terminations[agent] = row is None
+            scene.events = self._events.look(scene, tuple(actions))
         except _TRACI_ERRORS as error:
             raise SimulatorError(f"SUMO gave up: {_one_line(error)}") from error
         if scene.contacts or self._off_road:
