@@ -166,7 +166,7 @@ def damaged(path: Path, message: str) -> HuntDirectoryError:
 
 def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
     """Return the error that says in our words what SQLite says."""
-    where, text = str(path), str(error)
+    where, text = str(path), " ".join(str(error).split())  # which may quote what is damaged
     if "full" in text or "disk I/O" in text:
         return HuntDirectoryError(
             f"the disk is full ({text})", fix="free some space and run the same command again", where=where
