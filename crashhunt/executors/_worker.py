@@ -119,7 +119,9 @@ class Worker:
             simulator = self._simulator = self._parts.simulator()
         if self._baseline is None:
             _tidy(simulator)
-            self._baseline = Baseline(self._settings.code, self._settings.scratch)
+            scenario = self._settings.scenario
+            files = [scenario.folder / name for name in scenario.files()]
+            self._baseline = Baseline(self._settings.code, self._settings.scratch, files)
         self._baseline.begin()
         self.used = True
         made = time.monotonic()

@@ -52,7 +52,11 @@ def test_a_hunt_with_everything_that_people_have(town, shell, monkeypatch):
     (town / "in puts").mkdir()
     victim = town / "mine.xml"
     victim.write_text("what I have written")
-    (town / "more.rou.xml").write_text('<routes><flow id="g" route="way" begin="1" end="600" period="3"/></routes>')
+    # SUMO goes on reading this one while it simulates.
+    late = "".join(f'<vehicle id="late{time}" route="way" depart="{time}"/>' for time in range(700, 4000, 3))
+    (town / "more.rou.xml").write_text(
+        f'<routes><flow id="g" route="way" begin="1" end="600" period="3"/>{late}</routes>'
+    )
     packed = ROUTES.format(f'<include href="{town}/more.rou.xml"/>')
     # As it happens, ${ is in it.
     (town / "in puts" / "r.rou.xml.gz").write_bytes(gzip.compress(f"{packed}<!-- ${{NOT_OURS}} -->".encode()))
@@ -71,10 +75,22 @@ def test_a_hunt_with_everything_that_people_have(town, shell, monkeypatch):
     )
     shell.environment["INPUTS"] = "in puts"
     before = {path: path.read_bytes() for path in town.rglob("*.xml")}
-    words = ("run", str(town / "h"), "1", "1", "40", "--scenario", str(town / "town.sumocfg"), "--ego", "g.0")
+    words = (
+        "run",
+        str(town / "h"),
+        "1",
+        "2",
+        "40",
+        "--keep-going",
+        "--scenario",
+        str(town / "town.sumocfg"),
+        "--ego",
+        "g.0",
+    )
     done = shell.crashhunt(*words, "--arg", "speed=20", "--set", "scale=2", "--json", "--timeout", "120")
     outcomes = done.json["outcomes"]
     assert outcomes.get("invalid", 0) == 0
+    assert "which files are open" not in done.err  # so that the same worker goes on
     for part in ("${INPUTS}, which is 'in puts'", "threads 2 (it is 1", "tripinfo-output", "out/e1.xml", "nothing is"):
         assert part in done.err
     assert {path: path.read_bytes() for path in before} == before
@@ -107,6 +123,17 @@ def test_what_is_not_there_is_named_before_anything_runs(town, content, says):
         load_scenario(config(town, ""))
     for part in (*says, "r.rou.xml"):
         assert part in str(caught.value)
+
+
+def test_a_scenario_reads_nothing_outside_its_folder(town):
+    (town.parent / "other.xml").write_text("<routes/>")
+    (town / "r.rou.xml").write_text(ROUTES.format('<include href="../other.xml"/>'))
+    assert load_scenario(config(town, "")).folder == town.parent  # a configuration may lie anywhere
+    (town / "scenario.toml").write_text(
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nroute = "way"\n'
+    )
+    with pytest.raises(ScenarioError, match="outside the scenario's folder"):
+        load_scenario(town)
 
 
 def test_files_that_include_each_other_end(town):
