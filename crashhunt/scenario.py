@@ -111,7 +111,7 @@ class Scenario:
         if self.sumo is not None:
             named = (*self.sumo.routes, *self.sumo.additional)
             yield from named
-            yield from nested_files(self.folder, named)
+            yield from nested_files(self.folder, named, inside=True)
 
     def modules(self) -> Iterator[str]:
         """Yield the modules that the simulator imports besides the agents': those of environments and crash rules."""

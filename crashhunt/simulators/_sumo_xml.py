@@ -165,21 +165,25 @@ def movable(path: Path) -> bytes | None:
     return None if moved == content else moved
 
 
-def nested_files(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) -> tuple[str, ...]:
     """Return the files that some files have SUMO read, and those that these do, relative to the folder.
 
     Args:
         folder: of the scenario.
         names: files in it.
+        inside: refuse what lies outside the folder, before it is looked at.
 
     Raises:
-        ScenarioError: one does not exist, or is named by an argument.
+        ScenarioError: one does not exist.
     """
     found: dict[str, None] = {}
     waiting = list(names)
     while waiting:
         name = waiting.pop(0)
         for nested in _named_by(folder, name):
+            if inside and nested.startswith(f"..{os.sep}"):
+                message, fix = f"names {nested!r}, outside the scenario's folder", "move it inside, to be archived"
+                raise ScenarioError(message, fix=fix, where=str(folder / name))
             if nested not in found and nested not in names:
                 found[nested] = None
                 waiting.append(nested)
