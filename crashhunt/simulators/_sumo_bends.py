@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from crashhunt.scene import Actor, Spine
 
-__all__ = ["Bends", "is_articulated"]
+__all__ = ["Bends", "height_at", "is_articulated"]
 
 _RAILS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _RIGID_M = 15.0  # no longer bus or lorry may be built in one piece (Directive 96/53/EC); what is longer has a joint
@@ -83,7 +83,7 @@ class Bends:
             share = (place - distances[index - 1]) / max(distances[index] - distances[index - 1], 1e-9)
             # Beyond the beginning of its route, it goes straight on.
             x, y = x + share * (back_x - x), y + share * (back_y - y)
-            found.append((x, y, _height(on, at) if high else 0.0))
+            found.append((x, y, height_at(on, at) if high else 0.0))
         return None if _is_straight(found, length, heading) else tuple(found)
 
     def _behind(self, vehicle: str, lane: str, position: float, length: float) -> Iterator[tuple[Point, str, float]]:
@@ -151,9 +151,12 @@ def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Po
     return moved
 
 
-def _height(lane: str, position: float) -> float:
+def height_at(lane: str, position: float) -> float:
+    """Return z of the middle of a lane, in m; positions beyond its ends count as these."""
     edge, _, index = lane.rpartition("_")
-    place = sumo.simulation_convert3D(edge, max(0.0, min(position, sumo.lane_getLength(lane))), int(index), False)
+    # SUMO refuses what is longer than the lane by a rounding error.
+    position = max(0.0, min(position, sumo.lane_getLength(lane) - 1e-6))
+    place = sumo.simulation_convert3D(edge, position, int(index), False)
     return float(place[2]) if len(place) > 2 else 0.0
 
 

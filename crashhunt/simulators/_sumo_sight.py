@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from libsumo import _libsumo as sumo
 
 from crashhunt.scene import PERSON, Actor, Contact, Roster, Scene
-from crashhunt.simulators._sumo_bends import Bends, is_articulated
+from crashhunt.simulators._sumo_bends import Bends, height_at, is_articulated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -188,12 +188,10 @@ class Sight:
         """Whether the lanes of the network are not all on one plane."""
         low = high = None
         for lane in sumo.lane_getIDList():
-            edge, _, index = lane.rpartition("_")
             length = sumo.lane_getLength(lane)
             pieces = max(1, math.ceil(length / _HEIGHT_EVERY_M))
             for piece in range(pieces + 1):
-                place = sumo.simulation_convert3D(edge, length * piece / pieces, int(index), False)
-                z = place[2] if len(place) > 2 else 0.0
+                z = height_at(lane, length * piece / pieces)
                 low = z if low is None or z < low else low
                 high = z if high is None or z > high else high
         return low is not None and high is not None and high - low > _FLAT_M

@@ -20,6 +20,7 @@ from crashhunt.outlines import outlines
 from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box, read_log, write_log
 from crashhunt.render._scene import SceneView
 from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.simulators._sumo_bends import height_at
 from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.trial import Outcome, TrialSpec
 
@@ -329,3 +330,12 @@ def test_film_page_and_views_show_trains_and_persons(drive, tmp_path):
     _, recording, _ = drive("street", traffic, steps=2)
     picture = SceneView(recording, [], agent="ego", other="person 0").draw(1)
     assert (np.abs(picture.astype(int) - (198, 40, 40)) < 40).all(axis=2).sum() > 40
+
+
+def test_lanes_of_any_length_have_a_height(drive):
+    # 240.13 m in pieces of 20 m is a rounding error more than that: SUMO refuses it.
+    _, recording, _ = drive("bridge", vehicle("ego", "down", departPos="100"), steps=1)
+    for lane, length in (("down_0", 240.13), ("up_0", 240.13), (":b1_0_0", 0.1)):
+        for piece in range(14):
+            assert math.isfinite(height_at(lane, length * piece / 13 + 1e-9))
+    assert recording.scene(0).heights
