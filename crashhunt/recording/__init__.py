@@ -31,7 +31,7 @@ from crashhunt.recording._recording import (
 
 if TYPE_CHECKING:
     from crashhunt.recording._log import read_log, write_log
-    from crashhunt.recording._views import foxglove_layout, read_lanes
+    from crashhunt.recording._views import foxglove_layout, lane_borders, read_lanes
 
 __all__ = [
     "DISK",
@@ -53,6 +53,7 @@ __all__ = [
     "encode_spines",
     "first_divergence",
     "foxglove_layout",
+    "lane_borders",
     "read_black_box",
     "read_header",
     "read_lanes",
@@ -67,7 +68,7 @@ def __getattr__(name: str) -> Any:
         from crashhunt.recording import _log
 
         return getattr(_log, name)
-    if name in ("foxglove_layout", "read_lanes"):
+    if name in ("foxglove_layout", "lane_borders", "read_lanes"):
         from crashhunt.recording import _views
 
         return getattr(_views, name)

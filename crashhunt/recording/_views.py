@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.scene import Actor, Lane, Scene
     from crashhunt.trial import TrialResult
 
-__all__ = ["foxglove_layout", "read_lanes", "write_views"]
+__all__ = ["foxglove_layout", "lane_borders", "read_lanes", "write_views"]
 
 _MAP_REACH_M = 300.0
 _HEIGHT_M = 1.5
@@ -133,6 +133,16 @@ def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], la
             for x, y in _shifted(shape, side * lane.width).tolist():
                 line.points.add(x=x, y=y)
     log.write("/map", SceneUpdate, SceneUpdate(entities=[entity]).SerializeToString(), to_ns(scenes[0].time_s))
+
+
+def lane_borders(lanes: Sequence[Lane]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the right and the left border of each lane, shape (n, 2), in m, as `read_lanes` does of a log."""
+    shapes = [(lane, np.array(lane.shape, dtype=float).reshape(-1, 2)) for lane in lanes]
+    return [
+        (_shifted(shape, -0.5 * lane.width), _shifted(shape, 0.5 * lane.width))
+        for lane, shape in shapes
+        if len(shape) > 1
+    ]
 
 
 def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
+import importlib.util
+import os
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from crashhunt._names import one_of
-from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.errors import UsageError
-from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
-from crashhunt.scenario import argument_values, load_scenario, with_action
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.simulators._env_episodes import Episodes
+from crashhunt.simulators._env_process import RemoteEpisodes
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
-    from crashhunt.agents import Agent
-
 __all__ = ["SumoEnv"]
+
+# Which environment has this process's one simulation, and in which process that was said: a copy, made by forking, has
+# none. Weakly, so that one that is forgotten need not be closed.
+_here: weakref.WeakSet[Episodes] = weakref.WeakSet()
+_process: list[int] = []
 
 
 class SumoEnv(gymnasium.Env[Any, Any]):
@@ -28,8 +32,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
     The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). The reward is the
     distance driven in a step, in m. An episode is terminated by arrival and by a crash, and ``info["outcome"]`` says
-    which; it is truncated after ``max_steps``. libsumo is one simulation per process: of several environments, only
-    the one that was reset last can step.
+    which; it is truncated after ``max_steps``.
 
     Args:
         scenario: a shipped name, or a path.
@@ -37,13 +40,16 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         action: ``continuous`` is (target speed in m/s, lane change), ``meta`` highway-env's DiscreteMetaAction; the
             scenario's own choice by default.
         max_steps: None for no bound.
-        render_mode: None; a recording is looked at elsewhere.
+        render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
+        process: whether it runs in a process of its own, which costs up to a millisecond a step. libsumo is one
+            simulation per process, so that by default the first environment of a process runs in it, and the others in
+            one of their own each.
 
     Raises:
         CrashhuntError: the scenario or the agent does not exist.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's base class declares it so
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's base class declares it so
 
     def __init__(
         self,
@@ -53,27 +59,30 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         action: str = "",
         max_steps: int | None = None,
         render_mode: str | None = None,
+        process: bool | None = None,
     ) -> None:
-        chosen = load_scenario(scenario)
-        if agent and agent not in chosen.agents:
-            raise UsageError(f"there is no controlled vehicle {agent!r}", fix=one_of(agent, chosen.agents))
-        self.agent = agent or next(iter(chosen.agents))
-        if action:
-            chosen = with_action(chosen, self.agent, action)
-        self._arguments = argument_values(chosen)
+        if render_mode not in (None, "rgb_array"):
+            raise UsageError(f"render_mode is {render_mode!r}", fix=one_of(str(render_mode), ("rgb_array",)))
+        if render_mode is not None and importlib.util.find_spec("PIL") is None:
+            raise UsageError("render_mode needs Pillow", fix="pip install 'crashhunt[video]'")
         self._max_steps = max_steps
-        self._stage = tempfile.TemporaryDirectory(prefix="crashhunt-")
-        self._simulator = SumoSimulator(chosen, Path(self._stage.name))
-        self._form = self._simulator.actions[self.agent]
-        self._oracles = (ReportedCollision(), Overlap(), OffRoad())
-        self._others: dict[str, Agent] = {
-            other: KeepLaneWithSpeed(10.0, self._simulator.actions[other].space)
-            for other in chosen.agents
-            if other != self.agent
-        }
-        self.observation_space = self._simulator.observation_spaces[self.agent]
-        self.action_space = self._form.space
+        self._episodes: Episodes | RemoteEpisodes
+        if process is None:
+            process = _process == [os.getpid()] and len(_here) > 0
+        if process:
+            self._episodes = RemoteEpisodes(scenario, agent, action)
+        else:
+            self._episodes = Episodes(scenario, agent, action)
+            if _process != [os.getpid()]:
+                _here.clear()
+                _process[:] = [os.getpid()]
+            _here.add(self._episodes)
+        self.agent = self._episodes.agent
+        self.observation_space = self._episodes.observation_space
+        self.action_space = self._episodes.action_space
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._episodes.step_length_s))}
+        self._steps = -1
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -85,37 +94,36 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             options: ``{"arguments": {name: value}}``, scenario arguments that differ from their defaults.
         """
         super().reset(seed=seed)
-        arguments = {**self._arguments, **(options or {}).get("arguments", {})}
         drawn = int(self.np_random.integers(2**31))
-        self._observations, _ = self._simulator.reset(seed=drawn, options={"arguments": arguments})
         self._steps = 0
-        return self._observations[self.agent], {"sim_time_s": self._simulator.scene().time_s}
+        return self._episodes.reset(drawn, (options or {}).get("arguments", {}))
 
     def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         """Advance one control step.
 
         Raises:
             ActionError: the action is not in the space.
-            SimulatorError: SUMO gave up, or another environment of this process was reset meanwhile.
+            SimulatorError: SUMO gave up, its process ended, or another simulation has begun in this process.
         """
-        actions = {self.agent: self._form.encode(action)}
-        for other, driver in self._others.items():
-            if other in self._simulator.agents:
-                actions[other] = self._simulator.actions[other].encode(driver.act(self._observations[other]))
-        before = self._simulator.scene()
-        self._observations, rewards, terminations, _, _ = self._simulator.step(actions)
-        scene = self._simulator.scene()
-        scene.follow(before)
+        observation, reward, terminated, info = self._episodes.step(action)
         self._steps += 1
-        finding = merge_findings([found for oracle in self._oracles for found in oracle.check(scene, (self.agent,))])
-        terminated = terminations[self.agent] or finding is not None
         truncated = not terminated and self._max_steps is not None and self._steps >= self._max_steps
-        info: dict[str, Any] = {"sim_time_s": scene.time_s}
-        if terminated:
-            info["outcome"] = str(finding.outcome) if finding is not None else "finished"
-        return self._observations[self.agent], rewards[self.agent], terminated, truncated, info
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> NDArray[Any] | None:
+        """Return the scene from above, where ``render_mode`` asks for it.
+
+        Raises:
+            UsageError: no episode has begun.
+        """
+        if self.render_mode is None:
+            return None
+        if self._steps < 0:
+            raise UsageError("there is nothing to render yet", fix="call reset first")
+        return self._episodes.picture()
 
     def close(self) -> None:
-        """End the simulation and remove its files."""
-        self._simulator.close()
-        self._stage.cleanup()
+        """End the simulation and remove its files; may be called twice."""
+        self._episodes.close()
+        if isinstance(self._episodes, Episodes):
+            _here.discard(self._episodes)
