@@ -17,8 +17,8 @@ from crashhunt.errors import ArgumentError, ScenarioError
 from crashhunt.events import LIMITS
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_names import check_names
-from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true
-from crashhunt.simulators._sumo_xml import nested_files, read_xml
+from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true, writes
+from crashhunt.simulators._sumo_xml import nested_files, read_xml, written_by
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -216,7 +216,16 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     if "schema" not in data and not kept:
         # Some day there will be another one, and then nobody knows which of the two this file is.
         raise ScenarioError("the key 'schema' is missing", fix="add schema = 1", where=str(path))
-    return scenario
+    return scenario if kept or scenario.sumo is None else _noted(scenario, scenario.sumo)
+
+
+def _noted(scenario: Scenario, sumo: SumoSetup) -> Scenario:
+    """Tell what SUMO would write and does not."""
+    named = [name for option in sumo.options if writes(name := canonical(option))]
+    found = [f"{', '.join(named)} (nothing is written)"] if named else []
+    found += written_by(scenario.folder, (*sumo.routes, *sumo.additional))
+    note = f"of {scenario.file}, a trial does not take over: {'; '.join(found)}"
+    return replace(scenario, notes=(*scenario.notes, note)) if found else scenario
 
 
 def scenario_from_dict(data: dict[str, Any], *, where: str, folder: Path) -> Scenario:

@@ -7,17 +7,13 @@ import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import Scenario, check_options
 from crashhunt.setups import AgentSetup, ArgumentSetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_config import changes, is_left_out, read_config, split_names
 from crashhunt.simulators._sumo_options import INPUTS, RESERVED
-from crashhunt.simulators._sumo_xml import nested_files, read_xml, references
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
+from crashhunt.simulators._sumo_xml import nested_files, read_xml, written_by
 
 __all__ = ["load_sumocfg"]
 
@@ -55,7 +51,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         raise ScenarioError("the configuration names no net-file", fix="add <net-file value=…/>", where=str(path))
     changed = changes(options)
     options = {key: value for key, value in options.items() if not is_left_out(key)}
-    folder, files = _files(options, path)
+    folder, files = _files(options, path, "; ".join(note for note in notes if note.endswith("is not set")))
     (net, *_), routes, additional = (files[key] for key in _FILES)
     begin, step_length = _times(options, path)
     agent, setup, note = _choose_ego(ego, [folder / file for file in (*routes, *additional)], begin, path)
@@ -63,7 +59,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     kept = {key: value for key, value in options.items() if key not in _TAKEN | RESERVED}
     check_options(kept, str(path))
     kept |= {key: ",".join(files[key]) for key in INPUTS & files.keys()}
-    changed += _written(folder, (*routes, *additional))
+    changed += written_by(folder, (*routes, *additional))
     if changed:
         notes.append(f"of {path.name}, a trial does not take over: {'; '.join(changed)}")
     literal = any(b"${" in read_xml(folder / file) for file in (*routes, *additional))
@@ -89,7 +85,7 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
     )
 
 
-def _files(options: dict[str, str], path: Path) -> tuple[Path, dict[str, tuple[str, ...]]]:
+def _files(options: dict[str, str], path: Path, unset: str) -> tuple[Path, dict[str, tuple[str, ...]]]:
     """Return the folder that holds all files of the configuration, and their names in it by option."""
     base = path.resolve().parent
     named: dict[str, list[str]] = {key: [] for key in _FILES}
@@ -97,7 +93,8 @@ def _files(options: dict[str, str], path: Path) -> tuple[Path, dict[str, tuple[s
         for name in split_names(options.pop(key)):
             file = os.path.normpath(base / name)
             if not os.path.isfile(file):  # noqa: PTH113
-                raise ScenarioError(f"{key}: the file {file!r} does not exist", fix="mend the path", where=str(path))
+                fix = f"set it ({unset})" if unset else "mend the path"
+                raise ScenarioError(f"{key}: the file {file!r} does not exist", fix=fix, where=str(path))
             named.setdefault(key, []).append(file)
     for key in sorted(key for key in options if key.endswith(("-file", "-files"))):
         raise ScenarioError(
@@ -127,18 +124,6 @@ def _times(options: dict[str, str], path: Path) -> tuple[float, float]:
             f"step-length = {options['step-length']!r} is no time step", fix="give at least 0.001", where=str(path)
         )
     return begin, step_length
-
-
-def _written(folder: Path, names: Iterable[str]) -> list[str]:
-    """What the files would have SUMO write, in words."""
-    found = [
-        f"{name}: {reference}"
-        for name in dict.fromkeys((*names, *nested_files(folder, tuple(names))))
-        for reference in references(read_xml(folder / name), str(folder / name))
-        if reference.kind == "written"
-    ]
-    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-    return [f"{found[0]}{more} (nothing is written)"] if found else []
 
 
 def _number(text: str, option: str, path: Path) -> float:

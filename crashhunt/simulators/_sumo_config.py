@@ -56,7 +56,10 @@ def read_config(path: Path) -> tuple[dict[str, str], list[str]]:
             fix = "remove one of the two"
             raise ScenarioError(f"the option {element.tag} is given twice", fix=fix, where=str(path))
         options[name] = _resolved(value, used)
-    notes = [f"{path.name} names ${{{name}}}, which is {value!r} now" for name, value in used.items()]
+    notes = [
+        f"{path.name} names ${{{name}}}, which is {value!r} now" if value else f"{path.name}: ${{{name}}} is not set"
+        for name, value in used.items()
+    ]
     return options, notes
 
 

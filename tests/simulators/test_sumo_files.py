@@ -236,6 +236,7 @@ def test_options_under_any_name(town, text, says):
         ('<step-length value="0.0001"/>', "no time step"),
         ('<b value="1:0"/><e value="30"/>', "before begin"),
         ('<a value="gone.add.xml"/>', "additional-files: the file"),
+        ('<a value="${NOWHERE_AT_ALL}/r.rou.xml"/>', "NOWHERE_AT_ALL} is not set"),
     ],
 )
 def test_a_configuration_that_sumo_would_not_take_either(town, text, says):
@@ -261,6 +262,22 @@ def test_what_is_filled_in_is_so_in_compressed_files_too(town, tmp_path):
     (tmp_path / "again").mkdir()
     with pytest.raises(InvalidEpisodeError, match="imperfection"):
         StagedFiles(scenario, tmp_path / "again").arguments(1, {})
+
+
+def test_what_a_scenario_would_have_written_is_told_and_no_more_than_xml_is_asked(town, tmp_path):
+    # What an argument stands for may be several attributes.
+    (town / "a.add.xml").write_text('<additional><e1Detector file="x.xml" ${more} pos="3" period="9"/></additional>')
+    (town / "scenario.toml").write_text(
+        'schema = 1\n[sumo]\nnet = "net.net.xml"\nroutes = ["r.rou.xml"]\nadditional = ["a.add.xml"]\n'
+        '[sumo.options]\ntripinfo = "t.xml"\n[arguments.more]\ndefault = "x"\n[agents.ego]\nroute = "way"\n'
+    )
+    scenario = load_scenario(town)
+    assert "tripinfo-output (nothing is written)" in scenario.notes[0]
+    options = staged(scenario, tmp_path / "stage", more="id='d' lane='south_0'")
+    assert "tripinfo-output" not in options
+    assert 'file="/dev/null" id=' in Path(options["additional-files"]).read_text()
+    with pytest.raises(InvalidEpisodeError, match="not valid XML"):
+        staged(scenario, tmp_path / "stage", more="<")
 
 
 def test_a_traffic_light_of_the_network_writes_nothing_either(town, tmp_path):
