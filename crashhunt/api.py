@@ -54,6 +54,7 @@ def prepare(
     accelerate: bool = True,
     timeout_s: float = 60.0,
     recycle_after: int = 1000,
+    audit: float = 0.0,
     snapshot: SnapshotOptions | None = None,
     overwrite: bool = False,
     command: Sequence[str] | None = None,
@@ -83,6 +84,7 @@ def prepare(
         accelerate: speed simulators up where that changes no bit.
         timeout_s: wall-clock limit of a trial, in s.
         recycle_after: trials after which a worker is replaced; 0 for never.
+        audit: the share of trials without a crash that are run again in a fresh process, to see that they are the same.
         snapshot: what the snapshot of the code takes in.
         overwrite: begin anew, whatever hunt is there.
         command: the command line, as a comment in ``hunt.toml``.
@@ -114,6 +116,7 @@ def prepare(
             accelerate=accelerate,
             timeout_s=timeout_s,
             recycle_after=recycle_after,
+            audit=audit,
         ),
     )
     found, settings = plan(request)

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+from crashhunt.audit import Audit
 from crashhunt.bundle import list_bundles, write_bundle, write_trial
 from crashhunt.directory import HuntDirectory
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
@@ -170,6 +171,7 @@ class Hunt:
             reason,
             tuple(progress.notes),
             ledger.traffic_events(),
+            progress.audit,
         )
 
     def _hunt(
@@ -192,6 +194,8 @@ class Hunt:
             argument_files=snapshot.argument_files,
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
+            audit=run.audit,
+            hunt_seed=settings.seed,
         )
         waiting = iter(number for number in range(settings.trials) if number not in finished)
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))
@@ -199,6 +203,7 @@ class Hunt:
         preflight = Preflight(
             settings, settings.trials - len(finished), files=snapshot.argument_files, code=snapshot.code
         )
+        audit = Audit(worker_settings)
         in_flight: set[int] = set()
         heartbeat = 0.0
         try:
@@ -214,7 +219,7 @@ class Hunt:
                     break
                 for result in executor.completed(_TICK_S):
                     in_flight.discard(result.spec.number)
-                    for known in preflight.sift(result):
+                    for known in preflight.sift(audit.add(result)):
                         self._take(known, ledger, snapshot, sampler, progress)
                     if result.outcome in settings.crash_on and not run.keep_going:
                         above = min(progress.found) if run.deterministic else -1
@@ -226,9 +231,7 @@ class Hunt:
                     break
                 if self._hopeless(progress, finished):
                     return "no_valid_trial"
-                for note in executor.notes():
-                    ledger.remark(note)
-                    progress.notes.append(note)
+                self._listen(executor, audit, ledger, progress)
                 if time.monotonic() - heartbeat > _HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
@@ -239,17 +242,36 @@ class Hunt:
                 watch(self._status(progress, "saving"))
                 lowest = min(progress.found)
                 self._save(progress.found[lowest], ledger, snapshot, progress)
+            executor.close()
+            audit.parallel = run.parallel
+            while audit.waiting and not self._interrupted:
+                watch(self._status(progress, "auditing"))
+                self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
+            if progress.found:
                 return "crash"
         except ScenarioError as error:  # of which file is for somebody who wants to mend it
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
             executor.close()
+            audit.close()
         if self._interrupted:
             return "interrupted"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials"
+
+    def _listen(
+        self, executor: PoolExecutor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
+    ) -> None:
+        """Write down what people should know about how the trials were run, and whether they are the same again."""
+        for note in executor.notes():
+            ledger.remark(note)
+            progress.notes.append(note)
+        for difference in audit.look(wait_s):
+            ledger.remark(f"audit: {difference}")
+        if self.settings.run.audit > 0:
+            progress.audit = audit.report
 
     def _see_to(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger anew where somebody has removed it; what was recorded is still at hand.

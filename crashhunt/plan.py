@@ -171,6 +171,8 @@ def _check_numbers(request: Request) -> None:
     ):
         if value < least:
             raise UsageError(f"{name} is {value}", fix=f"give at least {least}{_ZERO.get(name, '')}")
+    if not 0 <= request.run.audit <= 1:
+        raise UsageError(f"--audit is {request.run.audit:g}", fix="give a share of the trials, from 0 to 1")
     if not 0 < request.run.timeout_s < float("inf"):
         raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from crashhunt.audit import AuditReport
     from crashhunt.bundle import Bundle
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.settings import HuntSettings
@@ -25,7 +26,7 @@ class HuntStatus:
     """How a hunt is going, for people who watch.
 
     Args:
-        phase: ``hunting``, ``saving``, ``confirming`` or ``done``.
+        phase: ``hunting``, ``saving``, ``auditing``, ``confirming`` or ``done``.
         planned: trials in all.
         done: trials that have ended, in earlier runs of the hunt too.
         outcomes: how they ended.
@@ -62,6 +63,7 @@ class HuntReport:
         reason: in words, where not one trial was valid.
         notes: what people should know about how it went, such as trials that were run again.
         events: traffic events of all trials: kind to how many, and in how many trials.
+        audit: what came of running trials without a crash again; None where nobody asked for it.
     """
 
     directory: Path
@@ -74,6 +76,7 @@ class HuntReport:
     reason: str = ""
     notes: tuple[str, ...] = ()
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
+    audit: AuditReport | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``run --json`` prints."""
@@ -89,6 +92,7 @@ class HuntReport:
             "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
             "crashes": [bundle.summary() for bundle in self.crashes],
             "notes": list(self.notes),
+            "audit": self.audit.to_json() if self.audit is not None else None,
         }
 
 
@@ -107,3 +111,4 @@ class Progress:
     untold: dict[int, TrialResult] = field(default_factory=dict)  # that the sampler has not been told yet
     next_told: int = 0
     notes: list[str] = field(default_factory=list)
+    audit: AuditReport | None = None

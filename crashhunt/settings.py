@@ -58,6 +58,7 @@ class RunSettings:
         keep_trials: keep the logs of every trial.
         timeout_s: wall-clock limit of a trial, in s.
         recycle_after: trials after which a worker is replaced by a fresh one.
+        audit: the share of trials without a crash that are run again in a fresh process, 0 to 1.
         accelerate: whether simulators are sped up where that changes no bit.
     """
 
@@ -67,6 +68,7 @@ class RunSettings:
     keep_trials: bool = False
     timeout_s: float = 60.0
     recycle_after: int = 1000
+    audit: float = 0.0
     accelerate: bool = True
 
 

@@ -55,6 +55,7 @@ class SuiteEntry:
         deterministic: the same seed gives the same crash.
         timeout_s: wall-clock limit of a trial, in s.
         keep_trials: keep the logs of every trial.
+        audit: the share of trials without a crash that are run again in a fresh process.
         snapshot_roots: files and folders, from the folder of the file, that the snapshot takes in as well.
     """
 
@@ -77,6 +78,7 @@ class SuiteEntry:
     deterministic: bool = False
     timeout_s: float = 60.0
     keep_trials: bool = False
+    audit: float = 0.0
     snapshot_roots: tuple[str, ...] = ()
 
 
@@ -237,6 +239,7 @@ class Suite:
                 deterministic=entry.deterministic,
                 timeout_s=entry.timeout_s,
                 keep_trials=entry.keep_trials,
+                audit=entry.audit,
             ),
         )
 

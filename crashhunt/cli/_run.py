@@ -90,6 +90,11 @@ def add_run(commands: Any) -> None:
         help="replace a worker after so many trials; 0: never; default: 1000",
     )  # fmt: skip
     how.add_argument(
+        "--audit", metavar="SHARE", type=float, default=0.0,
+        help="run this share of the trials without a crash again, each in a fresh process, and say where one is not "
+        "the same: 0.02 is one in fifty; default: 0",
+    )  # fmt: skip
+    how.add_argument(
         "--snapshot-root", metavar="PATH", type=Path, action="append", default=[],
         help="a file or folder that the snapshot takes in besides the agent's own project; may be repeated",
     )  # fmt: skip
@@ -139,6 +144,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         accelerate=not options.no_accelerate,
         timeout_s=options.timeout,
         recycle_after=options.recycle_after,
+        audit=options.audit,
         snapshot=SnapshotOptions(
             code=not options.no_snapshot, roots=tuple(options.snapshot_root), limit_mb=options.snapshot_limit
         ),

@@ -55,7 +55,7 @@ class FreshProcessExecutor:
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
         self._settings = settings
-        self._parallel = parallel
+        self.parallel = parallel
         self._waiting: deque[Attempt] = deque()
         self._running: dict[int, _Running] = {}
 
@@ -86,7 +86,7 @@ class FreshProcessExecutor:
         self.cancel()
 
     def _start(self) -> None:
-        while self._waiting and len(self._running) < self._parallel:
+        while self._waiting and len(self._running) < self.parallel:
             attempt = self._waiting.popleft()
             number = attempt.spec.number
             answer = answer_file(self._settings.scratch, number)

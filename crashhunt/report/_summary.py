@@ -35,6 +35,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.stopped_because == "no_valid_trial":
         lines.append(f"Not one trial was valid: {report.reason}")
     lines += [f"Note: {note}" for note in report.notes]
+    lines += _describe_audit(report)
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because == "all_trials":
@@ -127,6 +128,20 @@ def _table_around(report: ReplayReport) -> list[str]:
         "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[3]]).rstrip()
         for row in cells
     ]
+
+
+def _describe_audit(report: HuntReport) -> list[str]:
+    found = report.audit
+    if found is None:
+        return []
+    same = found.trials - len(found.differences)
+    if found.trials == 0:
+        return ["Audit: no trial without a crash belonged to the sample."]
+    lines = [f"Audit: {found.trials} run again in fresh processes, {same} the same to the bit."]
+    lines += [f"  {difference}" for difference in found.differences[:_SHOWN]]
+    if len(found.differences) > _SHOWN:
+        lines.append(f"  … and {len(found.differences) - _SHOWN} more; crashhunt logs has them all")
+    return lines
 
 
 def _describe_crash(bundle: Bundle) -> list[str]:

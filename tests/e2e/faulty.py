@@ -122,3 +122,15 @@ class HangsUnlessFirst(Fine):
 
     def go_wrong(self):
         raise ValueError("no plan")
+
+
+class Remembers(Fine):
+    """Goes faster from trial to trial, by what only a file remembers."""
+
+    def act(self, observation):
+        self.step += 1
+        memory = Path(__file__).parent / "memory.txt"
+        if self.step == 3:
+            with memory.open("a") as file:
+                file.write("x")
+        return 4.0 + (memory.stat().st_size if memory.exists() else 0) / 100, 0

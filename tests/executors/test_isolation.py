@@ -1,0 +1,113 @@
+"""A trial is the same wherever in its worker it comes, and in a process of its own."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor, WorkerSettings
+from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.trial import CRASHES, TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.scenario import Scenario
+
+SETS_CLASSES = """
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+Vehicle.MAX_SPEED = 60.0
+IDMVehicle.TIME_WANTED = 0.3
+
+class Agent:
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        assert (Vehicle.MAX_SPEED, IDMVehicle.TIME_WANTED) == (60.0, 0.3)
+        return 1
+"""
+STARTS_A_THREAD = """
+import threading
+
+threading.Thread(target=threading.Event().wait, daemon=True).start()
+
+class Agent:
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        return 5.0, 0
+"""
+DRAWS_AT_IMPORT = """
+import random
+import numpy as np
+
+OFFSET = random.random() + np.random.random()
+RNG = np.random.default_rng(1)
+
+class Agent:
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        return 5.0 + OFFSET + RNG.random(), 0
+"""
+SETS_CLASSES_LATE = """
+from highway_env.vehicle.behavior import IDMVehicle
+
+class Agent:
+    def reset(self, seed): ...
+
+    def act(self, observation):
+        IDMVehicle.TIME_WANTED += 0.2
+        IDMVehicle.act = IDMVehicle.act
+        return 1
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[TrialResult]]:
+    monkeypatch.chdir(tmp_path)
+
+    def run(module: str, scenario: Scenario, kind: Callable[..., Executor], count: int) -> list[TrialResult]:
+        Path("mine.py").write_text(module, encoding="utf-8")
+        scratch = tmp_path / kind.__name__
+        scratch.mkdir()
+        chosen = scenario.with_agents(dict.fromkeys(scenario.agents, "mine:Agent"))
+        executor = kind(WorkerSettings(scenario=chosen, oracles=(), crash_on=CRASHES, scratch=scratch), parallel=1)
+        try:
+            for number in range(count):
+                executor.submit(TrialSpec(number, 5, {}, argument_values(scenario), max_steps=3))
+            found: list[TrialResult] = []
+            deadline = time.monotonic() + 120
+            while len(found) < count:
+                assert time.monotonic() < deadline
+                found += executor.completed(0.2)
+        finally:
+            executor.close()
+        return found
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("module", "scenario"),
+    [
+        (SETS_CLASSES, "merge-highway-env"),
+        (SETS_CLASSES_LATE, "merge-highway-env"),
+        (STARTS_A_THREAD, "toy"),
+        (DRAWS_AT_IMPORT, "toy"),
+    ],
+    ids=["classes at import", "classes in an episode", "a thread at import", "random numbers at import"],
+)
+def test_a_trial_does_not_depend_on_its_place(run, module, scenario):
+    found = load_scenario("merge-highway-env" if scenario == "toy" else scenario)
+    if scenario == "toy":
+        found = replace(found, simulator="toy", highway=None, observation=None, arguments={})
+    pooled = run(module, found, PoolExecutor, 3)
+    (fresh,) = run(module, found, FreshProcessExecutor, 1)
+    assert {(str(result.outcome), result.digest) for result in pooled} == {("survived", fresh.digest)}
