@@ -26,6 +26,7 @@ from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from crashhunt.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.events import TOLD_BY, Event
 from crashhunt.oracles import rectangle_gap
 from crashhunt.scenario import argument_values
 from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
@@ -35,9 +36,10 @@ from crashhunt.simulators._highway_config import configured, mistake, restore_cl
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
+from crashhunt.simulators._standstill import Standstill
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from gymnasium import Space
@@ -86,6 +88,8 @@ class HighwaySimulator:
         except InvalidEpisodeError as error:
             raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
 
+    told_events = TOLD_BY["highway"]
+
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Make the environment, and let everybody in."""
         try:
@@ -109,6 +113,8 @@ class HighwaySimulator:
         self._places = {agent: vehicle.position.tolist() for agent, vehicle in self._controlled.items()}
         self._on_road = {agent: bool(vehicle.on_road) for agent, vehicle in self._controlled.items()}
         self._watch()
+        self._standstill = Standstill(self.step_length_s, self._scenario.events)
+        self._wrong: set[str] = set()
         self._look(())
         return self._show(self.agents, shown), {}
 
@@ -131,6 +137,7 @@ class HighwaySimulator:
             if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
         self._look(tuple(off_road))
+        self._scene.events = tuple([event for agent in actions for event in self._events(agent)])
         ended = bool(terminated or truncated)
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
         arrived += [
@@ -324,6 +331,24 @@ class HighwaySimulator:
         self._scene = Scene(time_s, self._roster, points, headings, speeds, contacts, off_road, lanes)
         for agent, vehicle in self._controlled.items():
             self._scene.agent_lanes[agent] = self._lane_name(vehicle.lane_index)
+
+    def _events(self, agent: str) -> Iterator[Event]:
+        """What is told of a controlled vehicle: that it stands, or drives against its lane."""
+        vehicle = self._controlled[agent]
+        speed = float(vehicle.speed)
+        point = self._scene.points[self._scene.roster.index[agent]]
+        lane = self._lane_name(vehicle.lane_index)
+        if stood := self._standstill.look(agent, speed):
+            yield Event("not_moving", agent, f"{agent} had stood still for {stood:g} s", (), lane, *point, speed)
+        along, _ = vehicle.lane.local_coordinates(vehicle.position)
+        turn = float(vehicle.heading) - float(vehicle.lane.heading_at(along))
+        # Of lanes above each other, highway-env takes the one that runs as the vehicle does.
+        if not self._lanes_are_road or abs(speed) < Standstill.SPEED or math.cos(turn) * speed >= -0.5 * abs(speed):
+            self._wrong.discard(agent)
+        elif agent not in self._wrong:
+            self._wrong.add(agent)
+            how = "backwards" if speed < 0 else "the wrong way"
+            yield Event("wrong_way", agent, f"{agent} drove {how} on lane {lane}", (), lane, *point, speed)
 
     def _lane_name(self, index: tuple[str, str, int]) -> str:
         found = self._lane_names.get(index)

@@ -8,14 +8,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import libsumo
+import numpy as np
 import pytest
 
 from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup, SumoSetup
+from crashhunt.setups import AgentSetup, HighwaySetup, SumoSetup
 from crashhunt.simulators._sumo_events import SumoEvents
+from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
@@ -281,3 +283,24 @@ def test_teleports_of_the_controlled_vehicle_and_in_sight(drive):
     _, told = drive(act, traffic=other, options=options, route="up", depart_pos="0", steps=150)
     assert [event.others for _, event in told if event.kind == "teleport"] == [("o",)]
     assert next(event.what for _, event in told if event.kind == "teleport").startswith("SUMO teleported o, ")
+
+
+def test_on_highway_env_a_standstill_and_driving_backwards(tmp_path):
+    config = {"action": {"type": "ContinuousAction"}, "vehicles_count": 0, "policy_frequency": 5, "duration": 1000}
+    scenario = Scenario(
+        simulator="highway",
+        agents={"ego": AgentSetup()},
+        highway=HighwaySetup(id="highway-fast-v0", config=config),
+        events={"not_moving": 3.0},
+    )
+    simulator = HighwaySimulator(scenario, tmp_path)
+    simulator.reset(seed=1, options={"arguments": {}})
+    told = []
+    for step in range(1, 90):
+        # It brakes from 25 m/s at 5 m/s², stands, and goes on backwards.
+        braking = -1.0 if step <= 25 or step > 60 else 0.0
+        simulator.step({"ego": np.array([braking, 0.0], np.float32)})
+        told += [(step, event) for event in simulator.scene().events]
+    assert [(step, event.kind) for step, event in told] == [(39, "not_moving"), (61, "wrong_way")]
+    assert told[1][1].what == "ego drove backwards on lane 0_1_1"
+    simulator.close()
