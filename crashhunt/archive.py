@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt._watching import watched
 from crashhunt.errors import BundleError
+from crashhunt.integrity import FILES, parse_object, typed
 from crashhunt.snapshot import Snapshot
 from crashhunt.whole_file import whole_file
 
@@ -114,10 +115,13 @@ def open_archive(path: Path) -> Iterator[Archive]:
                 index = _read_index(archive, path)
                 for entry in _checked(archive, index, path):
                     _extract(archive, entry, directory, index["files"][entry.filename], path)
-        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-            raise _refusal(path, f"not an undamaged zip file: {error}") from None
+        except BundleError:
+            raise
         except OSError as error:
             raise _refusal(path, f"cannot be unpacked: {error.strerror or error}") from None
+        except Exception as error:  # zipfile and what it unpacks with have an error of their own for every damage
+            name = "" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: "
+            raise _refusal(path, f"not an undamaged zip file: {name}{' '.join(str(error).split())}") from None
         yield Archive(
             directory,
             str(index.get("made_by", "?")),
@@ -131,14 +135,16 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
         info = archive.getinfo(_INDEX)
         if info.file_size > 50 * 10**6:
             raise _refusal(path, f"its {_INDEX} is too large")
-        index: dict[str, Any] = json.loads(archive.read(info))
+        index = parse_object(archive.read(info))
+        typed(index, {"schema": int})
         if index["schema"] != SCHEMA:
             raise BundleError(
-                f"schema {index['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(path)
+                f"schema {index['schema']} is not {SCHEMA}", fix="use the version that wrote it", where=str(path)
             )
-        if not all(isinstance(e["size"], int) and isinstance(e["blake2b"], str) for e in index["files"].values()):
-            raise ValueError("an entry is incomplete")
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        typed(index, {"files": FILES})
+        for entry in index["files"].values():
+            typed(entry, {"size": int, "blake2b": str})
+    except (KeyError, ValueError) as error:
         raise _refusal(path, f"not an exported crash: {type(error).__name__}: {error}") from None
     return index
 
@@ -208,13 +214,15 @@ def _key() -> bytes:
     try:
         return file.read_bytes()
     except OSError:
-        pass
+        pass  # none yet, or it may not be read
     key = secrets.token_bytes(32)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         temporary = file.with_name(f".{file.name}.{os.getpid()}")
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
             opened.write(key)
+            opened.flush()
+            os.fsync(opened.fileno())
         try:
             os.link(temporary, file)  # the first of two wins
         finally:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
+import re
 import shutil
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from crashhunt._names import listed, near_path, one_of
@@ -13,8 +14,10 @@ from crashhunt.environment import versions
 from crashhunt.errors import BundleError
 from crashhunt.events import Event
 from crashhunt.executors import BLACK_BOX, OUTPUT
+from crashhunt.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
 from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
-from crashhunt.trial import ClosestApproach, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import ClosestApproach, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec, check_parts
+from crashhunt.whole_file import sync_folder, sync_tree, whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,9 +25,30 @@ if TYPE_CHECKING:
 
     from crashhunt.scene import Lane
 
-__all__ = ["Bundle", "find_bundle", "list_bundles", "read_bundle", "write_bundle", "write_trial"]
+__all__ = [
+    "Bundle",
+    "files_of",
+    "find_bundle",
+    "list_bundles",
+    "read_bundle",
+    "read_params",
+    "write_bundle",
+    "write_trial",
+]
 
-SCHEMA = 1
+SCHEMA = 2
+_PROTECTED = 2  # the first version with a digest of itself and of the files beside it
+_KNOWN = bool | float | str | None
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("trial", "seed", "hunt_seed", "max_steps", "step"), int),
+    **dict.fromkeys(("outcome", "digest", "snapshot"), str),
+    "arguments": dict[str, dict[str, _KNOWN]],
+    "scenario_arguments": dict[str, _KNOWN],
+    "sim_time_s": float,
+    "confirmed": bool | None,
+    "divergence": dict | None,
+}
+_UNDAMAGED = "get an undamaged copy, or see with crashhunt check what can be saved"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +62,7 @@ class Bundle:
         snapshot: the digest of the code that it ran.
         confirmed: whether a fresh process did the same to the bit; None where nobody tried.
         divergence: where it did not.
+        files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
     """
 
     path: Path
@@ -46,6 +71,7 @@ class Bundle:
     snapshot: str
     confirmed: bool | None = None
     divergence: dict[str, Any] | None = None
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -68,9 +94,27 @@ class Bundle:
         """Read the log.
 
         Raises:
-            BundleError: it is missing or damaged.
+            BundleError: it is missing, damaged, or that of another crash.
         """
-        return read_log(self.path / "log.mcap")
+        log = self.path / "log.mcap"
+        found = read_log(log)
+        if found.digest != self.result.digest:
+            raise BundleError("the log does not have the digest that crash.json says", fix=_UNDAMAGED, where=str(log))
+        # The views for people, which have no part in the digest of the trial.
+        wrong = changed_file(log, self.files[log.name]) if log.name in self.files else ""
+        if wrong:
+            raise BundleError(f"it {wrong} since it was written", fix=_UNDAMAGED, where=str(log))
+        return found
+
+    def faults(self) -> list[str]:
+        """Return which files beside ``crash.json`` are not as they were written, and those that were not there."""
+        found = [
+            f"{name} {wrong}" for name, entry in self.files.items() if (wrong := changed_file(self.path / name, entry))
+        ]
+        if self.files:
+            names = {path.name for path in self.path.iterdir()} - {"crash.json"}
+            found += [f"{name} was not there" for name in sorted(names - self.files.keys()) if name[0] != "."]
+        return found
 
     def summary(self) -> dict[str, Any]:
         """Return the shape that ``run --json`` prints."""
@@ -117,10 +161,12 @@ class Bundle:
             "versions": versions(),
             "confirmed": self.confirmed,
             "divergence": self.divergence,
+            "files": self.files or _files_beside(folder),
         }
-        temporary = folder / ".crash.json.part"
-        temporary.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        os.replace(temporary, folder / "crash.json")  # noqa: PTH105 - one rename
+        data["integrity"] = digest_of_data(data)
+        with whole_file(folder / "crash.json") as temporary:
+            text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+            temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -131,40 +177,75 @@ def read_bundle(path: Path) -> Bundle:
     """
     file = path / "crash.json"
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-        if data["schema"] != SCHEMA:
+        data = read_object(file)
+        typed(data, {"schema": int})
+        if not 1 <= data["schema"] <= SCHEMA:
             raise BundleError(
-                f"schema {data['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(file)
+                f"schema {data['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
             )
-        hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
-        result = TrialResult(
-            TrialSpec(
-                data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
-            ),
-            Outcome(data["outcome"]),
-            steps=data["step"],
-            sim_time_s=data["sim_time_s"],
-            digest=data["digest"],
-            closest=ClosestApproach.from_json(data["closest_approach"]),
-            collision=Collision.from_json(hit) if hit else None,
-            failure=Failure(**failure) if failure else None,
-            escape=Escape(**escape) if escape else None,
-            event=Event.from_json(event) if event else None,
-            events=data.get("events"),
-        )
-        return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"])
+        if data["schema"] >= _PROTECTED or "integrity" in data:
+            _see_that_it_is_whole(data)
+        return _bundle(path, data)
     except OSError as error:
         raise BundleError(
-            f"no crash bundle here: {error.strerror}", fix="give another folder", where=str(file)
+            f"no crash bundle here: {error.strerror}",
+            fix="give another folder, or see with crashhunt check what can be saved",
+            where=str(file),
         ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        message = f"not a crash.json: {type(error).__name__}: {error}"
-        raise BundleError(message, fix="get an undamaged copy", where=str(file)) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise BundleError(f"not an undamaged crash.json: {reason}", fix=_UNDAMAGED, where=str(file)) from None
+
+
+def _see_that_it_is_whole(data: dict[str, Any]) -> None:
+    typed(data, {"integrity": str, "files": FILES})
+    said = data.pop("integrity")
+    if digest_of_data(data) != said:
+        raise ValueError("it has changed since it was written")
+    for name, entry in data["files"].items():
+        typed(entry, {"size": int, "blake2b": str})
+        if "/" in name or name in ("", ".", ".."):
+            raise ValueError(f"the file {name!r} is not beside it")
+
+
+def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
+    typed(data, _TYPES)
+    hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
+    check_parts(data["closest_approach"], hit, failure, escape, event)
+    typed({"events": data.get("events")}, {"events": dict[str, int] | None})
+    if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
+        raise ValueError("trial, seed, step or max_steps is out of its range")
+    if not re.fullmatch(r"\w+", data["snapshot"]):
+        raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
+    spec = TrialSpec(
+        data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
+    )
+    result = TrialResult(
+        spec,
+        Outcome(data["outcome"]),
+        steps=data["step"],
+        sim_time_s=data["sim_time_s"],
+        digest=data["digest"],
+        closest=ClosestApproach.from_json(data["closest_approach"]),
+        collision=Collision.from_json(hit) if hit else None,
+        failure=Failure(**failure) if failure else None,
+        escape=Escape(**escape) if escape else None,
+        event=Event.from_json(event) if event else None,
+        events=data.get("events"),
+    )
+    files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
+    return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"], files)
 
 
 def list_bundles(directory: Path) -> list[Bundle]:
     """Return the crashes of a hunt, in order of their trials."""
-    return [read_bundle(path.parent) for path in sorted((directory / "crashes").glob("*/crash.json"))]
+    return [read_bundle(folder) for folder in _folders(directory)]
+
+
+def _folders(directory: Path) -> list[Path]:
+    """The folders of crashes, also of one that has lost its ``crash.json``."""
+    found = (path for path in (directory / "crashes").glob("[!.]*") if path.is_dir())
+    return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / "crash.json").exists())
 
 
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
@@ -179,7 +260,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     """
     if (directory / "crash.json").is_file() and not crash:
         return read_bundle(directory)
-    bundles = list_bundles(directory)
+    bundles = _readable(directory, crash) if crash else list_bundles(directory)
     if not bundles:
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
@@ -190,6 +271,19 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     if not crash:
         return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
     return _named(bundles, crash, directory)
+
+
+def _readable(directory: Path, crash: str) -> list[Bundle]:
+    """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
+    found = []
+    for path in _folders(directory):
+        try:
+            found.append(read_bundle(path))
+        except BundleError:
+            name = path.name
+            if name.startswith(crash) or name.partition("-")[0].lstrip("0") == crash.lstrip("0"):
+                raise
+    return found
 
 
 def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
@@ -232,10 +326,12 @@ def write_bundle(
     layout = json.dumps(foxglove_layout(recording), indent=1)
     (building / "foxglove-layout.json").write_text(layout, encoding="utf-8")
     _collect_output(result, scratch, building)
-    bundle = Bundle(final, result, hunt_seed, snapshot)
+    bundle = Bundle(final, result, hunt_seed, snapshot, files=_files_beside(building))
     bundle.write(into=building)
+    sync_tree(building)
     shutil.rmtree(final, ignore_errors=True)
     building.rename(final)
+    sync_folder(final.parent, directory)
     shutil.rmtree(scratch, ignore_errors=True)
     return bundle
 
@@ -244,10 +340,42 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     """Keep what a trial printed that is no crash; its scratch folder is emptied."""
     target = directory / "trials" / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
-    params = json.dumps(result.to_json(), indent=2)
-    (target / "params.json").write_text(params, encoding="utf-8")
     _collect_output(result, scratch, target)
+    data = {**result.to_json(), "schema": SCHEMA, "files": _files_beside(target)}
+    data["integrity"] = digest_of_data(data)
+    with whole_file(target / "params.json", lasting=False) as temporary:
+        temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
     shutil.rmtree(scratch, ignore_errors=True)
+
+
+def files_of(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
+    for name in ("crash.json", "params.json"):
+        with suppress(OSError, ValueError):
+            data = read_object(folder / name)
+            if "integrity" in data:
+                _see_that_it_is_whole(data)
+                return dict(data["files"])
+    return {}
+
+
+def read_params(folder: Path) -> list[str]:
+    """Return what of a trial that was kept is not as it was written."""
+    try:
+        data = read_object(folder / "params.json")
+        if "integrity" in data:  # which earlier versions did not write
+            _see_that_it_is_whole(data)
+        files = data.get("files", {}).items()
+        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
+    except (OSError, ValueError) as error:
+        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
+
+
+def _files_beside(folder: Path) -> dict[str, dict[str, Any]]:
+    found = describe_files(folder)
+    return {
+        name: entry for name, entry in found.items() if name not in ("crash.json", "params.json") and name[0] != "."
+    }
 
 
 def _collect_output(result: TrialResult, scratch: Path, target: Path) -> None:

@@ -13,12 +13,15 @@ from crashhunt._calls import clear_calls
 from crashhunt.errors import UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
+from crashhunt.space import Constant
 from crashhunt.trial import Outcome, finite
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from crashhunt.settings import HuntSettings
 
 __all__ = ["Comparison", "HuntFigures", "Pair", "compare"]
 
@@ -60,7 +63,7 @@ class HuntFigures:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two hunts over the trials that have the same number and seed.
+    """Two hunts over the trials that have the same number, seed and traffic; or as a whole, where there are none.
 
     Args:
         first: directory.
@@ -69,8 +72,12 @@ class Pair:
         only_first: pairs in which only the first crashed.
         only_second: pairs in which only the second did.
         both: in which both did.
-        p_value: of McNemar's exact test that neither crashes more often; 1 where nothing tells them apart.
+        p_value: that neither crashes more often; 1 where nothing tells them apart.
         caution: why the answer may mean something else; empty for nothing.
+        test: which test it is of: ``mcnemar``, the exact one over pairs; ``fisher``, the exact one over all trials of
+            each; empty where there is none.
+        why_unpaired: why there are no pairs; empty where there are.
+        counts: crashes and valid trials of the first and of the second.
     """
 
     first: str
@@ -81,12 +88,15 @@ class Pair:
     both: int
     p_value: float
     caution: str = ""
+    test: str = "mcnemar"
+    why_unpaired: str = ""
+    counts: tuple[int, int, int, int] = (0, 0, 0, 0)
 
     @property
     def verdict(self) -> str:
         """The answer in words."""
         if not self.trials:
-            return f"{self.first} and {self.second} have no seed in common: run both with the same --seed"
+            return self._unpaired()
         counts = (
             f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
             f"{self.only_second} only in {self.second}, {self.both} in both "
@@ -96,6 +106,20 @@ class Pair:
             return f"no difference that chance does not explain: {counts}"
         better = self.second if self.only_first > self.only_second else self.first
         return f"{better} crashes less: {counts}"
+
+    def _unpaired(self) -> str:
+        reason = f"{self.first} and {self.second}{self.why_unpaired.removeprefix('they')}"
+        if not self.test:
+            return reason
+        a, trials_a, b, trials_b = self.counts
+        counts = (
+            f"{a} of {trials_a} trials crash in {self.first}, {b} of {trials_b} in {self.second} "
+            f"(Fisher's exact test, unpaired: p = {self.p_value:.2g})"
+        )
+        if self.p_value >= 1 - _CONFIDENCE:
+            return f"{reason}; no difference that chance does not explain: {counts}"
+        better = self.second if a * trials_b > b * trials_a else self.first
+        return f"{reason}; {better} crashes less: {counts}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,13 +226,25 @@ def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
 
 
 def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: NDArray[Any]) -> Pair:
+    (crashed, valid), (crashed_too, valid_too) = _counts(left), _counts(right)
+    totals = (crashed, valid, crashed_too, valid_too)
     _, in_left, in_right = np.intersect1d(left["number"], right["number"], assume_unique=True, return_indices=True)
     left, right = left[in_left], right[in_right]
     same = (left["seed"] == right["seed"]) & left["valid"] & right["valid"]
+    why_not = "" if same.any() else "they have no seed in common: run both with the same --seed"
+    if not why_not:
+        why_not = _other_traffic(first.settings, second.settings)
+        if not why_not and not _same_draws(first.settings, second.settings):
+            same &= _same_arguments(first, second, left["number"])
+            why_not = "" if same.any() else "they have other values of the scenario's arguments with the same seeds"
+        if why_not:
+            same = np.zeros_like(same)
     a, b = left["crash"][same], right["crash"][same]
     only_first, only_second = int((a & ~b).sum()), int((~a & b).sum())
-    p_value = 1.0
-    if only_first + only_second:
+    p_value, test = 1.0, "mcnemar"
+    if why_not:
+        p_value, test = _unpaired_test(first, second, totals)
+    elif only_first + only_second:
         from scipy.stats import binomtest
 
         p_value = float(binomtest(only_first, only_first + only_second).pvalue)
@@ -221,13 +257,59 @@ def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: ND
         int((a & b).sum()),
         p_value,
         _caution(first, second),
+        test,
+        why_not,
+        totals,
     )
+
+
+def _counts(table: NDArray[Any]) -> tuple[int, int]:
+    """Crashes and valid trials."""
+    return int((table["crash"] & table["valid"]).sum()), int(table["valid"].sum())
+
+
+def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
+    if one.scenario_digest != other.scenario_digest:
+        return "they are of two scenarios, in which the same seed is another traffic"
+    differing = [
+        name
+        for name in sorted(one.scenario_arguments.keys() | other.scenario_arguments.keys())
+        if one.scenario_arguments.get(name) != other.scenario_arguments.get(name)
+    ]
+    if differing:
+        return f"they do not try the same values of {', '.join(differing)}, so that the same seed is another traffic"
+    return ""
+
+
+def _same_draws(one: HuntSettings, other: HuntSettings) -> bool:
+    """Whether it is sure that trials of the same number and seed have the same scenario arguments."""
+    if all(isinstance(spec.distribution, Constant) for spec in one.scenario_arguments.values()):
+        return True
+    return one.sampler == other.sampler == "random"  # which draws them before any agent's
+
+
+def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[Any]) -> NDArray[Any]:
+    """Of each trial, whether the scenario's arguments had the same values."""
+    found = [
+        {trial["spec"]["number"]: trial["spec"]["scenario_arguments"] for trial in hunt.plain_results()}
+        for hunt in (first, second)
+    ]
+    return np.array([found[0][number] == found[1][number] for number in numbers.tolist()], bool)
+
+
+def _unpaired_test(first: HuntResults, second: HuntResults, totals: tuple[int, int, int, int]) -> tuple[float, str]:
+    a, trials_a, b, trials_b = totals
+    if _why_no_interval(first, a) or _why_no_interval(second, b) or not (trials_a and trials_b):
+        return 1.0, ""  # their trials say nothing about how often they crash
+    from scipy.stats import fisher_exact
+
+    return float(fisher_exact([[a, trials_a - a], [b, trials_b - b]]).pvalue), "fisher"
 
 
 def _caution(first: HuntResults, second: HuntResults) -> str:
     one, other = first.settings, second.settings
-    if (one.scenario_arguments, one.scenario_digest) != (other.scenario_arguments, other.scenario_digest):
-        return "their scenarios differ, so that the same seed is another traffic"
+    if one.max_steps != other.max_steps:
+        return f"trials of the one have {one.max_steps} steps to crash in, those of the other {other.max_steps}"
     if one.crash_on != other.crash_on:
         return "they do not count the same outcomes as crashes"
     if not (one.run.keep_going and other.run.keep_going):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt._names import did_you_mean, listed
@@ -15,15 +15,35 @@ if TYPE_CHECKING:
     from crashhunt.settings import ArgumentSpec, HuntSettings
     from crashhunt.trial import TrialSpec
 
-__all__ = ["edited_spec"]
+__all__ = ["Edits", "edited_spec"]
 
 Values = dict[tuple[str, str], Any]  # (agent, or empty for the scenario; name) to value
 
 
+@dataclass(frozen=True, slots=True)
+class Edits:
+    """What is not as it was recorded, in words.
+
+    Args:
+        agents: who drives, and with which arguments.
+        others: everything else: traffic, length, what counts. If a crash does not come again, that may be why.
+        ignored: what is written otherwise in ``hunt.toml`` and makes no difference to a replay.
+    """
+
+    agents: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """What makes it another trial."""
+        return (*self.agents, *self.others)
+
+
 def edited_spec(
     recorded: TrialSpec, settings: HuntSettings, original: HuntSettings, changes: Mapping[str, str]
-) -> tuple[TrialSpec, list[str]]:
-    """Return the trial as it is to be replayed, and in words what is not as it was recorded.
+) -> tuple[TrialSpec, Edits]:
+    """Return the trial as it is to be replayed, and what is not as it was recorded.
 
     Args:
         recorded: the trial.
@@ -34,7 +54,8 @@ def edited_spec(
     Raises:
         ArgumentError: an argument does not exist, or a range is given where it takes one value.
     """
-    edits: list[str] = []
+    agents: list[str] = []
+    others: list[str] = []
     values: Values = {}
     before, after = _specs(original), _specs(settings)
     for key in sorted(before.keys() | after.keys()):
@@ -43,11 +64,12 @@ def edited_spec(
             values[key] = _constant(spec.spec, spec, f"hunt.toml, {_name(key)}")
     for agent, chosen in settings.agents.items():
         if agent in original.agents and chosen.agent != original.agents[agent].agent:
-            edits.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
+            agents.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
     for name in ("max_steps", "crash_on", "events", "oracles"):
-        was, now = getattr(original, name), getattr(settings, name)
-        if was != now:
-            edits.append(f"{name} was {_plain(was)} and is {_plain(now)}")
+        before_it, now = getattr(original, name), getattr(settings, name)
+        if before_it != now:
+            longer = name == "max_steps" and now > before_it  # which leaves nothing out
+            (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
     for name, text in changes.items():
         key = _find(name, recorded, settings)
         values[key] = _constant(text, after.get(key), f"--set {name}")
@@ -56,11 +78,18 @@ def edited_spec(
     for (agent, name), value in values.items():
         target = arguments.setdefault(agent, {}) if agent else scenario_arguments
         if name not in target or target[name] != value:
-            edits.append(f"{_name((agent, name))} was {target.get(name, '(not there)')} and is {value}")
+            (agents if agent else others).append(
+                f"{_name((agent, name))} was {target.get(name, '(not there)')} and is {value}"
+            )
             target[name] = value
     max_steps = settings.max_steps if settings.max_steps != original.max_steps else recorded.max_steps
     trial = replace(recorded, arguments=arguments, scenario_arguments=scenario_arguments, max_steps=max_steps)
-    return trial, edits
+    kept = [
+        f"{name} was {was} and is {now} in hunt.toml; a replay keeps that of the recorded trial"
+        for name in ("seed", "scenario")
+        if (was := getattr(original, name)) != (now := getattr(settings, name))
+    ]
+    return trial, Edits(tuple(agents), tuple(others), tuple(kept))
 
 
 def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:

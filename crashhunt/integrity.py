@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = ["digest_of_data", "digest_of_file", "digest_of_row", "parse_object", "read_object", "typed"]
+__all__ = [
+    "changed_file",
+    "describe_files",
+    "digest_of_data",
+    "digest_of_file",
+    "digest_of_row",
+    "parse_object",
+    "read_object",
+    "typed",
+]
 
 
 def digest_of_row(values: tuple[Any, ...]) -> int:
@@ -40,6 +49,30 @@ def digest_of_file(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
+def describe_files(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return size and digest of every file of a folder, by its name.
+
+    Raises:
+        OSError: one cannot be read.
+    """
+    return {
+        path.name: {"size": path.stat().st_size, "blake2b": digest_of_file(path)}
+        for path in sorted(folder.iterdir())
+        if path.is_file()
+    }
+
+
+def changed_file(path: Path, entry: Mapping[str, Any]) -> str:
+    """Say what has become of a file of which size and digest were written down; empty where it is as it was."""
+    try:
+        if path.is_symlink() or not path.is_file():
+            return "is missing"
+        same = path.stat().st_size == entry["size"] and digest_of_file(path) == entry["blake2b"]
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+    return "" if same else "has changed"
+
+
 def read_object(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
@@ -56,18 +89,17 @@ def parse_object(text: bytes) -> dict[str, Any]:
     Raises:
         ValueError: it is not one, with the reason in one line.
     """
-
-    def refuse(name: str) -> Any:
-        raise ValueError(f"{name} is no JSON")
-
     try:
-        # JSON has no NaN, which would make two equal objects differ. A number that is no number of ours is none either.
-        found = json.loads(text, parse_constant=refuse)
+        found = json.loads(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(found, dict):
         raise ValueError(f"it holds {type(found).__name__}, not an object")
     return found
+
+
+FILES = dict[str, dict[str, int | str]]
+"""The type of what `describe_files` returns, for `typed`."""
 
 
 def typed(data: Mapping[str, Any], types: Mapping[str, Any]) -> None:

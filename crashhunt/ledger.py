@@ -150,7 +150,9 @@ class Ledger:
 
     def events(self) -> list[tuple[float, str, str]]:
         """Return when the hunt got into which state, and why."""
-        rows = self._select(f"SELECT at, state, detail{self._digest} FROM events ORDER BY rowid")
+        seal = self._seal()
+        rows = list(self._select(f"SELECT at, state, detail{self._digest} FROM events ORDER BY rowid"))
+        self._compare_seal(seal, "events", len(rows))
         return [self._checked(row, "what it says of its states")[:3] for row in rows]
 
     def replace(self, numbers: Iterable[int]) -> int:
@@ -172,12 +174,16 @@ class Ledger:
 
     def replaced(self) -> list[TrialResult]:
         """Return the trials that ran again, as they were."""
-        rows = self._select(f"SELECT number, replaced_at, result{self._digest} FROM replaced ORDER BY rowid")
+        seal = self._seal()
+        rows = list(self._select(f"SELECT number, replaced_at, result{self._digest} FROM replaced ORDER BY rowid"))
+        self._compare_seal(seal, "replaced", len(rows))
         return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
 
     def facts(self) -> dict[str, Any]:
         """Return the facts about the hunt itself."""
+        seal = self._seal()
         rows = [self._checked(row, "a fact") for row in self._select(f"SELECT key, value{self._digest} FROM hunt")]
+        self._compare_seal(seal, "facts", len(rows) - 1)
         try:
             return {row[0]: json.loads(row[1]) for row in rows if row[0] != _SEAL}
         except (ValueError, TypeError, RecursionError) as error:
@@ -241,6 +247,16 @@ class Ledger:
                     yield number, row[:11]
             except HuntDirectoryError:
                 yield number, None
+
+    def check_pages(self) -> None:
+        """Have SQLite look at the file.
+
+        Raises:
+            HuntDirectoryError: it is damaged.
+        """
+        for (found,) in self._select("PRAGMA integrity_check(1)"):
+            if found != "ok":
+                raise damaged(self._path, " ".join(str(found).split()))
 
     def result(self, number: int) -> TrialResult | None:
         """Return one trial, or None where it has not ended."""
@@ -384,7 +400,14 @@ class Ledger:
         said = hashlib.blake2b(digest_size=16)
         for rows in self._chunks():
             said.update(_as_text(rows))
-        return {"outcomes": self._outcomes(), "steps": self._steps(), "table": said.hexdigest()}
+        return {
+            "outcomes": self._outcomes(),
+            "steps": self._steps(),
+            "table": said.hexdigest(),
+            "events": self._count("events"),
+            "replaced": self._count("replaced"),
+            "facts": self._count(f"hunt WHERE key <> '{_SEAL}'"),
+        }
 
     def _break_seal(self) -> None:
         """See that what is there is as it was written before anything is added to it."""
@@ -407,11 +430,14 @@ class Ledger:
 
     def _compare_seal(self, seal: dict[str, Any] | None, name: str, found: object) -> None:
         # A writer may have come meanwhile; then it is another seal, or none.
-        if seal is not None and found != seal[name] and self._seal() == seal:
-            raise damaged(self._path, "trials are missing or have changed")
+        if seal is not None and found != seal.get(name) and self._seal() == seal:
+            raise damaged(self._path, f"{name} are not those that were written")
 
     def _outcomes(self) -> dict[str, int]:
         return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+
+    def _count(self, table: str) -> int:
+        return int(next(self._select(f"SELECT count(*) FROM {table}"))[0])
 
     def _steps(self) -> int:
         return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])

@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import time
 from contextlib import closing
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.bundle import files_of
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.integrity import changed_file
 from crashhunt.ledger import Ledger, has_begun
+from crashhunt.status import hunt_state, is_hunt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,6 +38,7 @@ class LogReader:
         self._kinds = kinds
         self._trial = trial
         self._read: dict[Path, int] = {}
+        self._files: dict[Path, dict[str, dict[str, Any]]] = {}
         self._told = 0
 
     def fresh(self) -> Iterator[tuple[str, str]]:
@@ -50,6 +55,8 @@ class LogReader:
 
     def _states(self) -> Iterator[tuple[str, str]]:
         if not has_begun(self._hunt / "ledger.sqlite"):
+            if is_hunt(self._hunt) and (state := hunt_state(self._hunt)).damaged:
+                raise HuntDirectoryError(state.detail)
             return
         with closing(Ledger(self._hunt / "ledger.sqlite")) as ledger:
             events = ledger.events()[self._told :]
@@ -78,4 +85,12 @@ class LogReader:
                 continue
             self._read[path] = size
             if text.strip():
-                yield f"{title}{kind}", text
+                changed = "" if self._as_written(path) else ", which has changed since it was written"
+                yield f"{title}{kind}{changed}", text
+
+    def _as_written(self, path: Path) -> bool:
+        """Whether a file beside a crash is what that says; those of a hunt itself, and of early ones, nobody says."""
+        if path.parent not in self._files:
+            self._files[path.parent] = files_of(path.parent)
+        entry = self._files[path.parent].get(path.name)
+        return entry is None or not changed_file(path, entry)

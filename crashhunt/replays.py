@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,7 +18,7 @@ from crashhunt.sandbox import landlock_version
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.settings import read_settings
 from crashhunt.snapshot import Snapshot
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, finite
 from crashhunt.trust import refuse_side_effects
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ class Rerun:
         snapshot: of the bundle.
         edits: what is not as it was recorded, in words.
         warnings: what may make a difference, in words.
+        other_traffic: those edits that are not about who drives: without the crash, they may be why.
         elsewhere: whether it is in another scenario, so that steps cannot be compared.
     """
 
@@ -91,6 +92,7 @@ class Rerun:
     snapshot: Snapshot
     edits: tuple[str, ...]
     warnings: tuple[str, ...]
+    other_traffic: tuple[str, ...] = ()
     elsewhere: bool = False
 
 
@@ -203,12 +205,6 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         UsageError: an edit cannot be meant.
     """
     recorded = bundle.recording()
-    if recorded.digest != bundle.result.digest:
-        raise BundleError(
-            "the log does not have the digest that crash.json says",
-            fix="get an undamaged copy of the bundle",
-            where=str(bundle.path / "log.mcap"),
-        )
     snapshot = Snapshot(bundle.hunt / "snapshots" / bundle.snapshot)
     warnings = []
     code: Code = options.code
@@ -219,6 +215,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         warnings += [f"the snapshot is damaged: {fault}" for fault in snapshot.faults()]
     else:
         snapshot.verify()
+    warnings += [f"{name} was not in the snapshot, and may make a difference" for name in snapshot.additions()]
     settings = read_settings(bundle.hunt / "hunt.toml")
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
     scenario = with_settings(snapshot.scenario(), settings)
@@ -228,10 +225,11 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if scenario.highway is not None and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
+    warnings += edits.ignored
     if code == "log":
-        if edits:
+        if edits.all:
             raise UsageError(
-                f"recorded actions belong to the recorded trial, and {edits[0]}", fix="replay with --code snapshot"
+                f"recorded actions belong to the recorded trial, and {edits.all[0]}", fix="replay with --code snapshot"
             )
         if not options.trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)
@@ -248,7 +246,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
             message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
             raise UsageError(message, fix="leave --scenario or --from-log out")
         scenario, spec = _elsewhere(options.scenario, settings, spec, recorded.prologue.step_length_s)
-        edits.append(f"the scenario was {settings.scenario} and is {options.scenario}")
+        elsewhere = f"the scenario was {settings.scenario} and is {options.scenario}"
+        edits = replace(edits, others=(*edits.others, elsewhere))
     worker = WorkerSettings(
         scenario=scenario,
         oracles=settings.oracles,
@@ -261,7 +260,16 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         sealed=None if code != "log" or options.trusted else (str(bundle.path),),
     )
     return Rerun(
-        bundle, recorded, spec, worker, code, snapshot, tuple(edits), tuple(warnings), elsewhere=bool(options.scenario)
+        bundle,
+        recorded,
+        spec,
+        worker,
+        code,
+        snapshot,
+        edits.all,
+        tuple(warnings),
+        other_traffic=edits.others,
+        elsewhere=bool(options.scenario),
     )
 
 
@@ -336,11 +344,12 @@ def _report(
     rerun: Rerun, recorded: Recording, replayed: Recording, result: TrialResult, *, whole: bool = True
 ) -> ReplayReport:
     if rerun.elsewhere:
-        crashed = result.outcome in rerun.worker.crash_on
-        return ReplayReport(rerun, "changed" if crashed else "fixed", result, replayed)
+        if result.outcome in rerun.worker.crash_on:
+            return ReplayReport(rerun, "changed", result, replayed)
+        return ReplayReport(rerun, "not_comparable", result, replayed, reason=_no_fix(rerun))
     divergence = first_divergence(recorded, replayed)
-    if divergence is None and rerun.code != "log" and whole:
-        divergence = _outcome_divergence(rerun.bundle.result, result)
+    if divergence is None and whole:
+        divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
     verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
     around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
     return ReplayReport(rerun, verdict, result, replayed, divergence, around, reason)
@@ -360,8 +369,12 @@ def _judge(
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
     crashed = result.outcome in rerun.worker.crash_on
     # Whoever stopped before the crash does not know whether it would have come.
-    if (rerun.code == "current" or rerun.edits) and (whole or crashed):
-        return ("changed" if crashed else "fixed"), ""
+    if (rerun.code == "current" or rerun.edits) and crashed:
+        return "changed", ""
+    if rerun.other_traffic and whole:
+        return "not_comparable", _no_fix(rerun)
+    if (rerun.code == "current" or rerun.edits) and whole:
+        return "fixed", ""
     return "diverged", ""
 
 
@@ -386,11 +399,28 @@ def _not_set_up(rerun: Rerun, message: str) -> CrashhuntError:
     )
 
 
-def _outcome_divergence(was: TrialResult, now: TrialResult) -> Divergence | None:
+def _no_fix(rerun: Rerun) -> str:
+    return (
+        f"no crash, but {rerun.other_traffic[0]}, and one draw of other traffic does not show a fix: hunt there with "
+        "--keep-going, and compare"
+    )
+
+
+def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergence | None:
     """Where two runs that are equal to the bit ended in another way, such as a hang that did not come again."""
-    if was.outcome is now.outcome:
+    if code == "log" and was.collision is None:  # the record of an agent's fault does not fail
         return None
-    return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
+    if was.outcome is not now.outcome:
+        return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
+    if was.steps != now.steps:
+        return Divergence(now.steps, "", "steps", was.steps, now.steps)
+    left, right = ({} if hit is None else finite(asdict(hit)) for hit in (was.collision, now.collision))
+    # Another crashhunt may know more about the same collision, or measure it in another way, but not who hit whom.
+    for name in {**left, **right}:
+        always = name in ("agent", "role", "collider", "victim")
+        if (code == "snapshot" or always) and left.get(name) != right.get(name):
+            return Divergence(now.steps, left.get("agent", ""), f"collision.{name}", left.get(name), right.get(name))
+    return None
 
 
 def _up_to(recording: Recording, step: int) -> Recording:

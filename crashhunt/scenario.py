@@ -200,7 +200,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 def _load_toml(path: Path, *, kept: bool) -> Scenario:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
     except OSError as error:
         raise ScenarioError(f"cannot be read: {error.strerror}", where=str(path)) from None

@@ -176,7 +176,7 @@ def read_settings(path: Path) -> HuntSettings:
         hint = "" if path.parent.is_dir() else near_path(path.parent, ".zip")
         fix = f"{hint}give the directory that crashhunt run was given"
         raise HuntDirectoryError(f"{place!r} {what}", fix=fix) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise HuntDirectoryError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
     except OSError as error:
         raise HuntDirectoryError(f"cannot be read: {error.strerror}", where=str(path)) from None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.machinery
 import json
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,19 +15,26 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.environment import environment
 from crashhunt.errors import BundleError, SnapshotError, UsageError
+from crashhunt.integrity import FILES, changed_file, describe_files, digest_of_data, digest_of_file, read_object, typed
 from crashhunt.scenario import Scenario, load_scenario
 from crashhunt.settings import HuntSettings, read_settings, write_settings
 from crashhunt.simulators._sumo_xml import movable
 from crashhunt.sources import Sources, find_sources, git
 from crashhunt.space import Choice, Constant
+from crashhunt.whole_file import sync_folder, sync_tree
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["Snapshot", "SnapshotOptions", "latest_snapshot", "scenario_digest", "take_snapshot"]
 
-SCHEMA = 1
+SCHEMA = 2
+_PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
 _MEGABYTE = 10**6
+_DESCRIBING = ("hunt.toml", "environment.json", "git.diff")
+_PARTS = ("code", "files", "scenario")
+# What Python might import, or run when it starts.
+_IMPORTABLE = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,15 +82,23 @@ class Snapshot:
         """
         file = self.path / "manifest.json"
         try:
-            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-            if found["schema"] != SCHEMA:
+            found = read_object(file)
+            typed(found, {"schema": int, "paths": list[str], "files": FILES})
+            if not 1 <= found["schema"] <= SCHEMA:
                 raise BundleError(
-                    f"schema {found['schema']!r} is not {SCHEMA}", fix="use the version that wrote it", where=str(file)
+                    f"schema {found['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
                 )
-            if not all(isinstance(found[key], kind) for key, kind in (("files", dict), ("paths", list))):
-                raise ValueError("it is incomplete")
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise BundleError(f"the snapshot has no manifest: {error}", fix=_UNDAMAGED, where=str(self.path)) from None
+            if found["schema"] >= _PROTECTED or "integrity" in found:
+                typed(found, {"integrity": str, "described": FILES})
+                said = found.pop("integrity")
+                if digest_of_data(found) != said:
+                    raise ValueError("it has changed since it was written")
+            found.setdefault("argument_files", {})
+            typed(found, {"argument_files": dict[str, str]})
+            _see_that_all_is_inside(found)
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise BundleError(f"the snapshot has no manifest: {reason}", fix=_UNDAMAGED, where=str(self.path)) from None
         return found
 
     @property
@@ -97,7 +114,7 @@ class Snapshot:
     @property
     def argument_files(self) -> dict[str, str]:
         """The files that arguments name: the value of the argument to the file in the snapshot."""
-        found = self.manifest.get("argument_files", {})
+        found = self.manifest["argument_files"]
         return {value: str((self.path / place).resolve()) for value, place in found.items()}
 
     def scenario(self) -> Scenario:
@@ -116,26 +133,54 @@ class Snapshot:
         """
         file = self.path / "environment.json"
         try:
-            found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            found = read_object(file)
+            known = {"distributions": dict[str, str], "loaded": list[str]}
+            known |= dict.fromkeys(("python", "implementation", "machine", "cpu"), str)
+            typed(found, {key: kind for key, kind in known.items() if key in found})
         except (OSError, ValueError) as error:
-            raise BundleError(f"cannot be read: {error}", fix=_UNDAMAGED, where=str(file)) from None
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise BundleError(f"cannot be read: {reason}", fix=_UNDAMAGED, where=str(file)) from None
         return found
 
     def faults(self) -> list[str]:
-        """Return what is not as it was: files that are missing or changed, and code that was not there."""
+        """Return what is not as it was: files that are missing or changed, and modules that were not there.
+
+        What Python compiled by itself is removed first: nobody can tell whether it was made from the code beside it.
+        """
+        manifest = self.manifest
         found = []
-        for name, entry in self.manifest["files"].items():
-            path = self.path / name
-            if not path.is_file() or path.is_symlink():
-                found.append(f"{name} is missing")
-            elif path.stat().st_size != entry["size"] or _hash(path) != entry["blake2b"]:
-                found.append(f"{name} has changed")
-        for path in sorted((self.path / "code").rglob("*")):
-            name = path.relative_to(self.path).as_posix()
-            # Data that the agent wrote beside its code does no harm; a module that was not there might.
-            if path.suffix in (".py", ".so", ".pth") and name not in self.manifest["files"]:
-                found.append(f"{name} was not there")
-        return found
+        for name, entry in {**manifest["files"], **manifest.get("described", {})}.items():
+            wrong = changed_file(self.path / name, entry)
+            if wrong:
+                found.append(f"{name} {wrong}")
+        digest = _digest(manifest["files"], says=[manifest["paths"], manifest["argument_files"]])
+        if digest != self.digest:
+            found.append(f"its manifest is that of the snapshot {digest}")
+        self.discard_compiled()
+        return found + [f"{name} was not there" for name in self._added() if self._may_run(name)]
+
+    def additions(self) -> list[str]:
+        """Return the files that were not there and are no modules: an agent may write data beside its code."""
+        return [name for name in self._added() if not self._may_run(name)]
+
+    def discard_compiled(self) -> None:
+        """Remove what Python compiled, which it would take for the code beside it, whatever is in there."""
+        for path in (self.path / "code").rglob("__pycache__/*.pyc"):
+            if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
+                with suppress(OSError):  # what cannot be removed is told as added
+                    path.unlink()
+
+    def _may_run(self, name: str) -> bool:
+        return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE)
+
+    def _added(self) -> list[str]:
+        there = (
+            path.relative_to(self.path).as_posix()
+            for part in _PARTS
+            for path in (self.path / part).rglob("*")
+            if path.is_symlink() or not path.is_dir()
+        )
+        return sorted(name for name in there if name not in self.manifest["files"])
 
     def verify(self) -> None:
         """Check that everything is as it was.
@@ -154,6 +199,20 @@ class Snapshot:
 
 
 _UNDAMAGED = "get an undamaged copy of the hunt's directory"
+
+
+def _see_that_all_is_inside(manifest: dict[str, Any]) -> None:
+    """See that no name in a manifest leads out of the snapshot."""
+    names = [*manifest["files"], *manifest["paths"], *manifest["argument_files"].values()]
+    for name in names:
+        parts = name.split("/")
+        if parts[0] not in _PARTS or not {"", ".", ".."}.isdisjoint(parts) or "\\" in name or "\0" in name:
+            raise ValueError(f"the name {name!r} leads out of the snapshot")
+    for name in manifest.get("described", {}):
+        if name not in _DESCRIBING:
+            raise ValueError(f"the name {name!r} is none of its files")
+    for entry in (*manifest["files"].values(), *manifest.get("described", {}).values()):
+        typed(entry, {"size": int, "blake2b": str})
 
 
 def latest_snapshot(hunt: Path) -> Snapshot | None:
@@ -203,14 +262,20 @@ def take_snapshot(
         }
         digest = _digest(stored, says=[found.paths, argument_files])
         final = snapshots / digest
-        if final.exists():
+        if final.exists() and not _is_damaged(Snapshot(final)):
             shutil.rmtree(building)
             return Snapshot(final)
-        (building / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         write_settings(building / "hunt.toml", settings, ["crashhunt", "run", "as resolved"])
         facts = {**environment(), "git": _describe_trees(found.trees, building / "git.diff")}
         (building / "environment.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        manifest["described"] = describe_files(building)
+        manifest["integrity"] = digest_of_data(manifest)
+        (building / "manifest.json").write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        sync_tree(building)
+        if final.exists():  # what is in it is the same, but for the damage
+            shutil.rmtree(final)
         building.rename(final)
+        sync_folder(snapshots)
     except OSError as error:
         shutil.rmtree(building, ignore_errors=True)
         raise SnapshotError(
@@ -221,9 +286,16 @@ def take_snapshot(
     return Snapshot(final)
 
 
+def _is_damaged(snapshot: Snapshot) -> bool:
+    try:
+        return bool(snapshot.faults())
+    except BundleError:
+        return True
+
+
 def scenario_digest(scenario: Scenario) -> str:
     """Return a digest of the scenario's files and of what it says, whoever drives in it."""
-    files = {name: {"blake2b": _hash(scenario.folder / name)} for name in scenario.files()}
+    files = {name: {"blake2b": digest_of_file(scenario.folder / name)} for name in scenario.files()}
     says = _as_dict(scenario)
     del says["agents"]
     return _digest({**files, "": {"blake2b": json.dumps(says, sort_keys=True)}})
@@ -233,11 +305,6 @@ def _digest(files: dict[str, Any], *, says: object = None) -> str:
     content: Any = {name: entry["blake2b"] for name, entry in files.items()}
     text = json.dumps(content if says is None else [content, says], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def _argument_files(settings: HuntSettings) -> dict[str, str]:
@@ -282,7 +349,7 @@ def _store(path: Path, copy: Path) -> dict[str, Any] | None:
         shutil.copy(path, copy)
     except FileNotFoundError:
         return None  # deleted since it was listed
-    return {"size": copy.stat().st_size, "blake2b": _hash(copy)}
+    return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
 
 
 def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
@@ -296,12 +363,12 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
         moved = movable(scenario.folder / name) if name in texts else None
         if moved is not None:
             (building / place).write_bytes(moved)
-            entries[place] = {"size": len(moved), "blake2b": _hash(building / place)}
+            entries[place] = {"size": len(moved), "blake2b": digest_of_file(building / place)}
     (building / "scenario").mkdir(exist_ok=True)
     resolved = building / "scenario" / "scenario.toml"
     text = "# The scenario as it was resolved for this hunt.\n" + tomli_w.dumps(_as_dict(scenario))
     resolved.write_text(text, encoding="utf-8")
-    entries["scenario/scenario.toml"] = {"size": resolved.stat().st_size, "blake2b": _hash(resolved)}
+    entries["scenario/scenario.toml"] = {"size": resolved.stat().st_size, "blake2b": digest_of_file(resolved)}
     return entries
 
 

@@ -110,6 +110,9 @@ def hunt_state(directory: Path) -> HuntState:
         HuntDirectoryError: it is not the directory of a hunt.
     """
     if not has_begun(directory / "ledger.sqlite") and is_hunt(directory):
+        if any((directory / "snapshots").glob("[!.]*")):  # which comes after the ledger
+            gone = damaged(directory / "ledger.sqlite", "it is missing, or empty")
+            return HuntState(str(directory), "error", str(gone), damaged=True)
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / "request.json"))
     if not directory.is_dir():
         fix = f"{near_path(directory)}give the directory of a hunt"

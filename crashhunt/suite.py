@@ -133,7 +133,7 @@ class Suite:
             data = tomllib.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise UsageError(f"cannot be read: {error.strerror}", fix="give a suite.toml", where=str(file)) from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise UsageError(f"not valid TOML: {error}", fix="mend the file", where=str(file)) from None
         whole = validate(_File, data, where=str(file), error=UsageError)
         if whole.schema != 1:

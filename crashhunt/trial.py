@@ -365,6 +365,7 @@ _COLLISION: dict[str, Any] = {
     **dict.fromkeys(("x", "y", "collider_speed", "victim_speed"), float | None),
     "seen_by": list[str],
 }
+_LATER = {"time_s": float | None}  # what earlier versions did not write
 _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
 _ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
 _EVENT: dict[str, Any] = {
@@ -403,3 +404,4 @@ def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, 
         typed({name: part}, {name: dict if name == "closest" else dict | None})
         if part is not None:
             typed(part, types)
+            typed(part, {key: kind for key, kind in _LATER.items() if key in part})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
@@ -75,6 +76,6 @@ def _sync(path: Path) -> None:
 
 def cannot_write(path: Path, error: OSError) -> HuntDirectoryError:
     """Return the error for a file or folder that cannot be written."""
-    return HuntDirectoryError(
-        f"cannot be written: {error.strerror or error}", fix="choose another place", where=str(path)
-    )
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    fix = "free some space and run the same command again" if full else "choose another place"
+    return HuntDirectoryError(f"cannot be written: {error.strerror or error}", fix=fix, where=str(path))

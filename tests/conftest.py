@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import hypothesis
 import pytest
 
+from crashhunt.integrity import describe_files, digest_of_data
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -104,6 +106,15 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[S
         return shell
 
     return fill
+
+
+def rewritten(snapshot: Path, name: str, text: str) -> None:
+    """Write a file that describes a snapshot as if it had been written so, digests and all."""
+    (snapshot / name).write_text(text)
+    manifest = json.loads((snapshot / "manifest.json").read_text())
+    del manifest["integrity"]
+    manifest["described"] = {kept: describe_files(snapshot)[kept] for kept in manifest["described"]}
+    (snapshot / "manifest.json").write_text(json.dumps({**manifest, "integrity": digest_of_data(manifest)}))
 
 
 TOY = """

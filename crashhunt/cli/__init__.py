@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt import __version__
+from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
@@ -138,7 +139,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_compare, add_lists, add_completion,
+        add_check, add_compare, add_lists, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

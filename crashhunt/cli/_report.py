@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say
 from crashhunt.cli._progress import shown_progress
-from crashhunt.errors import UsageError
+from crashhunt.errors import HuntDirectoryError, UsageError
 
 if TYPE_CHECKING:
     import argparse
@@ -34,10 +34,14 @@ def add_report(commands: Any) -> None:
 def _report(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.bundle import find_bundle, list_bundles
     from crashhunt.report import write_report
+    from crashhunt.status import hunt_state
 
     if options.crashes < 0:
         raise UsageError(f"--crashes is {options.crashes}", fix="give at least 0")
     with opened_hunt(options.directory) as (hunt, exported):
+        state = hunt_state(hunt)
+        if state.damaged and not exported and not options.crash:  # a page without its trials would pass for all of it
+            raise HuntDirectoryError(state.detail)
         bundles = [find_bundle(hunt, options.crash)] if options.crash else list_bundles(hunt)
         bundles.sort(key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         shown = bundles[: options.crashes]

@@ -149,9 +149,13 @@ class FreshProcessExecutor:
 
 
 def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
-    """Return the environment of a fresh process, in which crashhunt itself comes from the snapshot too."""
+    """Return the environment of a fresh process, in which crashhunt itself comes from the snapshot too.
+
+    Nothing compiled is left in the snapshot: what is there would be taken for the code, whoever has put it there.
+    """
     paths = os.pathsep.join(filter(None, (*settings.code, os.environ.get("PYTHONPATH"))))
-    return {**os.environ, **worker_environment(), **({"PYTHONPATH": paths} if paths else {})}
+    ours = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"} if settings.code else {}
+    return {**os.environ, **worker_environment(), **ours}
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ from crashhunt.processes import adopt_orphans, end_descendants
 from crashhunt.recording import DISK, BlackBox
 from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -197,9 +198,8 @@ class Worker:
             return
         text = json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes])
         if not path.exists():
-            temporary = path.with_suffix(f".{os.getpid()}")
-            temporary.write_text(text, encoding="utf-8")
-            temporary.replace(path)
+            with whole_file(path, lasting=False) as temporary:
+                temporary.write_text(text, encoding="utf-8")
         elif kept is not None and path.read_text(encoding="utf-8") != text:
             (kept / MAP).write_text(text, encoding="utf-8")
             return

@@ -7,7 +7,6 @@ Reading them gives back the very same records, hence the same digest. View chann
 from __future__ import annotations
 
 import math
-import os
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ from crashhunt.errors import BundleError
 from crashhunt.recording import _schemas as schemas
 from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.recording._recording import Prologue, Recording, decode_spines, pack_spines
+from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -95,24 +95,18 @@ def write_log(
         crash: how it ended, for the crash marker and the log line.
 
     Raises:
-        OSError: the disk is full, or the folder is not writable.
+        HuntDirectoryError: the disk is full, or the folder is not writable.
     """
     from crashhunt.recording._views import write_views
 
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            writer = Writer(file)
-            writer.start(profile="", library="crashhunt")
-            writer.add_metadata("crashhunt", {**(metadata or {}), "crashhunt_log_schema": SCHEMA})
-            log = LogWriter(writer)
-            _write_evidence(log, recording)
-            write_views(log, recording, lanes, crash)
-            writer.finish()
-        os.replace(temporary, path)  # noqa: PTH105 - one rename
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with whole_file(path, lasting=False) as temporary, temporary.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="crashhunt")
+        writer.add_metadata("crashhunt", {**(metadata or {}), "crashhunt_log_schema": SCHEMA})
+        log = LogWriter(writer)
+        _write_evidence(log, recording)
+        write_views(log, recording, lanes, crash)
+        writer.finish()
 
 
 def read_log(path: Path) -> Recording:

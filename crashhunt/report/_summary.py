@@ -101,15 +101,15 @@ def _verdict(report: ReplayReport) -> list[str]:
         if report.rerun.code == "log":
             what = "every observation and scene that the recorded actions lead to is the same to the bit"
         return [f"reproduced: {count}", f"  {what}"]
-    if report.rerun.elsewhere:
-        verb = "it crashes there as well" if report.verdict == "changed" else "no crash there"
-        return [f"{report.verdict}: {verb}; {now.summary}", f"  it was: {was.summary}"]
+    if report.rerun.elsewhere and report.verdict == "changed":
+        return [f"changed: it crashes there as well; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "fixed":
         return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "changed":
         return ["changed: another crash", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
     if report.verdict == "not_comparable":
-        return [f"not comparable: {report.reason}"]
+        ended = [f"  it was: {was.summary}", f"  it is:  {now.summary}"] if report.rerun.other_traffic else []
+        return [f"not comparable: {report.reason}", *ended]
     lines = [f"diverged: {count}"]
     if was.outcome is not now.outcome or was.steps != now.steps:
         lines.append(f"  now: {now.summary}")

@@ -15,6 +15,8 @@ import polars as pl
 import pytest
 from conftest import CRASHHUNT
 
+from crashhunt.ledger import Ledger
+
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
 
@@ -51,19 +53,15 @@ def test_a_process_id_that_another_process_has_now_is_not_the_owner(toy):
     process = started(toy)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
-    with closing(sqlite3.connect(toy.folder / "h/ledger.sqlite")) as database:
-        owner = json.loads(database.execute("SELECT value FROM hunt WHERE key = 'owner'").fetchone()[0])
+    with closing(Ledger(toy.folder / "h/ledger.sqlite", writable=True)) as ledger:
+        owner = ledger.facts()["owner"]
         assert owner["pid"] == process.pid
-        database.execute("UPDATE hunt SET value = ? WHERE key = 'owner'", (json.dumps(owner | {"pid": os.getpid()}),))
-        database.commit()
+        ledger.note(owner=owner | {"pid": os.getpid()})
         assert state(toy)["state"] == "killed"
         # On another machine, only its heartbeat tells.
-        database.execute("UPDATE hunt SET value = ? WHERE key = 'owner'", (json.dumps(owner | {"host": "elsewhere"}),))
-        database.execute("UPDATE hunt SET value = ? WHERE key = 'heartbeat'", (str(time.time()),))
-        database.commit()
+        ledger.note(owner=owner | {"host": "elsewhere"}, heartbeat=time.time())
         assert state(toy)["state"] == "running"
-        database.execute("UPDATE hunt SET value = ? WHERE key = 'heartbeat'", (str(time.time() - 3600),))
-        database.commit()
+        ledger.note(heartbeat=time.time() - 3600)
         assert state(toy)["state"] == "killed"
 
 

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from conftest import rewritten
 
 from crashhunt import __version__
 
@@ -187,7 +188,10 @@ def test_hunt_toml_is_what_a_replay_uses(crash):
     settings = crash.folder / "h" / "hunt.toml"
     edit(settings, "max_steps = 100", "max_steps = 12")
     done = crash.crashhunt("replay", "h", "--json", expect=1).json
-    assert (done["verdict"], done["steps_replayed"], done["edits"]) == ("fixed", 12, ["max_steps was 100 and is 12"])
+    assert done["edits"] == ["max_steps was 100 and is 12"]
+    # Whoever stops before the crash has mended nothing.
+    assert (done["verdict"], done["steps_replayed"]) == ("not_comparable", 12)
+    assert "max_steps was 100 and is 12" in done["reason"]
     edit(settings, "max_steps = 12", "max_steps = 100")
     edit(settings, 'spec = "8.0"', 'spec = "5.5"')
     assert crash.crashhunt("replay", "h", "--json", expect=1).json["edits"] == ["ego.speed was 8.0 and is 5.5"]
@@ -217,11 +221,10 @@ def test_what_cannot_be_compared_says_which(crash):
     assert "(4, 7)" in done["reason"]
     # Another version of the simulator: a warning as long as it makes no difference.
     edit(scenario, "vehicles = 4", "vehicles = 8")
-    facts = snapshot / "environment.json"
-    data = json.loads(facts.read_text())
+    data = json.loads((snapshot / "environment.json").read_text())
     now = data["distributions"]["libsumo"]
     data["distributions"]["libsumo"] = "1.2.3"
-    facts.write_text(json.dumps(data))
+    rewritten(snapshot, "environment.json", json.dumps(data))
     same = crash.crashhunt("replay", "h", "--json").json
     assert same["warnings"] == [f"libsumo was 1.2.3 and is {now}"]
     change_snapshot(crash, "self.step * helper.GAIN", "self.step * helper.GAIN * 2")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import rewritten
 
 import crashhunt
 from crashhunt.recording import read_lanes
@@ -163,14 +164,14 @@ def test_a_crash_in_one_simulator_is_tried_in_another(shell):
     words = ("--scenario", "highway", "--agent", "keep-lane", "--arg", "speed=30", "--seed", "1", "--deterministic")
     shell.crashhunt("run", "h", "2", "20", "150", *words)
     (facts,) = shell.folder.glob("h/snapshots/*/environment.json")
-    facts.write_text(json.dumps(json.loads(facts.read_text()) | {"cpu": "Abacus"}))
+    rewritten(facts.parent, facts.name, json.dumps(json.loads(facts.read_text()) | {"cpu": "Abacus"}))
     (warning,) = shell.crashhunt("replay", "h", "--json").json["warnings"]
     assert "the processor was 'Abacus'" in warning
     done = shell.crashhunt("replay", "h", "--scenario", "motorway", expect=None)
     assert "the scenario was highway and is motorway" in done.out
-    assert "it crashes there as well" in done.out or "no crash there" in done.out
+    assert "it crashes there as well" in done.out or "does not show a fix" in done.out
     told = shell.crashhunt("replay", "h", "--scenario", "motorway", "--json", expect=None).json
-    assert told["verdict"] in ("changed", "fixed")
+    assert told["verdict"] in ("changed", "not_comparable")
     assert told["divergence"] is None
     assert crashhunt.replay(shell.folder / "h", scenario="motorway").verdict == told["verdict"]
     for more, says in (

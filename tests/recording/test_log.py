@@ -132,6 +132,7 @@ import resource, signal, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from episodes import Episode, record
+from crashhunt.errors import HuntDirectoryError
 from crashhunt.recording import write_log
 folder = Path({str(tmp_path)!r})
 recording = record(Episode(["ego"], 25, 1), folder / "box")
@@ -139,11 +140,11 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
 try:
     write_log(folder / "log.mcap", recording)
-except OSError as error:
-    print("refused:", error.strerror)
+except HuntDirectoryError as error:
+    print("refused:", error.message)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert "refused: File too large" in done.stdout
+    assert "refused: cannot be written: File too large" in done.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["box"]
     assert signal.SIGXFSZ
     assert resource.RLIMIT_FSIZE

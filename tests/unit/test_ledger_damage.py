@@ -118,7 +118,7 @@ def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
         ("PRAGMA user_version = 1", "it is not as version 1 is"),
         ("PRAGMA user_version = 0", "its version is 0"),
         ("UPDATE hunt SET value = '61' WHERE key = 'planned'", "a fact is not as it was written"),
-        ("UPDATE hunt SET value = replace(value, '15', '16') WHERE key = 'seal'", "a fact is not as it was written"),
+        ("UPDATE hunt SET value = replace(value, '15', '16') WHERE key = 'seal'", "its seal is not as it was written"),
         ("UPDATE events SET detail = 'no disk'", "what it says of its states is not as it was written"),
     ],
 )

@@ -1,0 +1,83 @@
+"""``crashhunt check``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json, say
+from crashhunt.errors import UsageError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.check import Checked
+
+__all__ = ["add_check"]
+
+
+def add_check(commands: Any) -> None:
+    """Add the command."""
+    check = commands.add_parser(
+        "check",
+        help="see that everything on disk is what was written, and what can be saved",
+        description="See that everything on disk is what was written: every trial of the ledger, every crash with its "
+        "log, every snapshot of code; and that they belong together. Nothing is changed, and no code is run. Exits "
+        "with 1 where something is damaged, and says what is lost and what gets the rest.",
+    )
+    check.add_argument(
+        "directory", metavar="DIR", type=Path,
+        help="of a hunt, a suite or one crash, or a file that crashhunt export wrote",
+    )  # fmt: skip
+    check.add_argument(
+        "--salvage", metavar="TO", type=Path,
+        help="copy what is whole of a hunt into this new directory, where the same hunt goes on; what is damaged is "
+        "left out, and its trials run again",
+    )  # fmt: skip
+    add_json(check)
+    check.set_defaults(command=_check)
+
+
+def _check(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.check import check
+    from crashhunt.salvage import salvage
+
+    found = check(options.directory)
+    if options.salvage is not None and len(found) != 1:
+        raise UsageError(f"--salvage takes one hunt, and there are {len(found)}", fix="give the directory of one")
+    for each in found:
+        say(_describe(each), as_json=options.json)
+    saved = None
+    if options.salvage is not None:
+        saved = salvage(found[0], options.salvage)
+        counts = f"{saved['trials']} trials and {saved['crashes']} crashes"
+        say(
+            f"{counts} are in {options.salvage}; crashhunt run with it goes on from there",
+            as_json=options.json,
+        )
+    fine = all(each.fine for each in found)
+    if options.json:
+        print(json.dumps({"fine": fine, "hunts": [each.to_json() for each in found], "salvaged": saved}))
+    return 0 if fine else 1
+
+
+def _describe(found: Checked) -> str:
+    parts = [f"{len(found.trials)} trials"] if found.kind == "hunt" else []
+    parts.append(f"{len(found.crashes)} crash{'' if len(found.crashes) == 1 else 'es'}")
+    lines = [f"{found.dir}: {' and '.join(parts)} {'are' if found.kind == 'hunt' else 'is'} as written"]
+    if not found.fine:
+        bad = [
+            f"{len(numbers)} {name}"
+            for numbers, name in ((found.damaged_trials, "trials"), (found.damaged_crashes, "crashes"))
+            if numbers
+        ]
+        lines[0] += f"; damaged: {', '.join(bad) or 'see below'}"
+    for finding in found.findings:
+        mark = "damaged" if finding.damaged else "note"
+        lines.append(f"  {mark}: {finding.where}: {finding.what}")
+        if finding.lost:
+            lines.append(f"    lost: {finding.lost}")
+        if finding.fix:
+            lines.append(f"    {finding.fix}")
+    return "\n".join(lines)

@@ -1,0 +1,320 @@
+"""What lies on disk is what was written: damage is told in one line, and nobody is shown anything else."""
+
+from __future__ import annotations
+
+import json
+import os
+import py_compile
+import random
+import shutil
+import sqlite3
+from contextlib import closing
+
+import pytest
+from damage import (
+    command,
+    copied,
+    damage_archive,
+    damage_bytes,
+    damage_json_file,
+    damage_ledger,
+    damage_lines,
+)
+
+import crashhunt
+from crashhunt.integrity import digest_of_data
+
+HUNT = ("2", "12", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
+
+
+def hunted(shell):
+    shell.environment["XDG_STATE_HOME"] = str(shell.folder / "state")
+    shell.crashhunt("run", "h", *HUNT, "--keep-going", "--keep-trials")
+    shell.crashhunt("export", "h", "crash.zip")
+    shell.crashhunt("run", "small", *HUNT, "--no-snapshot")
+    shell.crashhunt("export", "small", "small.zip")
+
+
+@pytest.fixture
+def hunt(toy, made_once, monkeypatch):
+    """A hunt that has crashes, in the folder where this process is too."""
+    made_once(hunted, toy)
+    monkeypatch.chdir(toy.folder)
+    monkeypatch.setenv("XDG_STATE_HOME", str(toy.folder / "state"))
+    return toy.folder / "h"
+
+
+@pytest.fixture
+def crash(hunt):
+    """The first of its crashes."""
+    return min((hunt / "crashes").iterdir())
+
+
+def edited(path, change, *, schema: int = 2):
+    """Change a crash.json; as one of schema 1, which had no digest, or as one of today."""
+    data = json.loads(path.read_text())
+    change(data)
+    if schema == 1:
+        data["schema"] = 1
+        del data["integrity"], data["files"]
+    path.write_text(json.dumps(data))
+
+
+ASKED = {
+    "trials": ("trials", "h", "--format", "json"),
+    "status": ("status", "h", "--json"),
+    "compare": ("compare", "h", "h", "--json"),
+    "logs": ("logs", "h"),
+    "show": ("show", "h"),
+    "report": ("report", "h", "--output", "report.html"),
+    "export": ("export", "h", "other.zip"),
+    "check": ("check", "h", "--json"),
+}
+
+
+def test_damage_is_one_line_or_makes_no_difference(hunt):
+    """Whatever becomes of whichever file: no traceback, and nobody exits with 0 and other numbers."""
+    generator = random.Random(10)
+    whole = copied(hunt, hunt.with_name("whole"), but="code")
+    right = {name: command(*words) for name, words in ASKED.items()}
+    assert {code for code, _, _ in right.values()} == {0}
+    refused = 0
+    for number in range(24):
+        copied(whole, hunt, but="code")
+        signed = False
+        files = sorted(path for path in hunt.rglob("*.*") if path.is_file() and "code" not in path.parts)
+        jsons = [path for path in files if path.name in ("crash.json", "manifest.json", "environment.json")]
+        kind = number % 4
+        if kind == 0:
+            what = damage_ledger(hunt / "ledger.sqlite", generator)
+        elif kind == 1:
+            what = damage_bytes(generator.choice([path for path in files if path.stat().st_size]), generator)
+        elif kind == 2:
+            signed = generator.random() < 0.6
+            what = damage_json_file(generator.choice(jsons), generator, signed=signed)
+        else:
+            signed = True  # nobody has signed what people may edit
+            what = damage_lines(hunt / "hunt.toml", generator)
+        for name in generator.sample(sorted(ASKED), 4):
+            words = ASKED[name]
+            code, out, err = command(*words)
+            assert code != -1, (what, words, err)
+            refused += code != 0
+            said = [line for line in err.splitlines() if line.startswith("crashhunt:")]
+            assert len(said) <= 1, (what, words, err)
+            assert "\x1b" not in err, (what, words)
+            if code == 0 and not signed and name != "check":
+                assert out == right[name][1], (what, words)
+    assert refused > 20
+
+
+def test_damaged_archives_are_one_line(hunt):
+    generator = random.Random(5)
+    whole = (hunt.parent / "small.zip").read_bytes()
+    bad = hunt.parent / "bad.zip"
+    for _ in range(40):
+        if bad.is_dir():
+            bad.rmdir()
+        bad.write_bytes(whole)
+        what = damage_archive(bad, generator)
+        for words in (("show", bad), ("check", bad, "--json")):
+            code, _, err = command(*words)
+            assert code in (0, 1, 2), (what, words, err)
+            assert len([line for line in err.splitlines() if line.startswith("crashhunt:")]) <= 1, (what, err)
+
+
+def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
+    file = crash / "crash.json"
+    before = file.read_text()
+    for change, says in (
+        (lambda data: data["collision"].update(role="victim"), "it has changed since it was written"),
+        (lambda data: data.update(seed=data["seed"] + 1), "it has changed since it was written"),
+        (lambda data: data.pop("integrity"), "'integrity' is missing"),
+        (lambda data: data.update(schema=1), "it has changed since it was written"),
+        (lambda data: data.update(schema=99), "schema 99"),
+    ):
+        edited(file, change)
+        for words in (("show", crash), ("replay", crash), ("export", crash, "x.zip"), ("report", "h")):
+            code, _, err = command(*words)
+            assert code == 2, words
+            assert says in err
+            assert "crash.json" in err
+        file.write_text(before)
+    # An early one is read, but not where it leads out of the hunt.
+    for name in ("../../elsewhere", "/etc", "", ".", "a/b"):
+        edited(file, lambda data, name=name: data.update(snapshot=name), schema=1)
+        assert "is no name of one" in command("replay", crash)[2]
+        file.write_text(before)
+
+
+def test_a_replay_is_the_same_only_if_the_same_things_collided(hunt, crash):
+    file = crash / "crash.json"
+    before = file.read_text()
+    edited(file, lambda data: None, schema=1)
+    assert crashhunt.replay(crash).verdict == "reproduced"
+    for change, field in (
+        (lambda data: data["collision"].update(role="victim", collider="leader", victim="ego"), "collision.role"),
+        (lambda data: data["collision"].update(victim="ego"), "collision.victim"),
+        (lambda data: data["collision"].update(x=1.5), "collision.x"),
+        (lambda data: data.update(step=data["step"] - 1), "steps"),
+    ):
+        file.write_text(before)
+        edited(file, change, schema=1)
+        report = crashhunt.replay(crash)
+        assert (report.verdict, report.divergence.field) == ("diverged", field)
+    assert crashhunt.replay(crash, code="log").verdict == "diverged"  # the last of them
+
+
+def test_a_log_belongs_to_its_crash(hunt, crash):
+    other = max((hunt / "crashes").iterdir())
+    shutil.copy(other / "log.mcap", crash / "log.mcap")
+    for schema in (2, 1):
+        edited(crash / "crash.json", lambda data: None, schema=schema)
+        for words in (("show", crash), ("replay", crash), ("report", "h")):
+            code, _, err = command(*words)
+            assert (code, "the log does not have the digest" in err) == (2, True), words
+    assert command("show", other)[0] == 0
+    assert command("show", "h", "--crash", other.name)[0] == 0  # one that is damaged is in nobody's way
+
+
+def test_a_log_of_text_that_was_edited_says_so(hunt, crash):
+    (crash / "run.log").write_text("all is well\n")
+    number = str(int(crash.name[:6]))
+    assert "run, which has changed since it was written <==" in command("logs", "h", "--trial", number)[1]
+
+
+def test_a_snapshot_that_has_more_or_other_files_is_refused(hunt, crash):
+    (snapshot,) = (hunt / "snapshots").iterdir()
+    code = snapshot / "code"
+    evil = hunt.parent / "evil.py"
+    evil.write_text(f"open({str(hunt.parent / 'ran')!r}, 'a').write('x')\n")
+    for name in (
+        "sitecustomize.py",
+        "numpy.pyc",
+        "crashhunt/agents/toy.so",
+        "x.pth",
+        "scenario.cpython-311-x86_64-linux-gnu.so",
+    ):
+        (code / name).write_bytes(b"")
+        if name.endswith(".pyc"):
+            py_compile.compile(str(evil), cfile=str(code / name))
+        assert f"code/{name} was not there" in command("replay", crash)[2]
+        (code / name).unlink()
+    (code / "linked").symlink_to(hunt.parent)
+    assert "code/linked was not there" in command("replay", crash)[2]
+    (code / "linked").unlink()
+    # What Python would take for the compiled form of what is there: removed, as it will be made again.
+    source = code / "crashhunt" / "episode.py"
+    stray = source.parent / "__pycache__" / "episode.cpython-311.pyc"
+    stray.parent.mkdir(exist_ok=True)
+    times = source.stat()
+    kept = source.read_bytes()
+    source.write_bytes(evil.read_bytes().ljust(len(kept), b"#"))
+    os.utime(source, (times.st_atime, times.st_mtime))
+    py_compile.compile(
+        str(source), cfile=str(stray.with_name(f"episode.{__import__('sys').implementation.cache_tag}.pyc"))
+    )
+    source.write_bytes(kept)
+    os.utime(source, (times.st_atime, times.st_mtime))
+    report = crashhunt.replay(crash)
+    assert report.verdict == "reproduced"
+    assert not (hunt.parent / "ran").exists()
+    assert not list(code.rglob("*.pyc"))
+    for name in ("manifest.json", "environment.json", "hunt.toml"):
+        before = (snapshot / name).read_text()
+        (snapshot / name).write_text(before.replace("1", "2", 1))
+        assert command("replay", crash)[0] == 2, name
+        (snapshot / name).write_text(before)
+    manifest = json.loads((snapshot / "manifest.json").read_text())
+    for name in ("../../../evil.py", "/etc/passwd", "code/../../x"):
+        told = {**manifest, "files": {**manifest["files"], name: {"size": 1, "blake2b": ""}}}
+        del told["integrity"]
+        (snapshot / "manifest.json").write_text(json.dumps({**told, "integrity": digest_of_data(told)}))
+        assert "leads out of the snapshot" in command("export", crash, "x.zip")[2]
+
+
+def test_a_snapshot_that_is_damaged_is_made_again(hunt, toy):
+    (snapshot,) = (hunt / "snapshots").iterdir()
+    (snapshot / "code" / "crashhunt" / "episode.py").write_text("")
+    toy.crashhunt("run", "h", "2", "13", *HUNT[2:], "--keep-going", "--keep-trials")
+    assert command("check", "h")[0] == 0
+
+
+def test_check_says_what_is_lost_and_saves_the_rest(hunt, crash, toy):
+    whole = command("check", "h", "--json")
+    found = json.loads(whole[1])
+    assert (whole[0], found["fine"], found["hunts"][0]["trials"]) == (0, True, 12)
+    first, second, *_ = sorted((hunt / "crashes").iterdir())
+    (first / "log.mcap").write_bytes(b"")
+    (hunt / "crashes" / ".000099-hang.part").mkdir()
+    with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
+        database.execute("UPDATE trials SET steps = 5 WHERE number = 3")
+    code, out, _ = command("check", "h", "--json", "--salvage", "saved")
+    assert code == 1
+    found = json.loads(out)
+    (state,) = found["hunts"]
+    assert (state["damaged_trials"], state["damaged_crashes"]) == ([3], [first.name])
+    assert {finding["lost"] for finding in state["findings"] if finding["damaged"]} == {
+        "trials 3", f"the crash {first.name}"
+    }  # fmt: skip
+    assert any(".000099-hang.part" in finding["where"] for finding in state["findings"] if not finding["damaged"])
+    assert found["salvaged"] == {"trials": 10, "crashes": len(list((hunt / "crashes").glob("[!.]*"))) - 1}
+    assert not any(
+        finding["damaged"] for finding in json.loads(command("check", "saved", "--json")[1])["hunts"][0]["findings"]
+    )
+    # The same hunt goes on there, and has in the end what it had.
+    before = hunt.with_name("before")
+    toy.crashhunt("run", "saved", *HUNT, "--keep-going", "--keep-trials")
+    hunt.rename(before)
+    columns = ("number", "outcome", "steps", "digest")
+    trials = [
+        {name: row[name] for name in columns} for row in json.loads(command("trials", "saved", "--format", "json")[1])
+    ]
+    assert [row["number"] for row in trials] == list(range(12))
+    assert (hunt.with_name("saved") / "crashes" / first.name / "log.mcap").stat().st_size
+    assert command("check", "saved")[0] == 0
+    assert "it is there already" in command("check", "before", "--salvage", "saved")[2]
+    assert second.name
+
+
+def test_check_finds_what_does_not_belong_together(hunt, crash, toy):
+    shutil.rmtree(crash)
+    code, out, _ = command("check", "h")
+    assert (code, f"trial {int(crash.name[:6])} crashed, and its bundle is missing" in out) == (1, True)
+    code, out, _ = command("check", "crash.zip", "--json")
+    assert (code, json.loads(out)["hunts"][0]["kind"]) == (0, "file")
+    (other,) = (path for path in [max((hunt / "crashes").iterdir())])
+    assert command("check", other)[0] == 0
+    toy.crashhunt("run", "g", "2", "3", *HUNT[2:-1], "5", "--keep-going")
+    shutil.copytree(other, hunt.with_name("g") / "crashes" / other.name)
+    code, out, _ = command("check", "g")
+    assert (code, "it is of a hunt with seed 4" in out) == (1, True)
+    shutil.copy(hunt / "hunt.toml", hunt.with_name("g") / "hunt.toml")
+    assert "the trials are those of seed 5" in command("trials", "g")[2]
+    code, _, err = command("check", "toy")
+    assert (code, "there is no hunt" in err) == (2, True)
+
+
+def test_no_crash_in_other_traffic_is_no_fix(hunt, crash, toy):
+    """One draw of other traffic shows nothing, whichever way the traffic became another."""
+    for words in (("--set", "gap_m=500"), ("--scenario", "toy", "--set", "gap_m=500")):
+        code, out, _ = command("replay", crash, "--expect", "fixed", "--json", *words)
+        found = json.loads(out)
+        assert (code, found["verdict"]) == (1, "not_comparable"), words
+        assert "does not show a fix" in found["reason"]
+    code, out, _ = command("replay", crash, "--expect", "fixed", "--json", "--set", "speed=4")
+    assert (code, json.loads(out)["verdict"]) == (0, "fixed")
+    settings = hunt / "hunt.toml"
+    text = settings.read_text()
+    for before, after in (
+        (f"max_steps = {HUNT[2]}", "max_steps = 9"),
+        ('"collision"', '"hang"'),
+        ('"overlap"', '"off-road"'),
+    ):
+        assert before in text
+        settings.write_text(text.replace(before, after).replace('"reported-collision"', '"off-road"'))
+        assert crashhunt.replay(crash).verdict in ("not_comparable", "diverged"), after
+    settings.write_text(text.replace("seed = 4", "seed = 5"))
+    report = crashhunt.replay(crash)
+    assert (report.verdict, len(report.rerun.warnings)) == ("reproduced", 1)
+    assert "seed was 4 and is 5" in report.rerun.warnings[0]
