@@ -24,6 +24,8 @@ _STEP_M = 1e-3  # of relative motion; what overlaps for less is not looked for
 _TOUCH = 1e-9  # m; less is rounding
 _FRONT = math.cos(math.pi / 4)
 _CURVE = 1 / 32  # of distance times turn: a quarter of how far a bend is from its chord
+_SLACK_M = 0.4  # at most
+_KINK, _NO_TURN = 0.02, 0.01  # of distance, where it turns by rad: lanes have corners, no bends
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ class _Way:
             self.jump = (-side * math.sin(middle), side * math.cos(middle))
             dx, dy = dx - self.jump[0], dy - self.jump[1]
         distance = math.hypot(dx, dy)
-        self.slack = 0.0
+        self.slack = _SLACK_M if any(self.jump) else 0.0
         first, second = (x0 + dx / 3, y0 + dy / 3), (x0 + 2 * dx / 3, y0 + 2 * dy / 3)
         # Who stands, reverses, or turns round on the spot, as persons do, goes straight.
         if bends and abs(turn) < _TURN and dx * math.cos(middle) + dy * math.sin(middle) > 0:
@@ -86,7 +88,7 @@ class _Way:
             third = distance * (2 / 3 * math.tan(turn / 4) / math.sin(turn / 2) if abs(turn) > _TOUCH else 1 / 3)
             first = (x0 + third * math.cos(start[2]), y0 + third * math.sin(start[2]))
             second = (x0 + dx - third * math.cos(end[2]), y0 + dy - third * math.sin(end[2]))
-            self.slack = distance * abs(turn) * _CURVE
+            self.slack += min(_SLACK_M, distance * (abs(turn) * _CURVE + _KINK * min(1.0, abs(turn) / _NO_TURN)))
         self.points = ((x0, y0), first, second, (x0 + dx, y0 + dy))
         self.legs = tuple((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(self.points))
 
@@ -228,18 +230,19 @@ def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float 
     while share < until:
         apart = separation(way.at(share), other.at(share))[0]
         if apart < -slack:
-            return _bisect(way, other, apart_at, share, slack)
-        apart_at = share
+            return _bisect(way, other, apart_at, share)
+        if apart >= -_TOUCH:
+            apart_at = share
         if not fastest:
             break
-        share += max(apart, _STEP_M) / fastest
+        share += max(apart + slack, _STEP_M) / fastest
     return 1.0 if touching and until >= 1.0 else None
 
 
-def _bisect(way: _Way, other: _Way, apart: float, together: float, slack: float) -> float:
+def _bisect(way: _Way, other: _Way, apart: float, together: float) -> float:
     while together - apart > 1e-9:
         middle = (apart + together) / 2
-        if separation(way.at(middle), other.at(middle))[0] < -slack:
+        if separation(way.at(middle), other.at(middle))[0] < -_TOUCH:
             together = middle
         else:
             apart = middle
