@@ -51,6 +51,9 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         raise ScenarioError("the configuration names no net-file", fix="add <net-file value=…/>", where=str(path))
     changed = changes(options)
     options = {key: value for key, value in options.items() if not is_left_out(key)}
+    if "phemlight-path" in options:  # a folder of the installation, and the same for everybody
+        options["phemlight-path"] = str(path.resolve().parent / options["phemlight-path"]) + os.sep
+        notes.append(f"phemlight-path is {options['phemlight-path']}, which is not archived")
     folder, files = _files(options, path, "; ".join(note for note in notes if note.endswith("is not set")))
     (net, *_), routes, additional = (files[key] for key in _FILES)
     begin, step_length = _times(options, path)

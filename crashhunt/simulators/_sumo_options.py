@@ -161,7 +161,7 @@ write-license write-metadata precision human-readable-time verbose print-options
 aggregate-warnings language xml-validation no-step-log remote-port num-clients configuration-file
 gui-settings-file quit-on-end start delay breakpoints edgedata-files alternative-net-file selection-file demo
 disable-textures registry-viewport window-size window-pos tracker-interval save-commented game osg-view
-phemlight-path
+
 """
 _SHOWN = frozenset(_SHOWN_NAMES.split())
 _SHOWN_FAMILIES = ("output-", "output.", "precision.", "save-", "log.", "duration-log.", "step-log.", "xml-validation.")

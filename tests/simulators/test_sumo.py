@@ -69,10 +69,10 @@ def test_a_network_that_nobody_wrote_for_us(town, agent, ego):
 
 
 def test_a_vehicle_that_never_enters_is_invalid(town):
-    words = ("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--ego", "nobody", "--json")
-    done = town.crashhunt(*words, expect=3)
+    words = ("run", "h", "1", "4", "100", "--scenario", "town.sumocfg", "--ego", "odd.name#1.7", "--json")
+    done = town.crashhunt(*words, expect=3)  # the flow has five
     assert done.json["stopped_because"] == "no_valid_trial"
-    assert "'nobody' was not on the road" in done.err
+    assert "'odd.name#1.7' was not on the road" in done.err
 
 
 @pytest.mark.parametrize("damage", ["</net", "<net><edge"])

@@ -161,6 +161,7 @@ def test_files_that_include_each_other_end(town):
         ('<l value="log.txt"/><ndump value="n.xml"/>', {}, "log, netstate-dump"),
         ('<gui_only><delay value="9"/></gui_only><remote-port value="99"/><verbose value="1"/>', {}, ""),
         ('<thread-rngs value="8"/>', {"thread-rngs": "8"}, ""),
+        ('<phemlight-path value="/usr/share/p"/>', {"phemlight-path": "/usr/share/p/"}, "not archived"),
     ],
 )
 def test_what_somebody_wrote_is_kept_or_told(town, tmp_path, text, kept, says):
