@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt._blame import place_of
 from crashhunt._names import one_of
-from crashhunt.errors import ArgumentError, ScenarioError, UsageError
+from crashhunt.errors import ArgumentError, CrashhuntError, PluginError, ScenarioError, UsageError
 from crashhunt.events import LIMITS, TOLD_BY
 from crashhunt.plugins import locate, signature_of
 from crashhunt.scenario import Scenario, load_scenario, with_action
@@ -23,7 +24,7 @@ from crashhunt.space import Argument, Constant, parse_spec
 from crashhunt.trial import CRASHES, EVENTS, Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.plugins import Signature
@@ -103,8 +104,20 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, run), crash_on)
-    sampler(settings.space, points=request.points)  # refuses what it cannot sample before anything runs
+    _try_sampler(sampler, settings)
     return scenario, settings
+
+
+def _try_sampler(sampler: Callable[..., Sampler], settings: HuntSettings) -> None:
+    """Make the sampler, which refuses what it cannot sample, before anything runs."""
+    try:
+        sampler(settings.space, points=settings.points)
+    except CrashhuntError:
+        raise
+    except Exception as error:  # somebody's own
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        message = f"the sampler {settings.sampler!r} cannot be made: {said}"
+        raise PluginError(message, fix="mend it", where=place_of(error)) from error
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:

@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
-from crashhunt._names import did_you_mean, listed, near_path
+from crashhunt._names import did_you_mean, listed, near_path, one_of
 from crashhunt.errors import ArgumentError, ScenarioError
 from crashhunt.events import LIMITS
+from crashhunt.plugins import registered
 from crashhunt.setups import AgentSetup, ArgumentSetup, GymSetup, HighwaySetup, ObservationSetup, SumoSetup
 from crashhunt.simulators._sumo_names import check_names
 from crashhunt.simulators._sumo_options import INPUTS, RESERVED, canonical, is_true, writes
@@ -261,6 +262,9 @@ def _refuse(where: str, key: str, value: object, message: str, fix: str) -> NoRe
 def _check(scenario: Scenario, where: str) -> None:
     if not scenario.agents:
         _refuse(where, "agents", {}, "names no controlled vehicle", "add a table [agents.ego]")
+    if ":" not in scenario.simulator and scenario.simulator not in registered("simulators"):
+        fix = f"{one_of(scenario.simulator, registered('simulators'))}, or module:attribute"
+        _refuse(where, "simulator", scenario.simulator, "is not registered", fix)
     for key in ("step_length_s", "insertion_timeout_s"):
         value = getattr(scenario, key)
         if not 0 < value < float("inf"):

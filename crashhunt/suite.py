@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt._names import near_path
 from crashhunt._validation import validate
 from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.plan import Request
@@ -132,7 +133,8 @@ class Suite:
         try:
             data = tomllib.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
-            raise UsageError(f"cannot be read: {error.strerror}", fix="give a suite.toml", where=str(file)) from None
+            fix = f"{near_path(file, '.toml')}give a suite.toml"
+            raise UsageError(f"cannot be read: {error.strerror}", fix=fix, where=str(file)) from None
         except (ValueError, RecursionError) as error:
             raise UsageError(f"not valid TOML: {error}", fix="mend the file", where=str(file)) from None
         whole = validate(_File, data, where=str(file), error=UsageError)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["check_names", "line_of"]
 
 # Where one of these is, things may be defined that are not written there as `id="NAME"`.
-_SECRETIVE = re.compile(rb"""<include\b|\bid\s*=\s*["'][^"']*(?:\$\{|&#)|\bhref\s*=""")
+_SECRETIVE = re.compile(rb"""\bid\s*=\s*["'][^"']*(?:\$\{|&#)""")
 _TAGS = {"type": b"vType|vTypeDistribution", "route": b"route|routeDistribution", "edge": b"edge"}
 _VEHICLES = b"vehicle|trip|flow"
 
@@ -42,7 +42,7 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
     """
     if scenario.sumo is None:
         return
-    demand = [read_xml(scenario.folder / name) for name in (*scenario.sumo.routes, *scenario.sumo.additional)]
+    demand = [read_xml(scenario.folder / name) for name in scenario.texts()]
     open_ended = any(_SECRETIVE.search(text) for text in demand)
     for agent, setup in scenario.agents.items():
         key = f"agents.{agent}"

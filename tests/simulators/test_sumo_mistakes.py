@@ -60,7 +60,6 @@ def test_who_may_be_there_is_not(town, ego):
 @pytest.mark.parametrize(
     "more",
     [
-        '<include href="more.rou.xml"/>',
         '<vehicle id="${name}" route="way" depart="9"/>',
         '<trip id="&#110;o" depart="9"/>',
     ],
@@ -175,3 +174,11 @@ def test_a_hunt_tells_it(shell):
     told = shell.crashhunt("run", "h", "1", "1", "5", "--scenario", "own", expect=3).out
     assert f"{file}, line 8: SUMO says: Unknown car following model 'nope'" in told
     assert str(file) in shell.crashhunt("logs", "h").out
+
+
+def test_included_files_are_looked_into(town):
+    (town / "r.rou.xml").write_text(ROUTES.format(more='<include href="more.rou.xml"/>'))
+    (town / "more.rou.xml").write_text('<routes><trip id="late" from="south" to="east" depart="9"/></routes>')
+    load_scenario(town / "town.sumocfg", ego="late")
+    with pytest.raises(ScenarioError, match="did you mean 'late'"):
+        load_scenario(town / "town.sumocfg", ego="lte")

@@ -12,7 +12,7 @@ import crashhunt
 from crashhunt._names import did_you_mean, listed, near_path, one_of
 from crashhunt.bundle import Bundle, find_bundle
 from crashhunt.cli import main
-from crashhunt.errors import BundleError, CallError, CrashhuntError, UsageError
+from crashhunt.errors import BundleError, CallError, CrashhuntError, PluginError, UsageError
 from crashhunt.plan import Request, plan
 from crashhunt.settings import RunSettings
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -144,3 +144,17 @@ def test_a_crash_that_is_none_or_several_lists_them(tmp_path, word, says):
     with pytest.raises(BundleError) as caught:
         find_bundle(tmp_path, word)
     assert says in str(caught.value)
+
+
+class Careless:
+    """A sampler that cannot be made."""
+
+    def __init__(self, space, points=1):
+        raise KeyError("weights")
+
+
+def test_a_sampler_that_cannot_be_made_says_where():
+    with pytest.raises(PluginError) as caught:
+        plan(Request(trials=1, max_steps=1, sampler=f"{__name__}:Careless"))
+    assert "KeyError: 'weights'" in caught.value.message
+    assert caught.value.where.endswith(f"test_names.py, line {Careless.__init__.__code__.co_firstlineno + 1}")

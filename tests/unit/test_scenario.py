@@ -72,6 +72,7 @@ def test_every_shipped_scenario_is_valid_and_complete(name):
         (("observation",), {"features": ["smell"]}, ["observation.features", "'smell'"]),
         (("arguments", "vehicles"), None, ["'vehicles'", "traffic.rou.xml"]),
         (("schema",), 2, ["schema", "2"]),
+        (("simulator",), "smuo", ["simulator = 'smuo'", "did you mean 'sumo'?"]),
         (("schema",), None, ["'schema' is missing", "add schema = 1"]),
         (("arguments", "vehicles", "default"), 40, ["arguments.vehicles.default = 40", "'10:35'"]),
         (
