@@ -1,25 +1,28 @@
 """The keeper of a process: ends it, and all that it has started, when it is done or nobody waits for it any more.
 
-``python -P -m crashhunt.keeper LIFELINE MODULE ARGUMENT…`` calls ``main()`` of a module in a child. The lifeline is the
-end of a pipe whose other end is held by whoever waits: the kernel closes that one however its holder dies, also before
-the keeper has come to look. This module is imported before everything else, and imports next to nothing.
+``python -P …/keeper.py LIFELINE MODULE ARGUMENT…`` calls ``main()`` of a module in a child. The lifeline is the end of
+a pipe whose other end is held by whoever waits: the kernel closes that one however its holder dies, also before the
+keeper has come to look. It is run by its path, and imports next to nothing: the crashhunt that the child imports is
+that of a snapshot, which may be older than this file.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
+import runpy
 import select
 import signal
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import IO, TYPE_CHECKING
-
-from crashhunt.processes import adopt_orphans, die_with, end_descendants
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from types import ModuleType
 
 __all__ = ["Kept"]
 
@@ -60,7 +63,7 @@ class Kept:
         theirs, self._lifeline = os.pipe()
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "crashhunt.keeper", str(theirs), module, *arguments],
+                [sys.executable, "-P", __file__, str(theirs), module, *arguments],
                 stdin=stdin,
                 stdout=stdout,
                 stderr=stderr,
@@ -88,20 +91,36 @@ class Kept:
 
 def _main() -> None:
     lifeline, module, *arguments = sys.argv[1:]
-    adopt_orphans()
+    processes = _beside("processes")
+    processes.adopt_orphans()
     keeper = os.getpid()
     child = os.fork()
     if child == 0:
         os.close(int(lifeline))
-        die_with(keeper)
+        processes.die_with(keeper)
         sys.argv = [module, *arguments]
-        importlib.import_module(module).main()
+        found = importlib.import_module(module)
+        if hasattr(found, "main"):
+            found.main()
+        else:  # the debugger of older versions
+            del sys.modules[module]
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
         return
     for number in _PASSED_ON:  # what is asked of everybody at once is for the child, or for whoever waits
         signal.signal(number, signal.SIG_IGN)
     status = _wait(child, int(lifeline))
-    end_descendants()
+    processes.end_descendants()
     _leave(status)
+
+
+def _beside(name: str) -> ModuleType:
+    """Import a module that lies beside this one, whatever package of that name there is to import."""
+    spec = importlib.util.spec_from_file_location(f"_crashhunt_{name}", Path(__file__).with_name(f"{name}.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _wait(child: int, lifeline: int) -> int | None:

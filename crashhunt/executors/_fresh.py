@@ -94,12 +94,13 @@ class FreshProcessExecutor:
             job = self._settings.scratch / f"job-{number:06d}.json"
             content = {"settings": self._settings.to_json(), "spec": attempt.spec.to_json(), "answer": str(answer)}
             job.write_text(json.dumps(content), encoding="utf-8")
-            with (self._settings.scratch / f"start-{number:06d}.log").open("wb") as log:
+            log_file = self._settings.scratch / f"start-{number:06d}.log"
+            with log_file.open("wb") as log, job.open("rb") as described:
                 kept = Kept(
                     "crashhunt.executors._fresh",
                     [str(job)],
                     environment=fresh_environment(self._settings),
-                    stdin=subprocess.DEVNULL,
+                    stdin=described,  # which older versions read
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                 )
