@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
 
-__all__ = ["Baseline"]
+__all__ = ["OPEN_FILES", "Baseline"]
+
+OPEN_FILES = "which files are open"
 
 # What everybody uses, and somebody may patch.
 _SHARED = (
@@ -100,7 +102,7 @@ class Baseline:
             one, other = self._files.get(descriptor, ""), files.get(descriptor, "")
             known = (one or other).startswith(self._scratch) or (one or other) in self._read
             if one != other and not known:
-                return "which files are open"
+                return OPEN_FILES
         for aspect, now in self._look().items():
             if now != self._process[aspect]:
                 return aspect
