@@ -99,6 +99,8 @@ class Episodes:
             self._crash_step = self._steps
         terminated = terminations[self.agent] or finding is not None
         info: dict[str, Any] = {"sim_time_s": scene.time_s}
+        if scene.events:
+            info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return self._observations[self.agent], rewards[self.agent], terminated, info

@@ -7,7 +7,6 @@ the lane of a controlled vehicle or the least of all accelerations.
 from __future__ import annotations
 
 import math
-from operator import sub
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +15,13 @@ from libsumo import _libsumo as sumo
 from crashhunt.events import Event
 from crashhunt.oracles import rectangle_gap
 from crashhunt.outlines import outlines
-from crashhunt.scene import is_person
 from crashhunt.simulators._standstill import Standstill
+from crashhunt.simulators._sumo_braking import HardBraking
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from crashhunt.scene import Actor, Scene
+    from crashhunt.scene import Scene
 
 __all__ = ["SumoEvents"]
 
@@ -30,9 +29,6 @@ _RED = ("r", "u")  # red, and red with yellow; after a stop, "s" may be passed
 _LINKS_AT_ONCE = 6  # that a vehicle crosses in one long step
 _DIRECTION_EVERY = 10  # steps; how often a vehicle that stays on its lane is asked which way it drives
 _AGAINST = -0.5  # cosine of the angle between a course and a lane
-_LOOKED_INTO = 2.0  # m/s²; a weaker braking is nobody's limit
-_TOLERANCE = 0.01  # m/s²
-_LEADER_M = 100.0
 _SIGHT_M = 150.0
 _CONSEQUENCE_S = 5.0
 
@@ -47,7 +43,7 @@ class SumoEvents:
 
     def __init__(self, step_length_s: float, limits: Mapping[str, float]) -> None:
         self._dt = step_length_s
-        self._limit = limits.get("hard_braking")
+        self._braking = HardBraking(step_length_s, limits.get("hard_braking"))
         self._standstill = Standstill(step_length_s, limits)
 
     def begin(self, scene: Scene, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
@@ -62,11 +58,7 @@ class SumoEvents:
         self._last = scene
         self._lanes = dict(scene.agent_lanes)
         self._steps = 0
-        self._limits: dict[str, float] = {}
-        self._followers = {agent: sumo.vehicle_getFollower(agent)[0] for agent in agents}
-        self._wary: dict[str, str] = {}  # who braked hard in the last step, with which controlled vehicle ahead
-        self._braking: frozenset[str] = frozenset()  # those of them that have been told
-        self._braked: dict[str, tuple[str, float]] = {}  # whom, and when last
+        self._braking.begin(agents, controlled)
         self._wrong: set[str] = set()
         self._stuck: set[tuple[str, str]] = set()
         self._standstill.begin()
@@ -101,11 +93,8 @@ class SumoEvents:
             self._others_collided(scene, agents, found)
         if sumo.simulation_getStartingTeleportNumber():
             self._teleports(last, scene, agents, found)
-        hard = self._braking_hard(last, scene)
-        if hard or self._wary:
-            self._hard_braking(hard, scene, found)
-        index = scene.roster.index
-        self._followers = {agent: sumo.vehicle_getFollower(agent)[0] for agent in agents if agent in index}
+        for agent, vehicle, what in self._braking.look(last, scene, agents, self._lanes):
+            found.append(self._of(scene, agent, "hard_braking", what, (vehicle,)))
         self._last = scene
         return tuple(found)
 
@@ -173,7 +162,7 @@ class SumoEvents:
             distance, agent = near
             what = f"{pair[0]} drove into {pair[1]}, {distance:.0f} m from {agent}"
             for other in pair:
-                whom, when = self._braked.get(other, ("", -math.inf))
+                whom, when = self._braking.lately.get(other, ("", -math.inf))
                 if scene.time_s - when <= _CONSEQUENCE_S:
                     what += f"; {other} had braked hard {scene.time_s - when:.1f} s before, with {whom} ahead"
             found.append(self._of(scene, agent, "others_collided", what, pair))
@@ -195,69 +184,6 @@ class SumoEvents:
             if near is not None and near[0] <= _SIGHT_M:
                 what = f"SUMO teleported {vehicle}, {near[0]:.0f} m from {near[1]}"
                 found.append(self._of(scene, near[1], "teleport", what, (vehicle,)))
-
-    def _hard_braking(self, hard: list[tuple[str, float]], scene: Scene, found: list[Event]) -> None:
-        """Others that brake harder than is comfortable, with a controlled vehicle ahead of them.
-
-        SUMO decides a step by who was ahead at its beginning. So it must have been the controlled vehicle then: the
-        braking one was its follower, or had to heed it when it braked hard in the step before as well.
-        """
-        braking = set()
-        wary: dict[str, str] = {}
-        for vehicle, deceleration in hard:
-            agent, where = self._ahead_of(vehicle)
-            if not agent:
-                continue
-            wary[vehicle] = agent
-            if self._followers[agent] != vehicle and self._wary.get(vehicle) != agent:
-                continue
-            braking.add(vehicle)
-            self._braked[vehicle] = (agent, scene.time_s)
-            if vehicle not in self._braking:
-                what = f"{vehicle} braked at {deceleration:.1f} m/s² with {agent} {where}"
-                found.append(self._of(scene, agent, "hard_braking", what, (vehicle,)))
-        self._wary, self._braking = wary, frozenset(braking)
-
-    def _ahead_of(self, vehicle: str) -> tuple[str, str]:
-        """Which controlled vehicle one has to heed, and where that is; empty where there is none or somebody else."""
-        leader = sumo.vehicle_getLeader(vehicle, _LEADER_M)
-        if leader is not None and leader[0]:
-            return (leader[0], "ahead of it") if leader[0] in self._followers else ("", "")
-        crossing = sumo.vehicle_getLaneID(vehicle)
-        if not crossing.startswith(":"):
-            links = sumo.vehicle_getNextLinks(vehicle)
-            crossing = links[0][4] if links else ""
-        foes = sumo.lane_getInternalFoes(crossing) if crossing else ()
-        for agent in self._followers:
-            if self._lanes.get(agent) in foes:
-                return agent, "across its way"
-        return "", ""
-
-    def _braking_hard(self, last: Scene, scene: Scene) -> list[tuple[str, float]]:
-        """Who braked harder than its limit in the last step, and how hard in m/s²."""
-        rows: Iterable[tuple[Actor, float, float]]
-        if scene.roster is last.roster:
-            if min(map(sub, scene.speeds, last.speeds), default=0.0) > -_LOOKED_INTO * self._dt:
-                return []
-            rows = zip(scene.roster.actors, last.speeds, scene.speeds, strict=True)
-        else:
-            index = last.roster.index
-            rows = [
-                (actor, last.speeds[index[actor.id]], speed)
-                for actor, speed in zip(scene.roster.actors, scene.speeds, strict=True)
-                if actor.id in index
-            ]
-        found = []
-        for actor, was, now in rows:
-            deceleration = (was - now) / self._dt
-            if deceleration < _LOOKED_INTO or actor.id in self._controlled or is_person(actor.id):
-                continue
-            limit = self._limits.get(actor.id)
-            if limit is None:
-                limit = self._limits[actor.id] = self._limit or sumo.vehicle_getDecel(actor.id)
-            if deceleration > limit + _TOLERANCE:
-                found.append((actor.id, deceleration))
-        return found
 
 
 def _states(lane: str, edge: str) -> set[str]:
