@@ -218,12 +218,16 @@ def test_whoever_brakes_hard_behind_is_told(drive):
     # The same braking for somebody else, two metres behind whom the controlled vehicle follows on.
     ahead = '<vehicle id="slow" type="car" route="across" depart="0" departLane="0" departPos="40" departSpeed="6"/>'
 
+    leaves: list[int] = []
+
     def follows(step):
         if step == 1:
             libsumo.vehicle.setLaneChangeMode("slow", 0)
             libsumo.vehicle.setSpeed("slow", 6.0)
         if step == 42:
             libsumo.vehicle.changeLane("slow", 1, 5.0)
+        if step in leaves:
+            libsumo.vehicle.changeLane("slow", 0, 5.0)
         return 6.0, 0
 
     braking = []
@@ -236,6 +240,9 @@ def test_whoever_brakes_hard_behind_is_told(drive):
     place = {"depart_lane": "0", "depart_speed": "6", "depart_pos": "80", "steps": 100}
     assert drive(watches, traffic=ahead + BEHIND, **place)[1] == []
     assert min(braking) < -8.0
+    # The controlled vehicle is next ahead only once that one has left the lane, in the step after.
+    leaves.append(45)
+    assert drive(watches, traffic=ahead + BEHIND, **{**place, "depart_lane": "1"})[1] == []
 
 
 def test_whoever_brakes_hard_for_one_that_crosses_is_told(drive):
