@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from crashhunt.oracles import outlines_overlap, rectangle_gap, time_to_contact
+from crashhunt.oracles import approaches, outlines_overlap, rectangle_gap, time_to_contact
+from crashhunt.scene import Roster, Scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -149,6 +150,9 @@ class Encounter:
         turn = other_heading - heading
         gap = rectangle_gap(_turned(offset, heading), turn, half_own, half_other)
         contact = time_to_contact(_turned(offset, heading), _turned(velocity, heading), turn, half_own, half_other)
+        for place, (_, scene) in enumerate(self._scenes):
+            if any(row in scene.spines for row in rows[place]):
+                contact[place], gap[place] = self._bent(scene, rows[place], gap[place])
         needed = np.where(contact > 0, np.hypot(*velocity.T) / (2 * np.maximum(contact, 1e-9)), 0.0)
         return [
             Moment(number, scene.time_s, *map(float, values))
@@ -156,6 +160,19 @@ class Encounter:
                 self._scenes, speed, other_speed, gap, closing, contact, needed, strict=True
             )
         ]
+
+    def _bent(self, scene: Scene, rows: tuple[int, int], straight_m: float) -> tuple[float, float]:
+        """Time to collision and gap of two of whom one is bent; further away, the gap is as if it were straight."""
+        pair = Scene(
+            scene.time_s,
+            Roster(tuple(scene.roster.actors[row] for row in rows)),
+            [scene.points[row] for row in rows],
+            [scene.headings[row] for row in rows],
+            [scene.speeds[row] for row in rows],
+            spines={place: scene.spines[row] for place, row in enumerate(rows) if row in scene.spines},
+        )
+        times, gaps, _ = approaches([pair.frame], self.agent)
+        return float(times[0]), float(gaps[0]) if math.isfinite(gaps[0]) else straight_m
 
 
 def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:

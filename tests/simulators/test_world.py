@@ -14,6 +14,7 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
+from crashhunt.encounter import Encounter
 from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, approaches, outlines_overlap
 from crashhunt.outlines import outlines
@@ -174,6 +175,7 @@ def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, st
     assert result.closest.gap_m == pytest.approx(6 - width, abs=0.2)
     bent = [scene for scene in recording.scenes() if scene.spines]
     assert len(bent) > 10
+    assert min(moment.gap_m for moment in Encounter(recording, "ego", "other").moments) == result.closest.gap_m
     middle = bent[len(bent) // 2]
     for actor, edges in (("ego", ("ina", "inb", "inc")), ("other", ("outa", "outb", "outc"))):
         row = middle.roster.index[actor]
