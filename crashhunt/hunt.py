@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.audit import Audit
@@ -21,6 +19,7 @@ from crashhunt.plugins import locate
 from crashhunt.preflight import Preflight
 from crashhunt.progress import HuntReport, HuntStatus, Progress, StoppedBecause
 from crashhunt.replays import confirm
+from crashhunt.signals import stop_requests
 from crashhunt.simulators._sumo_says import explained
 from crashhunt.snapshot import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.status import this_process
@@ -28,7 +27,7 @@ from crashhunt.text import encodable
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from crashhunt.bundle import Bundle
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
-_STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _TICK_S = 0.1
 _HEARTBEAT_S = 1.0
 _INVALID_BEFORE_GIVING_UP = 10
@@ -80,7 +78,7 @@ class Hunt:
         self._overwrite = overwrite
         self._seed_given = seed_given
         self._snapshot_options = snapshot
-        self._interrupted = False
+        self._stops: Sequence[int] = ()
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -92,7 +90,7 @@ class Hunt:
             HuntDirectoryError: the directory is busy, foreign, unwritable or full.
             CrashhuntError: the machinery failed.
         """
-        with self._place.locked(), self._signals():
+        with self._place.locked(), stop_requests() as self._stops:
             self.settings = self._place.claim(
                 self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given
             )
@@ -227,7 +225,7 @@ class Hunt:
                         in_flight = {number for number in in_flight if number <= above}
                         if not run.deterministic:
                             break
-                if self._interrupted:
+                if self._stops:
                     break
                 if self._hopeless(progress, finished):
                     return "no_valid_trial"
@@ -244,7 +242,7 @@ class Hunt:
                 self._save(progress.found[lowest], ledger, snapshot, progress)
             executor.close()
             audit.parallel = run.parallel
-            while audit.waiting and not self._interrupted:
+            while audit.waiting and not bool(self._stops):
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.found:
@@ -255,7 +253,7 @@ class Hunt:
         finally:
             executor.close()
             audit.close()
-        if self._interrupted:
+        if self._stops:
             return "interrupted"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
@@ -335,8 +333,8 @@ class Hunt:
         """Run every crash that nobody has confirmed yet once more, in a fresh process."""
 
         def confirmed(bundle: Bundle) -> Bundle:
-            if bundle.confirmed is None and not self._interrupted:
-                found = confirm(bundle, lambda: self._interrupted)
+            if bundle.confirmed is None and not self._stops:
+                found = confirm(bundle, lambda: bool(self._stops))
                 if found is not None:
                     bundle = found
                     bundle.write()
@@ -363,28 +361,6 @@ class Hunt:
             workers or {},
             len(progress.crashes) + (1 if progress.found else 0),
         )
-
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Turn Ctrl-C, SIGTERM and a hang-up into a request to stop; a second one ends the process at once."""
-
-        def stop(number: int, _frame: object) -> None:
-            if self._interrupted:
-                signal.signal(number, signal.SIG_DFL)
-                os.kill(os.getpid(), number)
-            self._interrupted = True
-
-        try:
-            # Whoever ignores hang-ups, as nohup does, goes on ignoring them.
-            asked = [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
-            before = {number: signal.signal(number, stop) for number in asked}
-        except ValueError:  # not in the main thread; whoever runs us there handles signals
-            before = {}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def _why_invalid(result: TrialResult, scenario: Scenario) -> str:

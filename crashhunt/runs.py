@@ -11,7 +11,7 @@ import sys
 import time
 import traceback
 from collections import deque
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,11 +22,12 @@ from crashhunt.ledger import Ledger
 from crashhunt.plan import Request, plan, with_settings
 from crashhunt.scenario import load_scenario
 from crashhunt.settings import RunSettings, read_settings
+from crashhunt.signals import stop_requests
 from crashhunt.snapshot import SnapshotOptions, latest_snapshot
 from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from crashhunt.scenario import Scenario
     from crashhunt.settings import HuntSettings
@@ -107,7 +108,8 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
     waiting = deque(folders)
     running: dict[subprocess.Popen[bytes], int] = {}
     watched = 0.0
-    with _signals() as asked:
+    passed_on = False
+    with stop_requests() as asked:
         try:
             while waiting or running:
                 for process in [process for process in running if process.poll() is not None]:
@@ -122,12 +124,11 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
                         free -= width
                     except (CrashhuntError, OSError) as error:
                         _fail(folder, str(error), "")
-                if asked:
+                if asked and not passed_on:
+                    passed_on = True
                     waiting.clear()
                     for process in running:
-                        for number in asked:
-                            process.send_signal(number)
-                    asked.clear()
+                        process.send_signal(asked[0])
                 if watch is not None and time.monotonic() - watched > _WATCH_EVERY_S:
                     watched = time.monotonic()
                     watch()
@@ -138,6 +139,8 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
                 process.wait()
         if watch is not None:
             watch()
+    if asked:
+        raise KeyboardInterrupt
 
 
 def set_aside(folder: Path) -> Path:
@@ -163,32 +166,6 @@ def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
             stderr=log,
             start_new_session=True,  # Ctrl-C is passed on by us, once
         )
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM, to be passed on; a second one ends this process at once, and with it the hunts."""
-    asked: list[int] = []
-    seen: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        if seen:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        seen.append(number)
-        asked.append(number)
-
-    try:
-        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not in the main thread
-        before = {}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if seen:
-        raise KeyboardInterrupt
 
 
 def _main(folder: Path, parallel: int, parent: int) -> None:

@@ -61,7 +61,9 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
     if everybody:  # as systemd and SLURM do; the workers come first
         for pid in reversed(tree(process.pid)):
             os.kill(pid, number)
-    else:  # as timeout does
+    else:  # as timeout does: the process, and then its group, so that the process is told twice
+        os.kill(process.pid, number)
+        time.sleep(0.05)
         os.killpg(process.pid, number)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
