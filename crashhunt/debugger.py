@@ -18,7 +18,7 @@ from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.executors import BLACK_BOX, Parts, WorkerSettings, fresh_environment, seal
 from crashhunt.keeper import Kept
 from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.render import explanation, labelled, save_panels, scope
+from crashhunt.render import explanation, labelled, save_meanings, save_panels, scope
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -264,6 +264,9 @@ def main() -> None:
             made = parts.agent(name, simulator, arguments)
             if name == job["agent"]:
                 made = _Watched(made, name, job["stop_at"], simulator)
+            if job["panels"] is not None:
+                meanings = getattr(simulator.actions[name].space, "meanings", ())
+                save_meanings(Path(job["panels"][1]), name, meanings)
             if job["panels"] is not None and callable(getattr(made, "panels", None)):
                 made = _Drawn(made, name, job["panels"][0], Path(job["panels"][1]))
             return made

@@ -15,7 +15,7 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from crashhunt.bundle import Bundle
     from crashhunt.debugger import Look
@@ -102,11 +102,13 @@ def filmed(
 
 def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
     """Return what a replay did, to be filmed."""
-    from crashhunt.render import load_panels
+    from crashhunt.render import load_meanings, load_panels
 
-    panels = load_panels(chosen.look.panels[1]) if chosen.look is not None and chosen.look.panels is not None else {}
+    folder = chosen.look.panels[1] if chosen.look is not None and chosen.look.panels is not None else None
+    panels = load_panels(folder) if folder is not None else {}
+    meanings = load_meanings(folder).get(report.bundle.driver, ()) if folder is not None else ()
     crashed = report.replayed.outcome in report.rerun.worker.crash_on
-    return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed)
+    return _shot(report.bundle, report.recording, report.replayed, panels, crashed=crashed, meanings=meanings)
 
 
 def recorded_shot(bundle: Bundle) -> Shot:
@@ -130,11 +132,19 @@ def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOption
     return written
 
 
-def _shot(bundle: Bundle, recording: Recording, result: TrialResult, panels: Any, *, crashed: bool) -> Shot:
+def _shot(
+    bundle: Bundle,
+    recording: Recording,
+    result: TrialResult,
+    panels: Any,
+    *,
+    crashed: bool,
+    meanings: Sequence[str] = (),
+) -> Shot:
     from crashhunt.recording import read_lanes
     from crashhunt.render.film import Shot
 
     hit = result.collision
     other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
     lanes = read_lanes(bundle.path / "log.mcap")
-    return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels)
+    return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels, meanings)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.errors import CrashhuntError
-from crashhunt.executors._protocol import answer_file
+from crashhunt.executors._protocol import NOTICES, answer_file
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
@@ -131,6 +131,9 @@ class PoolExecutor:
 
     def notes(self) -> list[str]:
         """Return what people should be told that has not been returned before."""
+        with suppress(OSError):
+            told = (self._settings.scratch / NOTICES).read_text(encoding="utf-8", errors="replace")
+            self._notes |= dict.fromkeys(told.splitlines())
         fresh = list(self._notes)[self._told :]
         self._told += len(fresh)
         return fresh

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Executor", "WorkerSettings", "scratch_of"]
+__all__ = ["NOTICES", "Executor", "WorkerSettings", "scratch_of"]
+
+NOTICES = "notices.txt"
+"""In the scratch folder: what simulators want people to know, a line each."""
 
 _AUDIT = 1  # apart from what draws the trial itself
 _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one

@@ -22,7 +22,7 @@ from crashhunt.episode import run_episode
 from crashhunt.errors import RecorderError
 from crashhunt.executors._baseline import Baseline
 from crashhunt.executors._parts import Braking, Parts
-from crashhunt.executors._protocol import WorkerSettings, scratch_of
+from crashhunt.executors._protocol import NOTICES, WorkerSettings, scratch_of
 from crashhunt.processes import adopt_orphans, end_descendants
 from crashhunt.recording import DISK, BlackBox
 from crashhunt.scene import Lane
@@ -83,6 +83,7 @@ class Worker:
 
     def __init__(self, settings: WorkerSettings, parts: Parts | None = None) -> None:
         self.change = ""
+        self._noticed: set[str] = set()
         self.used = False
         self._pid = os.getpid()
         self._settings = settings
@@ -143,9 +144,18 @@ class Worker:
         with _undisturbed(self):
             faulthandler.cancel_dump_traceback_later()
             self.change = self._changed(simulator)
+            self._tell(simulator)
             result = self._kept(result, simulator, folder)
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)
+
+    def _tell(self, simulator: Simulator) -> None:
+        """Write down what the simulator wants people to know, for the hunt to tell them once."""
+        for notice in getattr(simulator, "notices", ()):
+            if notice not in self._noticed:
+                self._noticed.add(notice)
+                with (self._settings.scratch / NOTICES).open("a", encoding="utf-8") as file:
+                    file.write(f"{notice}\n")
 
     def _stand_aside(self) -> None:
         """Keep the copy of this process that an agent forks from writing into the recording."""

@@ -4,7 +4,7 @@ Needs Pillow, and for MP4 PyAV: ``pip install 'crashhunt[video]'``. Panels thems
 them where nobody draws them.
 """
 
-from crashhunt.render._files import explanation, load_panels, save_panels
+from crashhunt.render._files import explanation, load_meanings, load_panels, save_meanings, save_panels
 from crashhunt.render._nest import labelled, scope
 from crashhunt.render._panels import (
     Action,
@@ -32,7 +32,9 @@ __all__ = [
     "Text",
     "explanation",
     "labelled",
+    "load_meanings",
     "load_panels",
+    "save_meanings",
     "save_panels",
     "scope",
 ]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from crashhunt.render._panels import Panel
 
-__all__ = ["explanation", "load_panels", "save_panels"]
+__all__ = ["explanation", "load_meanings", "load_panels", "save_meanings", "save_panels"]
 
 _SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
 _LINE = 34  # characters that fit
@@ -44,6 +44,22 @@ def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) ->
                 picture = explanation(error).draw(label=label)
             Image.fromarray(picture).save(folder / name, compress_level=1)
             index.write(json.dumps([step, label, name]) + "\n")
+
+
+def save_meanings(folder: Path, agent: str, meanings: Sequence[str]) -> None:
+    """Write down what the numbers of an agent's discrete actions stand for; nothing where nobody says."""
+    if meanings:
+        with (folder / "meanings.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps([agent, list(map(str, meanings))]) + "\n")
+
+
+def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Return agent to what `save_meanings` was given."""
+    try:
+        lines = (folder / "meanings.jsonl").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    return {agent: tuple(meanings) for agent, meanings in map(json.loads, lines)}
 
 
 def load_panels(folder: Path) -> dict[int, dict[str, NDArray[np.uint8]]]:

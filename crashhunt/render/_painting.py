@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["painted"]
 
 _TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
+_SHORT = 12  # characters of a name that are written large
 _HUGE = 1e100
 
 
@@ -154,8 +155,10 @@ def _paint_action(panel: kinds.Action, canvas: Canvas) -> None:
     values = np.asarray(panel.value)
     if values.ndim == 0 and np.issubdtype(values.dtype, np.integer):
         name = panel.names[int(values)] if 0 <= int(values) < len(panel.names) else ""
-        canvas.text((canvas.width / 2, canvas.height / 2), str(int(values)), COLORS[0], 36, anchor="mm")
-        canvas.text((canvas.width / 2, canvas.height / 2 + 32), name, INK, 12, anchor="mm")
+        middle, size = (canvas.width / 2, canvas.height / 2), 26 if len(name) <= _SHORT else 14
+        canvas.text(middle, name or str(int(values)), COLORS[0], size if name else 36, anchor="mm")
+        if name:
+            canvas.text((middle[0], middle[1] + 32), f"action {int(values)}", INK, 12, anchor="mm")
         return
     parts = _numbers(values).ravel()
     low = np.broadcast_to(_numbers(-1.0 if panel.low is None else panel.low), parts.shape)

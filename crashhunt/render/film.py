@@ -82,6 +82,7 @@ class Shot:
         other: the one it crashed with.
         crash_step: where the crash is.
         panels: step to the agent's own panels, by label, as pictures.
+        meanings: what the numbers of its discrete actions stand for, where that is known.
     """
 
     recording: Recording
@@ -90,6 +91,7 @@ class Shot:
     other: str
     crash_step: int
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]
+    meanings: Sequence[str] = ()
 
 
 class Layout:
@@ -323,7 +325,7 @@ class _Builtin:
         if action is not None:
             value = action.reshape(-1)
             if value.size == 1 and np.issubdtype(value.dtype, np.integer):
-                found.append((_BUILTIN[3], Action(int(value[0]))))
+                found.append((_BUILTIN[3], Action(int(value[0]), names=self._shot.meanings)))
             else:
                 found.append((_BUILTIN[3], Action(value, self._low, self._high, self._names)))
         return found

@@ -60,8 +60,9 @@ class Simulator(Protocol):
 
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
-    A simulator whose observations are structured hands out flattened arrays, and offers ``shown_spaces``: for each such
-    agent the Dict or Tuple space into which its observations are unflattened before the agent is shown them.
+    A simulator that wants people to know something about what it runs offers ``notices``, lines of text; a hunt tells
+    each once. One whose observations are structured hands out flattened arrays, and offers ``shown_spaces``: for each
+    such agent the Dict or Tuple space into which its observations are unflattened before the agent is shown them.
     One that looks for traffic events offers ``told_events``, their kinds, and puts them into its scenes.
     A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`. One that
     has a window of its own offers ``open_window()``, called before the first `reset`, ``follow(agent, other)``, which

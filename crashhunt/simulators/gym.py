@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import numpy as np
 
 from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.plugins import load_object
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
@@ -56,6 +57,7 @@ class GymSimulator:
         self._factory = self._find()
         self._rule = _Rule(self._setup.crash)
         self.agents: list[str] = []
+        self.notices: dict[str, None] = {}
         try:
             self._adopt(self._make(argument_values(scenario)))  # which says what the spaces are
         except CrashhuntError:
@@ -78,7 +80,7 @@ class GymSimulator:
         self._steps = 0
         self._crashed = False
         self._look("")
-        return {self._agent: self._form.encode(observation)}, {self._agent: info}
+        return {self._agent: self._shown(observation)}, {self._agent: info}
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Step the environment."""
@@ -89,7 +91,7 @@ class GymSimulator:
         over = bool(terminated or truncated) or self._crashed
         if over:
             self.agents = []
-        agent, shown = self._agent, self._form.encode(observation)
+        agent, shown = self._agent, self._shown(observation)
         return {agent: shown}, {agent: float(reward)}, {agent: over}, {agent: False}, {agent: info}
 
     def scene(self) -> Scene:
@@ -99,6 +101,22 @@ class GymSimulator:
     def close(self) -> None:
         """Close the environment."""
         self._env.close()
+
+    def _shown(self, observation: Any) -> NDArray[Any]:
+        """An observation as it is recorded; one that is not what the environment promises is told, once a hunt.
+
+        The episode goes on: what an agent makes of it is its own business, and many environments stray by a rounding.
+        """
+        array = self._form.encode(observation)
+        if not self._form.space.contains(array):
+            what = "outside its own observation space"
+            if array.dtype.kind == "f" and np.isnan(array).any():
+                what = "that has parts which are no numbers (NaN)"
+            notice = f"the environment {self._setup.id!r} shows its agent an observation {what}"
+            if notice not in self.notices:
+                self.notices[notice] = None
+                logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
+        return array
 
     def _find(self) -> Callable[..., Any]:
         name = self._setup.id

@@ -124,11 +124,14 @@ def test_an_action_lies_within_its_bounds():
     assert lengths[2] == lengths[3]
 
 
-def test_a_discrete_action_is_written_as_an_integer_with_its_name():
+def test_a_discrete_action_is_written_by_its_name_with_the_number_below():
     plain, named = Action(3).draw(), Action(3, names=("LEFT", "IDLE", "RIGHT", "FASTER")).draw()
-    changed = np.nonzero((plain != named).any(axis=2))
-    assert len(changed[0]) > 20
-    assert changed[0].min() > 95  # the name is below the number
+    written = [np.nonzero((picture == BLUE).all(axis=2))[1] for picture in (plain, named)]
+    assert np.ptp(written[1]) > 3 * np.ptp(written[0])  # a word, and not a digit
+    below = [int((picture[100:] != 255).any(axis=2).sum()) for picture in (plain, named)]
+    assert below[1] > below[0] + 20
+    unknown = Action(7, names=("LEFT", "IDLE")).draw()
+    assert np.array_equal(unknown, Action(7).draw())
 
 
 def test_a_distribution_of_discrete_actions_is_bars_up_to_one():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -205,3 +207,59 @@ def test_a_mistake_is_one_line(tmp_path, name, options, says):
         simulator_of(tmp_path, name, **options)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+class Straying(gymnasium.Env):
+    """Shows what it does not promise: no number at step 2, too much at step 3."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        shown = {2: np.nan, 3: 7.0}.get(self.steps, 0.5)
+        return np.array([shown, 0.0], np.float32), 0.0, False, False, {}
+
+
+def make_straying():
+    return Straying()
+
+
+def test_observations_that_the_environment_does_not_promise_are_told_once(tmp_path):
+    simulator = simulator_of(tmp_path, f"{__name__}:make_straying")
+    for _ in range(2):
+        simulator.reset(seed=1)
+        for _ in range(4):
+            simulator.step({"me": np.array(1)} if "me" in simulator.agents else {simulator.agents[0]: np.array(1)})
+    nan, outside = simulator.notices
+    assert nan.endswith("shows its agent an observation that has parts which are no numbers (NaN)")
+    assert outside.endswith("shows its agent an observation outside its own observation space")
+
+
+SCENARIO = """
+schema = 1
+title = "Strays"
+simulator = "gym"
+[gym]
+id = "straying:make_straying"
+[agents.me]
+agent = "random"
+"""
+
+
+def test_a_hunt_tells_it_in_its_summary(shell):
+    source = Path(__file__).read_text(encoding="utf-8")
+    body = source.partition("class Straying")[2].partition("\n\n\ndef test_")[0]
+    (shell.folder / "straying.py").write_text(
+        f"import gymnasium\nimport numpy as np\nfrom gymnasium import spaces\n\n\nclass Straying{body}\n"
+    )
+    (shell.folder / "strays.toml").write_text(SCENARIO)
+    done = shell.crashhunt("run", "h", "1", "2", "4", "--scenario", "strays.toml", "--seed", "1", "--json")
+    assert done.json["outcomes"] == {"survived": 2}
+    assert sum("(NaN)" in note for note in done.json["notes"]) == 1
+    assert "Note: the environment 'straying:make_straying' shows its agent an observation outside" in done.err
