@@ -77,7 +77,7 @@ def test_every_end_has_its_state(toy):
     assert "told to fail" in found["none"]["detail"]
     # All below a folder, and one that nobody can read hides no other.
     (toy.folder / "fine/ledger.sqlite").write_bytes(b"nonsense" * 1000)
-    found = {hunt["dir"]: hunt["state"] for hunt in toy.crashhunt("status", ".", "--json").json["hunts"]}
+    found = {hunt["dir"]: hunt["state"] for hunt in toy.crashhunt("status", ".", "--json", expect=2).json["hunts"]}
     assert found == {"fine": "error", "crash": "crashed", "none": "error"}
     assert "there is no hunt in 'toy'" in toy.crashhunt("status", "toy", expect=2).err
     assert "does not exist" in toy.crashhunt("status", "nowhere", expect=2).err
