@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from crashhunt._calls import clear_calls
-from crashhunt.errors import UsageError
+from crashhunt.errors import HuntDirectoryError, UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
 from crashhunt.space import Constant
@@ -164,11 +164,14 @@ def compare(*directories: Path | str) -> Comparison:
 
     Raises:
         UsageError: fewer than two are given.
-        HuntDirectoryError: one is not the directory of a hunt.
+        HuntDirectoryError: one is not the directory of a hunt, or its ledger is damaged.
     """
     if len(directories) < 2:
         raise UsageError("there is nothing to compare with", fix="give the directories of two hunts or more")
     hunts = [HuntResults(directory) for directory in directories]
+    for hunt in hunts:
+        if hunt.state.damaged:
+            raise HuntDirectoryError(hunt.state.detail)
     tables = [_table(hunt) for hunt in hunts]
     figures = tuple(_figures(hunt, table) for hunt, table in zip(hunts, tables, strict=True))
     pairs = tuple(_pair(hunts[0], tables[0], hunt, table) for hunt, table in zip(hunts[1:], tables[1:], strict=True))

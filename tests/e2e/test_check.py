@@ -22,6 +22,7 @@ from damage import (
 )
 
 import crashhunt
+from crashhunt.errors import HuntDirectoryError
 from crashhunt.integrity import digest_of_data
 
 HUNT = ("2", "12", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
@@ -318,3 +319,11 @@ def test_no_crash_in_other_traffic_is_no_fix(hunt, crash, toy):
     report = crashhunt.replay(crash)
     assert (report.verdict, len(report.rerun.warnings)) == ("reproduced", 1)
     assert "seed was 4 and is 5" in report.rerun.warnings[0]
+
+
+def test_hunts_are_not_compared_where_one_has_a_damaged_ledger(hunt):
+    with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
+        # In a column that compare itself does not read, of the trial that is read for the time at which it ended.
+        database.execute("UPDATE trials SET snapshot = 'x' WHERE number = (SELECT max(number) FROM trials)")
+    with pytest.raises(HuntDirectoryError, match="crashhunt check"):
+        crashhunt.compare(hunt, hunt)
