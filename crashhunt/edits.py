@@ -119,8 +119,10 @@ def _find(name: str, recorded: TrialSpec, settings: HuntSettings) -> tuple[str, 
         return takers[0], name
     if name in recorded.scenario_arguments:
         return "", name
-    known = [_name(key) for key in _specs(settings)]
-    hint = did_you_mean(name, [*known, *(key[1] for key in _specs(settings))])
+    bare = {_name(key): key[1] for key in _specs(settings)}
+    known = list(bare)
+    near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(name, [part]))
+    hint = did_you_mean(name, known) or next(near, "")
     fix = f"{hint} it has {listed(known)}".lstrip()
     raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=fix)
 

@@ -247,8 +247,10 @@ class Hunt:
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.found:
                 return "crash"
-        except ScenarioError as error:  # of which file is for somebody who wants to mend it
+        except CrashhuntError as error:  # of which file is for somebody who wants to mend it
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
+            if mine not in error.where:
+                raise
             raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
             executor.close()

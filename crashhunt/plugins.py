@@ -105,7 +105,7 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
     if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
         hint = did_you_mean(missing.rpartition(".")[2], _modules_beside(missing))
         fix = f"{hint} run from the folder that holds the module, install it, or mend the name".lstrip()
-        return PluginError(f"{shown!r} cannot be imported: there is no module {missing!r}", fix=fix)
+        return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
     fix = f"install {missing.partition('.')[0]!r}, or mend the import" if missing else "mend it"
     return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
 

@@ -59,8 +59,9 @@ def test_a_crash_from_before_says_nothing(toy):
     toy.crashhunt("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
     (file,) = (toy.folder / "h" / "crashes").glob("*/crash.json")
     data = json.loads(file.read_text())
-    del data["escape"]
-    file.write_text(json.dumps(data))
+    for new in ("escape", "integrity", "files"):
+        del data[new]
+    file.write_text(json.dumps({**data, "schema": 1}))
     assert "Braking" not in toy.crashhunt("show", "h").out
     assert "calculated, not run" in toy.crashhunt("show", "h", "--braking", "6").out
 

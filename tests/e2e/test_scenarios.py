@@ -204,7 +204,7 @@ def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
     scenario = scenario_from_dict(tomllib.loads(table), where="x", folder=Path())
     assert isinstance(scenario, Scenario)
     with pytest.raises(UsageError, match=says):
-        refuse_side_effects(scenario, settings)
+        refuse_side_effects(scenario, settings, {})
 
 
 WIDER = """

@@ -85,8 +85,8 @@ def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says)
         ("def f():\n  return (", "broken:Agent", "broken.py, line 2", "SyntaxError"),
         ("import sys\nsys.exit(3)", "broken:Agent", "broken.py, line 2", "SystemExit: 3"),
         ("from json import nothing", "broken:Agent", "broken.py, line 1", "cannot import name 'nothing'"),
-        ("", "brokn:Agent", "", "there is no module 'brokn'; did you mean 'broken'?"),
-        ("", "broken.inner:Agent", "", "there is no module 'broken.inner'"),
+        ("", "brokn:Agent", "", "No module named 'brokn'; did you mean 'broken'?"),
+        ("", "broken.inner:Agent", "", "No module named 'broken.inner'"),
         ("x\0y", "broken:Agent", "", "null bytes"),
     ],
 )
