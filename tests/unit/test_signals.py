@@ -14,8 +14,8 @@ from crashhunt.signals import stop_requests
 def test_a_request_that_comes_twice_at_once_is_one(number):
     with stop_requests() as asked:
         assert asked == []
-        os.kill(os.getpid(), number)
-        os.kill(os.getpid(), number)
+        signal.raise_signal(number)
+        signal.raise_signal(number)
         assert asked == [number]
 
 
@@ -24,7 +24,7 @@ def test_a_second_request_a_while_later_ends_the_process_at_once(monkeypatch):
     ended: list[int] = []
     before = signal.getsignal(signal.SIGTERM)
     with stop_requests() as asked:
-        os.kill(os.getpid(), signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
         with monkeypatch.context() as patch:  # instead of the end of this process
             patch.setattr(os, "kill", lambda _, number: ended.append(number))
             signal.raise_signal(signal.SIGTERM)
@@ -37,7 +37,7 @@ def test_whoever_ignores_hang_ups_goes_on_ignoring_them_and_threads_are_left_alo
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with stop_requests() as asked:
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
             assert asked == []
     finally:
         signal.signal(signal.SIGHUP, before)
