@@ -96,9 +96,9 @@ def _registered(group: Any) -> list[str]:
 
 
 def _outcomes(*, crashes: bool) -> list[str]:
-    from crashhunt.trial import CRASHES, Outcome
+    from crashhunt.trial import CRASHES, EVENTS, Outcome
 
-    return [str(outcome) for outcome in (CRASHES if crashes else Outcome)]
+    return [str(outcome) for outcome in ((*CRASHES, *EVENTS) if crashes else Outcome)]
 
 
 def _crashes(parsed_args: argparse.Namespace, **_: Any) -> list[str]:

@@ -43,6 +43,7 @@ def press(toy):
         ("crashhunt run out 1 1 9 --agent id", ["idm"]),
         ("crashhunt run out 1 1 9 --sampler s", ["sweep"]),
         ("crashhunt run out 1 1 9 --crash-on hang,col", ["hang,collision"]),
+        ("crashhunt run out 1 1 9 --crash-on red", ["red_light"]),
         ("crashhunt run out 1 1 9 --scenario toy --set g", ["gap_m="]),
         ("crashhunt run out 1 1 9 --scenario merge --arg head", ["headway_s="]),
         ("crashhunt trials h --outcome sur", ["survived"]),

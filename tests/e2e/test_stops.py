@@ -186,7 +186,7 @@ def test_output_that_cannot_be_written_is_one_line(toy, words):
 
 
 def test_too_few_files_are_one_line(toy):
-    command = ["bash", "-c", f"ulimit -n 16; exec {CRASHHUNT} run h 2 4 20 {' '.join(FINE)}"]
+    command = ["bash", "-c", 'ulimit -n 16; exec "$0" "$@"', str(CRASHHUNT), "run", "h", "2", "4", "20", *FINE]
     done = subprocess.run(command, cwd=toy.folder, env=toy.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "Too many open files" in done.stderr
