@@ -49,6 +49,7 @@ def shown(shell):
     return shell
 
 
+@pytest.mark.timeout(900)  # a minute and a half of hunts, and more on a machine with something else to do
 def test_every_command_does_what_it_says(shown):
     ran = []
     for command in commands():
