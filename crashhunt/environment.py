@@ -21,10 +21,16 @@ def environment() -> dict[str, Any]:
     ``loaded`` are the distributions of which something has been imported by now: with the simulator's, those on which
     a result may depend.
     """
-    distributions = {dist.metadata["Name"]: dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
     modules = {name.partition(".")[0] for name in list(sys.modules)}
-    owners = metadata.packages_distributions()
-    loaded = {owner for name in modules for owner in owners.get(name, ())} | (distributions.keys() & _VERSIONED)
+    distributions: dict[str, str] = {}
+    loaded: set[str] = set()
+    for distribution in metadata.distributions():
+        name, version = _name_and_version(distribution)
+        if not name:
+            continue
+        distributions[name] = version
+        if name in _VERSIONED or not modules.isdisjoint(_top_level_modules(distribution)):
+            loaded.add(name)
     return {
         "schema": 1,
         "python": platform.python_version(),
@@ -39,12 +45,37 @@ def environment() -> dict[str, Any]:
     }
 
 
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    """Read the two out of the text: `Distribution.metadata` parses all of it, which is most of a hunt's start."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    head, _, _ = text.partition("\n\n")
+    found = dict(line.split(": ", 1) for line in head.splitlines() if line.startswith(("Name: ", "Version: ")))
+    if len(found) == 2:
+        return found["Name"].strip(), found["Version"].strip()
+    return distribution.metadata["Name"] or "", distribution.metadata["Version"] or ""
+
+
+def _version_of(name: str) -> str:
+    return _name_and_version(metadata.distribution(name))[1]
+
+
+def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
+    """What can be imported of it, as `importlib.metadata.packages_distributions` finds it, in a tenth of the time."""
+    declared = (distribution.read_text("top_level.txt") or "").split()
+    if declared:
+        return set(declared)
+    record = distribution.read_text("RECORD")
+    names = map(str, distribution.files or ()) if record is None else record.splitlines()
+    files = (name.partition(",")[0].strip('"') for name in names)
+    return {file.partition("/")[0].removesuffix(".py") for file in files if file.endswith(".py")}
+
+
 def versions() -> dict[str, str]:
     """Return the versions that every crash names."""
     found = {"python": platform.python_version()}
     for name in _VERSIONED:
         try:
-            found[name] = metadata.version(name)
+            found[name] = _version_of(name)
         except metadata.PackageNotFoundError:
             continue
     return found
@@ -64,7 +95,7 @@ def environment_changes(recorded: dict[str, Any]) -> dict[str, tuple[str, str]]:
     distributions = recorded.get("distributions", {})
     for name in recorded.get("loaded", ()):
         try:
-            now = metadata.version(name)
+            now = _version_of(name)
         except metadata.PackageNotFoundError:
             now = "not installed"
         then = distributions.get(name, now)
