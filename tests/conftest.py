@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
+from commands import CRASHHUNT, Commands
 
 from crashhunt.integrity import describe_files, digest_of_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
 hypothesis.settings.register_profile("crashhunt", deadline=None)
 hypothesis.settings.load_profile("crashhunt")
 
-CRASHHUNT = Path(sys.executable).parent / "crashhunt"
+_TIMEOUT_S = 150.0
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
 
 
@@ -47,21 +48,22 @@ class Shell:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        # Users have Python keep what it compiled; without, every process would compile crashhunt again.
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-        kept.pop("PYTHONDONTWRITEBYTECODE", None)
-        self.environment = kept
+        self.environment = _usual_environment()
 
     def crashhunt(self, *words: str, expect: int | None = 0) -> Done:
-        """Run a command to its end."""
-        command = [str(CRASHHUNT), *words]
+        """Run a command to its end: in a fork of a process that has imported what it needs, where that is the same."""
+        commands = _commands()
+        if not commands.fits(self.environment):
+            return self.process(*words, expect=expect)
+        return _ended(words, Done(*commands.run(words, self.folder, self.environment, _TIMEOUT_S)), expect)
+
+    def process(self, *words: str, expect: int | None = 0) -> Done:
+        """Run a command to its end as a shell does it, for tests of how it starts and ends."""
         done = subprocess.run(
-            command, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=150, check=False
-        )
-        if expect is not None:
-            assert done.returncode == expect, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
-        assert "Traceback" not in done.stderr, done.stderr
-        return Done(done.returncode, done.stdout, done.stderr)
+            [str(CRASHHUNT), *words], cwd=self.folder, env=self.environment, capture_output=True, text=True,
+            timeout=_TIMEOUT_S, check=False,
+        )  # fmt: skip
+        return _ended(words, Done(done.returncode, done.stdout, done.stderr), expect)
 
     def start(self, *words: str, **options: Any) -> subprocess.Popen[str]:
         """Start a command; the caller ends it."""
@@ -74,6 +76,33 @@ class Shell:
             text=True,
             **options,
         )
+
+
+def _ended(words: tuple[str, ...], done: Done, expect: int | None) -> Done:
+    if expect is not None:
+        assert done.code == expect, f"{words}: {done.code}\n{done.out}\n{done.err}"
+    assert "Traceback" not in done.err, done.err
+    return done
+
+
+def _usual_environment() -> dict[str, str]:
+    # Users have Python keep what it compiled; without, every process would compile crashhunt again.
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    kept.pop("PYTHONDONTWRITEBYTECODE", None)
+    return kept
+
+
+@functools.cache
+def _commands() -> Commands:
+    return Commands(_usual_environment())
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _commands_end() -> Iterator[None]:
+    yield
+    if _commands.cache_info().currsize:
+        _commands().close()
+        _commands.cache_clear()
 
 
 def needed(*names: str) -> str:

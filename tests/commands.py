@@ -1,0 +1,149 @@
+"""Commands in processes that are there already: what `crashhunt` imports is imported once, and every command is a fork.
+
+A command is a process of its own as before: with its own directory, variables, output and exit code, and nothing that
+it changes reaches the next. What it does not show is how Python starts; `Shell.process` does.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import importlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+CRASHHUNT = Path(sys.executable).parent / "crashhunt"
+# What `run` and `replay` import; the rest of a command's modules is imported by its fork.
+IMPORTED = ("crashhunt.cli", "crashhunt.api", "crashhunt.report", "crashhunt.snapshot", "rich.console")
+# What Python and its libraries look at when they start.
+_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
+_MESSAGE = 1 << 20
+
+
+class Commands:
+    """The process that all commands of a test session are forked from.
+
+    Args:
+        environment: in which it starts.
+    """
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self._at_start = _at_start(environment)
+        self._lock = threading.Lock()
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, __file__, str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=environment,
+            )
+
+    def fits(self, environment: Mapping[str, str]) -> bool:
+        """Whether a process that is started with these variables begins as the forks do."""
+        return _at_start(environment) == self._at_start
+
+    def run(
+        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], timeout_s: float
+    ) -> tuple[int, str, str]:
+        """Run a command to its end; return its exit code, or minus its signal, and what it has printed.
+
+        Raises:
+            subprocess.TimeoutExpired: it took too long, and was killed.
+        """
+        request = json.dumps({"words": words, "folder": str(folder), "environment": dict(environment)}).encode()
+        with self._lock, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            socket.send_fds(self._control, [request], [out.fileno(), err.fileno()])
+            self._control.settimeout(None)
+            pid = json.loads(self._control.recv(_MESSAGE))
+            self._control.settimeout(timeout_s)
+            try:
+                code = json.loads(self._control.recv(_MESSAGE))
+            except TimeoutError:
+                os.kill(pid, 9)
+                self._control.settimeout(None)
+                self._control.recv(_MESSAGE)
+                raise subprocess.TimeoutExpired(["crashhunt", *words], timeout_s) from None
+            for file in (out, err):
+                file.seek(0)
+            return code, _text(out.read()), _text(err.read())
+
+    def close(self) -> None:
+        """End it."""
+        self._control.close()
+        self._process.wait(10)
+
+
+def _text(data: bytes) -> str:
+    """As `subprocess` has it where it is asked for text."""
+    return data.decode().replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in environment.items() if name.startswith(_AT_START)}
+
+
+def _serve(control: socket.socket) -> None:
+    while True:
+        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 2)
+        if not data:
+            return
+        pid = os.fork()
+        if pid == 0:
+            control.close()
+            _be_command(json.loads(data), *descriptors)
+        for descriptor in descriptors:
+            os.close(descriptor)
+        control.send(json.dumps(pid).encode())
+        _, status = os.waitpid(pid, 0)
+        control.send(json.dumps(os.waitstatus_to_exitcode(status)).encode())
+
+
+def _be_command(request: dict, out: int, err: int) -> NoReturn:
+    """Do what the script `crashhunt` does, and end as a process of Python ends."""
+    code = 1
+    try:
+        for descriptor, copy in ((out, 1), (err, 2)):
+            os.dup2(descriptor, copy)
+            os.close(descriptor)
+        os.environ.clear()
+        os.environ.update(request["environment"])
+        os.chdir(request["folder"])
+        sys.argv = [str(CRASHHUNT), *request["words"]]
+        from crashhunt.cli import main
+
+        try:
+            main()
+        except SystemExit as leaving:
+            code = leaving.code if isinstance(leaving.code, int) else 1 if leaving.code else 0
+        except BaseException:
+            traceback.print_exc()
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(ValueError):
+                stream.flush()
+    finally:
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    sys.path[0] = str(CRASHHUNT.parent)  # where the script lies, and not these tests
+    for module in IMPORTED:
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()
+    _serve(socket.socket(fileno=int(sys.argv[1])))
