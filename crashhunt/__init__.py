@@ -8,10 +8,14 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from crashhunt.api import Hunt, Suite, compare, load, prepare, replay, run
-    from crashhunt.simulators.acceleration import accelerate
+    from crashhunt.api import prepare, replay, run
+    from crashhunt.estimation import compare
+    from crashhunt.hunts import Hunt, load
+    from crashhunt.simulators.accelerator import accelerate
+    from crashhunt.suites import Suite
 
-__version__ = "0.1.0"
+from crashhunt.base.version import __version__
+
 __all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run"]
 
 
@@ -20,7 +24,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "accelerate":
-        from crashhunt.simulators.acceleration import accelerate
+        from crashhunt.simulators.accelerator import accelerate
 
         return accelerate
     from crashhunt import api
@@ -37,7 +41,7 @@ def _register_environment() -> None:
     from gymnasium.envs.registration import register, registry
 
     if "crashhunt/SUMO-v0" not in registry:
-        register(id="crashhunt/SUMO-v0", entry_point="crashhunt.simulators.gym_env:SumoEnv")
+        register(id="crashhunt/SUMO-v0", entry_point="crashhunt.envs:SumoEnv")
 
 
 # gymnasium.make("crashhunt:crashhunt/SUMO-v0") imports this module. Nobody else should wait for Gymnasium's import,

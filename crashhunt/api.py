@@ -5,25 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt._calls import clear_calls
-from crashhunt.bundle import Bundle, find_bundle
-from crashhunt.comparison import compare
-from crashhunt.errors import UsageError
-from crashhunt.hunt import Hunt
-from crashhunt.plan import Request, plan
-from crashhunt.replays import ReplayOptions, ReplayReport
-from crashhunt.replays import replay as _replay
-from crashhunt.results import load
-from crashhunt.settings import RunSettings
-from crashhunt.suite import Suite
+from crashhunt.base.calls import clear_calls
+from crashhunt.base.errors import UsageError
+from crashhunt.crashes import Bundle, find_bundle
+from crashhunt.estimation import compare
+from crashhunt.hunts import Hunt, load
+from crashhunt.plans import Request, RunSettings, plan
+from crashhunt.replays import ReplayOptions, ReplayReport, replay as _replay
+from crashhunt.suites import Suite
 from crashhunt.trial import CRASHES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from crashhunt.progress import HuntReport, HuntStatus
+    from crashhunt.hunts import HuntReport, HuntStatus
     from crashhunt.replays import Code
-    from crashhunt.snapshot import SnapshotOptions
+    from crashhunt.snapshots import SnapshotOptions
 
 __all__ = ["Hunt", "Suite", "compare", "load", "prepare", "replay", "run"]
 

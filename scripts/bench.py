@@ -78,13 +78,14 @@ def child_step(scenario: str) -> dict[str, float]:
     """A whole step against a bare libsumo loop over the same traffic, alternating in one process."""
     import libsumo
 
-    from crashhunt import episode
     from crashhunt.agents import KeepLaneWithSpeed
-    from crashhunt.oracles import ApproachMeter, OffRoad, Overlap, ReportedCollision
+    from crashhunt.episode import _episode as episode
+    from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.simulators.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
+    from crashhunt.world import ApproachMeter
 
     steps, speed = 1000, 10.0
     chosen = load_scenario(scenario)
@@ -195,7 +196,7 @@ def bench_parallel() -> Iterator[Figure]:
 
 def bench_orchestration() -> Iterator[Figure]:
     """Everything that is not the episode, with few and with many trials in the ledger."""
-    from crashhunt.ledger import Ledger
+    from crashhunt.hunts import Ledger
     from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
     costs = {}
@@ -274,8 +275,8 @@ def bench_help() -> Iterator[Figure]:
 
 def child_memory(trials: str) -> dict[str, float]:
     """Resident memory of a worker after a tenth and after all of its trials."""
-    from crashhunt.executors._protocol import WorkerSettings
-    from crashhunt.executors._worker import Worker
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.executors import Worker
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.trial import TrialSpec
 
@@ -374,8 +375,8 @@ class Agent:
 
 def child_replay(directory: str) -> dict[str, float]:
     """Steps a second of a hunt and of the replays of its crash."""
-    from crashhunt.bundle import find_bundle
-    from crashhunt.ledger import Ledger
+    from crashhunt.crashes import find_bundle
+    from crashhunt.hunts import Ledger
     from crashhunt.replays import replay
 
     bundle = find_bundle(Path(directory))
@@ -400,7 +401,7 @@ def bench_replay() -> Iterator[Figure]:
 
 def _large_ledger(directory: Path, trials: int) -> None:
     """Grow a hunt to so many trials, by copying those that it has."""
-    from crashhunt.ledger import Ledger
+    from crashhunt.hunts import Ledger
 
     with closing(Ledger(directory / "ledger.sqlite", writable=True)) as ledger:
         rows = [row for _, row in ledger.intact_rows(range(trials)) if row is not None]
@@ -447,7 +448,7 @@ def bench_panels() -> Iterator[Figure]:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    from crashhunt.render import Curve, Heatmap
+    from crashhunt.panels import Curve, Heatmap
 
     rng = np.random.default_rng(0)
     maps, curves = rng.normal(size=(200, 8, 7)), np.cumsum(rng.normal(size=(200, 100)), axis=1)
@@ -494,7 +495,7 @@ def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> d
     import highway_env
     from highway_env.road.road import Road
 
-    from crashhunt.simulators._accelerator import accelerate, decelerate
+    from crashhunt.simulators.accelerator import switch_off, switch_on
 
     warnings.simplefilter("ignore")
     assert highway_env
@@ -538,9 +539,9 @@ def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> d
 
     slow, fast = [], []
     for number in range(int(rounds)):
-        decelerate()
+        switch_off()
         slow.append(rate(100 * number))
-        reason = accelerate()
+        reason = switch_on()
         assert not reason, reason
         fast.append(rate(100 * number))
     ratio = statistics.median(two / one for one, two in zip(slow, fast, strict=True))
@@ -613,11 +614,11 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
     """A made-up crash with so many actors and steps."""
     import numpy as np
 
-    from crashhunt.bundle import write_bundle
-    from crashhunt.executors import BLACK_BOX
+    from crashhunt.base.layout import BLACK_BOX
+    from crashhunt.crashes import write_bundle
     from crashhunt.recording import AgentChannel, BlackBox, Prologue, Tag, digest_of, encode_actors
-    from crashhunt.scene import Actor, Roster, Scene
     from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+    from crashhunt.world import Actor, Roster, Scene
 
     scratch = directory / "scratch"
     scratch.mkdir()

@@ -15,7 +15,7 @@ import hypothesis
 import pytest
 from commands import CRASHHUNT, Commands
 
-from crashhunt.integrity import describe_files, digest_of_data
+from crashhunt.base.integrity import describe_files, digest_of_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -12,8 +12,8 @@ import zipfile
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.integrity import digest_of_data
 from crashhunt.cli import main
-from crashhunt.integrity import digest_of_data
 
 if TYPE_CHECKING:
     import random

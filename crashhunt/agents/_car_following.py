@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from crashhunt.agents._forms import meta_actions, wanted_meta_action
-from crashhunt.space import Argument, Range
+from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

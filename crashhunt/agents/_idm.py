@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from crashhunt.agents._car_following import CAR_LENGTH_M, VX, Leader, X, actors, find_leader, idm_acceleration, off_path
 from crashhunt.agents._forms import wanted_meta_action
 from crashhunt.agents._lane_changer import LANE_WIDTH_M, LaneChanger
-from crashhunt.space import Argument, Range
+from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
     import numpy as np

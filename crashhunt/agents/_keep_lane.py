@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 from crashhunt.agents._forms import meta_actions
-from crashhunt.space import Argument, Range
+from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
     from gymnasium import Space

@@ -18,7 +18,7 @@ from crashhunt.agents._car_following import (
     off_path,
 )
 from crashhunt.agents._forms import meta_actions, wanted_meta_action
-from crashhunt.space import Argument, Range
+from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

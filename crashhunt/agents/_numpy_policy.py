@@ -10,7 +10,7 @@ import numpy as np
 
 from crashhunt.agents._car_following import VX, Y, check_layout
 from crashhunt.agents._forms import meta_actions
-from crashhunt.space import Argument
+from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
     from gymnasium import Space
@@ -106,10 +106,10 @@ class NumpyPolicy:
 
     def panels(self) -> Any:
         """Show the values."""
-        from crashhunt import render
+        from crashhunt import panels
 
         names = [name.removeprefix("LANE_") for name in _MEANINGS]
-        return {"values": render.Bar(dict(zip(names, self.values.tolist(), strict=True)))}
+        return {"values": panels.Bar(dict(zip(names, self.values.tolist(), strict=True)))}
 
     def _continuous(self, decision: str, observation: NDArray[np.float32]) -> tuple[float, int]:
         speed = float(observation[0, VX])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from crashhunt.space import Argument
+from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
     from gymnasium import Space

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-from crashhunt.space import Argument
+from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
     from gymnasium import Space

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from crashhunt.space import Argument
+from crashhunt.trial import Argument
 
 __all__ = ["Recorded"]
 

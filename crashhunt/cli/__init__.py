@@ -12,7 +12,9 @@ import traceback
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt import __version__
+from crashhunt.base.errors import CrashhuntError, UsageError, remedy
+from crashhunt.base.text import one_line
+from crashhunt.base.version import __version__
 from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
@@ -27,8 +29,6 @@ from crashhunt.cli._show import add_show
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
-from crashhunt.errors import CrashhuntError, UsageError, remedy
-from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_json, say
-from crashhunt.errors import UsageError
 
 if TYPE_CHECKING:
     import argparse
 
-    from crashhunt.check import Checked
+    from crashhunt.hunts import Checked
 
 __all__ = ["add_check"]
 
@@ -40,8 +40,7 @@ def add_check(commands: Any) -> None:
 
 
 def _check(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.check import check
-    from crashhunt.salvage import salvage
+    from crashhunt.hunts import check, salvage
 
     found = check(options.directory)
     if options.salvage is not None and len(found) != 1:

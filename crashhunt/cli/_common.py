@@ -9,15 +9,15 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from crashhunt._names import did_you_mean, one_of
-from crashhunt.errors import UsageError
-from crashhunt.text import visible
+from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
+from crashhunt.base.names import did_you_mean, one_of
+from crashhunt.base.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt.archive import Archive
-    from crashhunt.bundle import Bundle
+    from crashhunt.crashes import Archive, Bundle
 
 __all__ = [
     "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt", "pairs",
@@ -85,12 +85,12 @@ def opened_crash(directory: Path, crash: str) -> Iterator[tuple[Bundle, Archive 
     Raises:
         BundleError: there is no such crash.
     """
-    from crashhunt.bundle import find_bundle
+    from crashhunt.crashes import find_bundle
 
     if not directory.is_file():
         yield find_bundle(directory, crash), None
         return
-    from crashhunt.archive import open_archive
+    from crashhunt.crashes import open_archive
 
     with open_archive(directory) as archive:
         yield find_bundle(archive.directory, crash), archive
@@ -104,15 +104,15 @@ def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
         HuntDirectoryError: it is not the directory of a hunt.
     """
     if directory.is_file():
-        from crashhunt.archive import open_archive
+        from crashhunt.crashes import open_archive
 
         with open_archive(directory) as archive:
             yield archive.directory, True
         return
-    from crashhunt.settings import read_settings
+    from crashhunt.plans import read_settings
 
-    hunt = directory.resolve().parent.parent if (directory / "crash.json").is_file() else directory
-    read_settings(hunt / "hunt.toml")  # refuses what is no hunt
+    hunt = directory.resolve().parent.parent if (directory / layout.CRASH).is_file() else directory
+    read_settings(hunt / layout.HUNT)  # refuses what is no hunt
     yield hunt, False
 
 
@@ -127,7 +127,7 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
         HuntDirectoryError: there is none.
         UsageError: there is no such run.
     """
-    from crashhunt.status import find_hunts
+    from crashhunt.hunts import find_hunts
 
     names = {hunt: hunt.relative_to(directory).as_posix() for hunt in find_hunts(directory)}
     for run in runs:

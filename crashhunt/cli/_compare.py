@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:
@@ -31,14 +32,14 @@ def add_compare(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.comparison import compare
+    from crashhunt.estimation import compare
+    from crashhunt.hunts import find_hunts
     from crashhunt.report import comparison_page, describe_comparison
-    from crashhunt.status import find_hunts
 
     hunts = []
     for directory in options.directories:
         for hunt in find_hunts(directory):
-            if hunt == directory or (hunt / "hunt.toml").exists():
+            if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:
                 say(f"{hunt} has not begun, and is left out", as_json=True)

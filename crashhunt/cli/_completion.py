@@ -8,6 +8,8 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
@@ -90,7 +92,7 @@ def _scenarios() -> list[str]:
 
 
 def _registered(group: Any) -> list[str]:
-    from crashhunt.plugins import registered
+    from crashhunt.base.plugins import registered
 
     return list(registered(group))
 
@@ -118,7 +120,7 @@ def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]
     from crashhunt.scenario import shipped_folder
 
     name = getattr(parsed_args, "scenario", None) or "loop"
-    for file in (shipped_folder() / name / "scenario.toml", Path(name) / "scenario.toml", Path(name)):
+    for file in (shipped_folder() / name / layout.SCENARIO, Path(name) / layout.SCENARIO, Path(name)):
         try:
             said = tomllib.loads(file.read_text(encoding="utf-8"))
             tables = [agent.get("arguments", {}) for agent in said.get("agents", {}).values()]

@@ -30,8 +30,7 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.archive import export_crash
-    from crashhunt.bundle import find_bundle
+    from crashhunt.crashes import export_crash, find_bundle
 
     bundle = find_bundle(options.directory, options.crash)
     with shown_progress(f"writing {options.file}", as_json=options.json) as watch:

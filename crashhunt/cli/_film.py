@@ -8,20 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import integer, number
 from crashhunt.cli._progress import shown_progress
-from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator, Sequence
 
-    from crashhunt.bundle import Bundle
-    from crashhunt.debugger import Look
+    from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
-    from crashhunt.render.film import FilmOptions, Shot
-    from crashhunt.replays import ReplayOptions, ReplayReport
+    from crashhunt.render import FilmOptions, Shot
+    from crashhunt.replays import Look, ReplayOptions, ReplayReport
     from crashhunt.trial import TrialResult
 
 __all__ = ["add_film_options", "film_options", "filmed", "look_at_all", "recorded_shot", "replayed_shot", "write_films"]
@@ -56,7 +56,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     if not (options.video or options.gif or options.frames):
         return None
     try:
-        from crashhunt.render.film import FilmOptions, check_places
+        from crashhunt.render import FilmOptions, check_places
     except ImportError as error:
         raise UsageError(f"a film needs Pillow: {error}", fix="pip install 'crashhunt[video]'") from None
     check_places(video=options.video, gif=options.gif, folder=options.frames)
@@ -75,7 +75,7 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
 
 def look_at_all(bundle: Bundle, **options: Any) -> Look | None:
     """Return how to look at a whole crash; None where nothing of it can be looked at."""
-    from crashhunt.debugger import Look
+    from crashhunt.replays import Look
 
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
     fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
@@ -122,7 +122,7 @@ def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOption
     Raises:
         CrashhuntError: a file cannot be written, or what writes it is not installed.
     """
-    from crashhunt.render.film import write_frames, write_gif, write_video
+    from crashhunt.render import write_frames, write_gif, write_video
 
     written = {}
     for path, write in ((options.video, write_video), (options.gif, write_gif), (options.frames, write_frames)):
@@ -142,9 +142,9 @@ def _shot(
     meanings: Sequence[str] = (),
 ) -> Shot:
     from crashhunt.recording import read_lanes
-    from crashhunt.render.film import Shot
+    from crashhunt.render import Shot
 
     hit = result.collision
     other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
-    lanes = read_lanes(bundle.path / "log.mcap")
+    lanes = read_lanes(bundle.path / layout.LOG)
     return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels, meanings)

@@ -6,8 +6,8 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.text import one_line, visible
 from crashhunt.cli._common import add_json
-from crashhunt.text import one_line, visible
 
 if TYPE_CHECKING:
     import argparse
@@ -27,19 +27,19 @@ def add_lists(commands: Any) -> None:
 
 
 def _agents(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.listing import list_agents
+    from crashhunt.report import list_agents
 
     return _print_listing("agents", list_agents(), as_json=options.json)
 
 
 def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.listing import list_scenarios
+    from crashhunt.report import list_scenarios
 
     return _print_listing("scenarios", list_scenarios(), as_json=options.json)
 
 
 def _print_listing(name: str, entries: list[dict[str, Any]], *, as_json: bool) -> int:
-    from crashhunt.listing import describe
+    from crashhunt.report import describe
 
     for entry in entries:
         if "warning" in entry:

@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import one_line, visible
 from crashhunt.cli._common import chosen_runs, integer
-from crashhunt.errors import UsageError
-from crashhunt.text import one_line, visible
 
 if TYPE_CHECKING:
     import argparse
@@ -35,8 +35,7 @@ def add_logs(commands: Any) -> None:
 
 
 def _logs(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.logs import LogKind, LogReader
-    from crashhunt.status import hunt_state
+    from crashhunt.hunts import LogKind, LogReader, hunt_state
 
     if options.errors_only and options.type not in (None, "error"):
         raise UsageError(f"--errors-only and --type {options.type} contradict each other", fix="give one of them")

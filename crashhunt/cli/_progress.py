@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt._watching import Watch
+    from crashhunt.base.watching import Watch
 
 __all__ = ["shown_progress"]
 

@@ -8,6 +8,8 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_crash, add_json, integer, number, opened_crash, pairs, say
 from crashhunt.cli._film import (
     add_film_options,
@@ -18,18 +20,15 @@ from crashhunt.cli._film import (
     replayed_shot,
     write_films,
 )
-from crashhunt.errors import UsageError
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
     from pathlib import Path
 
-    from crashhunt.archive import Archive
-    from crashhunt.bundle import Bundle
-    from crashhunt.debugger import Look
-    from crashhunt.render.film import FilmOptions
-    from crashhunt.replays import ReplayOptions, ReplayReport
+    from crashhunt.crashes import Archive, Bundle
+    from crashhunt.render import FilmOptions
+    from crashhunt.replays import Look, ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
 
@@ -169,7 +168,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
 def _replay_one(
     options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
 ) -> tuple[ReplayReport, dict[str, Any]]:
-    from crashhunt.escape import partner
+    from crashhunt.crashes import partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table
 
@@ -187,9 +186,9 @@ def _replay_one(
 
 
 def _refuse(archive: Archive, bundle: Bundle, path: Path) -> UsageError:
-    from crashhunt.settings import read_settings
+    from crashhunt.plans import read_settings
 
-    agents = {agent.agent for agent in read_settings(bundle.hunt / "hunt.toml").agents.values()}
+    agents = {agent.agent for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()}
     return UsageError(
         f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
         f"({', '.join(sorted(agents))})",
@@ -200,7 +199,7 @@ def _refuse(archive: Archive, bundle: Bundle, path: Path) -> UsageError:
 
 def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
     """Return what to look at; None for nothing."""
-    from crashhunt.debugger import Look
+    from crashhunt.replays import Look
 
     if options.json and options.pdb:
         raise UsageError("--pdb needs the terminal, and --json is for programs", fix="leave one of them out")

@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say
 from crashhunt.cli._progress import shown_progress
-from crashhunt.errors import HuntDirectoryError, UsageError
 
 if TYPE_CHECKING:
     import argparse
@@ -32,9 +33,9 @@ def add_report(commands: Any) -> None:
 
 
 def _report(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.bundle import find_bundle, list_bundles
+    from crashhunt.crashes import find_bundle, list_bundles
+    from crashhunt.hunts import hunt_state
     from crashhunt.report import write_report
-    from crashhunt.status import hunt_state
 
     if options.crashes < 0:
         raise UsageError(f"--crashes is {options.crashes}", fix="give at least 0")
@@ -45,7 +46,7 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
         bundles = [find_bundle(hunt, options.crash)] if options.crash else list_bundles(hunt)
         bundles.sort(key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         shown = bundles[: options.crashes]
-        target = options.output or (Path(f"{options.directory}.html") if exported else hunt / "report.html")
+        target = options.output or (Path(f"{options.directory}.html") if exported else hunt / layout.REPORT)
         with shown_progress(f"writing {target}", as_json=options.json) as watch:
             size = write_report(hunt, shown, target, name=options.directory.resolve().name, watch=watch)
     left = f", the {len(shown)} with the fewest steps" if len(shown) < len(bundles) else ""

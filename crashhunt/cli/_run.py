@@ -8,9 +8,9 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json, integer, number, pairs
-from crashhunt.errors import CrashhuntError
-from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     import argparse
@@ -120,7 +120,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
 
     from crashhunt.api import prepare
     from crashhunt.report import Watcher, describe_hunt
-    from crashhunt.snapshot import SnapshotOptions
+    from crashhunt.snapshots import SnapshotOptions
     from crashhunt.trial import CRASHES
 
     hunt = prepare(

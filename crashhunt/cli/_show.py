@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import visible
 from crashhunt.cli._common import add_crash, add_json, number, opened_crash
-from crashhunt.errors import UsageError
-from crashhunt.text import visible
 
 if TYPE_CHECKING:
     import argparse

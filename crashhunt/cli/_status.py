@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json
-from crashhunt.text import one_line
 
 if TYPE_CHECKING:
     import argparse
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from crashhunt.status import HuntState
+    from crashhunt.hunts import HuntState
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
@@ -58,7 +58,7 @@ def _status(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _states(directories: list[Path]) -> list[HuntState]:
-    from crashhunt.status import find_hunts, hunt_state
+    from crashhunt.hunts import find_hunts, hunt_state
 
     return [hunt_state(hunt) for directory in directories for hunt in find_hunts(directory)]
 

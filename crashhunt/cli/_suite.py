@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from crashhunt.status import HuntState
+    from crashhunt.hunts import HuntState
 
 __all__ = ["add_rerun", "add_suite"]
 
@@ -72,8 +72,8 @@ def add_rerun(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.status import find_hunts, hunt_state
-    from crashhunt.suite import Suite
+    from crashhunt.hunts import find_hunts, hunt_state
+    from crashhunt.suites import Suite
 
     suite = Suite.read(options.file)
     watch, finish = _watcher(as_json=options.json)
@@ -90,14 +90,14 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _defaults(_options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.suite import default_suite
+    from crashhunt.suites import default_suite
 
     print(default_suite(), end="")
     return 0
 
 
 def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.reruns import rerun
+    from crashhunt.suites import rerun
 
     hunts = list(chosen_runs(options.directory, options.run))
     watch, finish = _watcher(as_json=options.json)

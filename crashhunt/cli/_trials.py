@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt._names import one_of
-from crashhunt.errors import UsageError
-from crashhunt.text import visible
+from crashhunt.base.errors import UsageError
+from crashhunt.base.names import one_of
+from crashhunt.base.text import visible
 
 if TYPE_CHECKING:
     import argparse
@@ -40,10 +40,9 @@ def add_trials(commands: Any) -> None:
 
 
 def _trials(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.results import HuntResults
-    from crashhunt.tables import write_parquet, write_text
+    from crashhunt.base.files import whole_file
+    from crashhunt.hunts import HuntResults, write_parquet, write_text
     from crashhunt.trial import Outcome
-    from crashhunt.whole_file import whole_file
 
     outcomes = [name for name in options.outcome.split(",") if name]
     for name in outcomes:

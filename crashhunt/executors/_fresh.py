@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import BundleError, CrashhuntError
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.keeper import Kept
+from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._baseline import OPEN_FILES
-from crashhunt.executors._parts import require_origin, seal
-from crashhunt.executors._protocol import WorkerSettings, answer_file, scratch_of
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
-from crashhunt.executors._worker import BLACK_BOX, Worker, worker_environment
-from crashhunt.keeper import Kept
+from crashhunt.executors._worker import Worker, worker_environment
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
 
@@ -192,7 +192,7 @@ def main() -> None:
 
 def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Escape | None:
     """Until when braking would have avoided a crash, by trials in this process, whose simulator is warm."""
-    from crashhunt.escape import find_escape
+    from crashhunt.crashes import find_escape
 
     if result.collision is None:
         return None
@@ -202,7 +202,7 @@ def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Es
     numbers = itertools.count(result.spec.number + 1)  # folders of their own
 
     def recording(number: int) -> Recording:
-        return Recording(read_black_box(scratch_of(settings.scratch, number) / BLACK_BOX))
+        return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
         # A file that was left open is no matter for trials that have to be the same up to the step anyway.

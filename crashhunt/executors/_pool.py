@@ -14,8 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import CrashhuntError
-from crashhunt.executors._protocol import NOTICES, answer_file
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import answer_file
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
@@ -23,7 +24,7 @@ from crashhunt.trial import TrialResult
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from crashhunt.executors._protocol import WorkerSettings
+    from crashhunt.episode import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialSpec
 
@@ -132,7 +133,7 @@ class PoolExecutor:
     def notes(self) -> list[str]:
         """Return what people should be told that has not been returned before."""
         with suppress(OSError):
-            told = (self._settings.scratch / NOTICES).read_text(encoding="utf-8", errors="replace")
+            told = (self._settings.scratch / layout.NOTICES).read_text(encoding="utf-8", errors="replace")
             self._notes |= dict.fromkeys(told.splitlines())
         fresh = list(self._notes)[self._told :]
         self._told += len(fresh)

@@ -7,12 +7,13 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import BundleError
-from crashhunt.executors._protocol import scratch_of
-from crashhunt.executors._worker import BLACK_BOX, OUTPUT, STACK, read_tail
-from crashhunt.oracles import closest_approach
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.episode import scratch_of
+from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
-from crashhunt.trial import ClosestApproach, Failure, Outcome, TrialResult
+from crashhunt.trial import Failure, Outcome, TrialResult
+from crashhunt.world import ClosestApproach, closest_approach
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,7 +64,7 @@ class Attempt:
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
     """Return where a running trial is, or None where it has not begun."""
-    header = read_header(scratch_of(scratch, number) / BLACK_BOX)
+    header = read_header(scratch_of(scratch, number) / layout.BLACK_BOX)
     return header if header is not None and header.trial == number else None
 
 
@@ -104,12 +105,12 @@ def _result(
     exit_code: int | None,
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
-    output = read_tail(folder / OUTPUT)
-    stack = read_tail(folder / STACK)
+    output = read_tail(folder / layout.RUN_LOG)
+    stack = read_tail(folder / layout.STACK)
     agent, steps, sim_time_s, digest, closest = "", 0, 0.0, "", ClosestApproach()
     phase = header.phase if header is not None else Phase.SETUP
     try:
-        recording = Recording(read_black_box(folder / BLACK_BOX)) if header is not None else None
+        recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
     except BundleError:
         recording = None
     scenes = recording.scenes() if recording is not None else []

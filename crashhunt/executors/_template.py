@@ -17,20 +17,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.episode import words_of
-from crashhunt.errors import CrashhuntError
-from crashhunt.executors._protocol import WorkerSettings, answer_file
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import locate, registered
+from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
+from crashhunt.episode import WorkerSettings, answer_file, words_of
 from crashhunt.executors._remains import DAMAGED
 from crashhunt.executors._worker import Worker, loaded
-from crashhunt.plugins import locate, registered
-from crashhunt.processes import adopt_orphans, die_with, end_descendants, kill
 from crashhunt.recording import DISK
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from crashhunt.executors._parts import Parts
+    from crashhunt.episode import Parts
 
 __all__ = ["main"]
 

@@ -12,13 +12,13 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.errors import CrashhuntError
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.keeper import Kept
 from crashhunt.executors._remains import signal_name
 from crashhunt.executors._worker import worker_environment
-from crashhunt.keeper import Kept
 
 if TYPE_CHECKING:
-    from crashhunt.executors._protocol import WorkerSettings
+    from crashhunt.episode import WorkerSettings
 
 __all__ = ["TemplateLink"]
 

@@ -18,16 +18,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.episode import run_episode
-from crashhunt.errors import RecorderError
+from crashhunt.base import layout
+from crashhunt.base.errors import RecorderError
+from crashhunt.base.files import whole_file
+from crashhunt.base.processes import adopt_orphans, end_descendants
+from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors._baseline import Baseline
-from crashhunt.executors._parts import Braking, Parts
-from crashhunt.executors._protocol import NOTICES, WorkerSettings, scratch_of
-from crashhunt.processes import adopt_orphans, end_descendants
 from crashhunt.recording import DISK, BlackBox
-from crashhunt.scene import Lane
 from crashhunt.trial import Outcome
-from crashhunt.whole_file import whole_file
+from crashhunt.world import Lane
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -37,10 +36,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import Overruled, TrialResult, TrialSpec
 
 __all__ = [
-    "BLACK_BOX",
-    "MAP",
-    "OUTPUT",
-    "STACK",
     "Worker",
     "loaded",
     "read_map",
@@ -48,7 +43,6 @@ __all__ = [
     "worker_environment",
 ]
 
-BLACK_BOX, OUTPUT, STACK, MAP = "blackbox.bin", "run.log", "stack.txt", "map.json"
 _TAIL = 4000  # bytes
 
 
@@ -154,7 +148,7 @@ class Worker:
         for notice in getattr(simulator, "notices", ()):
             if notice not in self._noticed:
                 self._noticed.add(notice)
-                with (self._settings.scratch / NOTICES).open("a", encoding="utf-8") as file:
+                with (self._settings.scratch / layout.NOTICES).open("a", encoding="utf-8") as file:
                     file.write(f"{notice}\n")
 
     def _stand_aside(self) -> None:
@@ -169,12 +163,12 @@ class Worker:
         kept = kept or settings.is_audited(result)
         if result.outcome is not Outcome.INVALID:
             self._draw_map(simulator, folder if kept else None)
-        failure = result.failure and replace(result.failure, last_output=read_tail(folder / OUTPUT))
+        failure = result.failure and replace(result.failure, last_output=read_tail(folder / layout.RUN_LOG))
         if kept:
             # The next trial gets a folder of its own; this one now belongs to the hunt.
             self._folder = None
             if result.failure is not None and result.failure.traceback:
-                (folder / "error.log").write_text(result.failure.traceback, encoding="utf-8", errors="replace")
+                (folder / layout.ERROR_LOG).write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return replace(result, kept=kept, failure=failure)
 
     def _changed(self, simulator: Simulator) -> str:
@@ -199,7 +193,7 @@ class Worker:
 
     def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
         """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""
-        path = self._settings.scratch / MAP
+        path = self._settings.scratch / layout.MAP
         draw = getattr(simulator, "lanes", None)
         if draw is None or (path.exists() and kept is None):
             return
@@ -211,7 +205,7 @@ class Worker:
             with whole_file(path, lasting=False) as temporary:
                 temporary.write_text(text, encoding="utf-8")
         elif kept is not None and path.read_text(encoding="utf-8") != text:
-            (kept / MAP).write_text(text, encoding="utf-8")
+            (kept / layout.MAP).write_text(text, encoding="utf-8")
             return
         self._lanes = lanes
 
@@ -226,13 +220,13 @@ class Worker:
             made.mkdir()
             if self._box is not None:
                 self._box.close()
-            self._box = BlackBox(made / BLACK_BOX)
-            output = os.open(made / OUTPUT, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            self._box = BlackBox(made / layout.BLACK_BOX)
+            output = os.open(made / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
             os.dup2(output, 1)
             os.dup2(output, 2)
             os.close(output)
             self._output = os.fstat(1)
-            self._stack = (made / STACK).open("w")
+            self._stack = (made / layout.STACK).open("w")
             faulthandler.enable(self._stack)
             faulthandler.register(signal.SIGUSR1, self._stack)
             self._folder = made
@@ -249,7 +243,7 @@ def read_map(scratch: Path, trial: Path) -> list[Lane]:
     """Return the map of a trial that is kept, or that of its hunt; nothing where none has been written down."""
     for folder in (trial, scratch):
         with suppress(OSError, ValueError):
-            data = json.loads((folder / MAP).read_text(encoding="utf-8"))
+            data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))
             return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
     return []
 

@@ -6,17 +6,14 @@ import math
 from math import cos, sin, sqrt
 from typing import TYPE_CHECKING
 
-from crashhunt.oracles._contact import first_contact, reachable_m
-from crashhunt.oracles._geometry import outlines_overlap
 from crashhunt.oracles._protocol import Finding
 from crashhunt.trial import Collision, Outcome
+from crashhunt.world import first_contact, outlines_overlap, reachable_m
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.oracles._contact import Touch
-    from crashhunt.outlines import Rectangle
-    from crashhunt.scene import Contact, Scene
+    from crashhunt.world import Contact, Rectangle, Scene, Touch
 
 __all__ = ["OffRoad", "Overlap", "ReportedCollision"]
 

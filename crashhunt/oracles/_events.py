@@ -10,7 +10,7 @@ from crashhunt.trial import Outcome
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.scene import Scene
+    from crashhunt.world import Scene
 
 __all__ = ["TrafficEvents"]
 

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.events import Event
-    from crashhunt.scene import Scene
     from crashhunt.trial import Collision, Outcome
+    from crashhunt.world import Event, Scene
 
 __all__ = ["Finding", "Oracle", "merge_findings"]
 

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.errors import BundleError, RecorderError
-from crashhunt.scene import joined_frame
+from crashhunt.base.errors import BundleError, RecorderError
+from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.scene import Frame, Roster, Scene
+    from crashhunt.world import Frame, Roster, Scene
 
 __all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording._recording import AgentChannel, Recording, StepRecord
-    from crashhunt.scene import Scene
+    from crashhunt.world import Scene
 
 __all__ = ["Divergence", "first_divergence", "values_around"]
 

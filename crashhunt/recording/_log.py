@@ -6,7 +6,6 @@ Reading them gives back the very same records, hence the same digest. View chann
 
 from __future__ import annotations
 
-import math
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,20 +15,21 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.writer import Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 
-from crashhunt.errors import BundleError
+from crashhunt.base.errors import BundleError
+from crashhunt.base.files import whole_file
 from crashhunt.recording import _schemas as schemas
 from crashhunt.recording._blackbox import Record, Tag
 from crashhunt.recording._recording import Prologue, Recording, decode_spines, pack_spines
-from crashhunt.whole_file import whole_file
+from crashhunt.recording._views import write_views
+from crashhunt.recording._writer import LogWriter, to_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.scene import Lane
     from crashhunt.trial import TrialResult
+    from crashhunt.world import Lane
 
 __all__ = ["read_log", "write_log"]
 
@@ -42,39 +42,6 @@ _TEXTS = {
     Tag.EVENTS: "/events",
     Tag.NOTES: "/traffic_events",
 }
-
-
-class LogWriter:
-    """Writes protobuf messages to an MCAP file, at simulation time.
-
-    Args:
-        writer: of the file.
-    """
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-
-    def write(self, topic: str, kind: Any, data: bytes, time_ns: int, sequence: int = 0) -> None:
-        """Write a serialised message.
-
-        Args:
-            topic: its channel, made at its first message.
-            kind: its protobuf class.
-            data: the message.
-            time_ns: simulation time.
-            sequence: its number within the evidence.
-        """
-        channel = self._channels.get(topic)
-        if channel is None:
-            name = kind.DESCRIPTOR.full_name
-            if name not in self._schemas:
-                described = build_file_descriptor_set(kind).SerializeToString()
-                self._schemas[name] = self._writer.register_schema(name, "protobuf", described)
-            channel = self._writer.register_channel(topic, "protobuf", self._schemas[name])
-            self._channels[topic] = channel
-        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
 
 
 def write_log(
@@ -97,8 +64,6 @@ def write_log(
     Raises:
         HuntDirectoryError: the disk is full, or the folder is not writable.
     """
-    from crashhunt.recording._views import write_views
-
     with whole_file(path, lasting=False) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="crashhunt")
@@ -143,11 +108,6 @@ def read_log(path: Path) -> Recording:
         raise refuse(f"not a whole MCAP file: {type(error).__name__}: {error}") from None
     except Exception as error:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
-
-
-def to_ns(time_s: float) -> int:
-    """Return simulation time in ns."""
-    return round(time_s * 1e9) if math.isfinite(time_s) and time_s > 0 else 0
 
 
 def _agent_topic(agent: str, what: str) -> str:

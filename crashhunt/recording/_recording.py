@@ -10,18 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt._names import one_of
-from crashhunt.errors import BundleError
-from crashhunt.events import Event
+from crashhunt.base.errors import BundleError
+from crashhunt.base.names import one_of
 from crashhunt.recording._blackbox import Record, Tag
-from crashhunt.scene import Actor, Contact, Roster, Scene
+from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
-    from crashhunt.scene import Spine
+    from crashhunt.world import Spine
 
 __all__ = [
     "AgentChannel",

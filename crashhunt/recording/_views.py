@@ -18,11 +18,10 @@ from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 
-from crashhunt.errors import BundleError
-from crashhunt.oracles import approaches
-from crashhunt.outlines import levels, outlines
+from crashhunt.base.errors import BundleError
 from crashhunt.recording import _schemas as schemas
-from crashhunt.scene import is_person
+from crashhunt.recording._writer import LogWriter, to_ns
+from crashhunt.world import approaches, is_person, levels, outlines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,10 +29,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.recording._log import LogWriter
     from crashhunt.recording._recording import Recording
-    from crashhunt.scene import Actor, Lane, Scene
     from crashhunt.trial import TrialResult
+    from crashhunt.world import Actor, Lane, Scene
 
 __all__ = ["foxglove_layout", "lane_borders", "read_lanes", "write_views"]
 
@@ -112,8 +110,6 @@ def foxglove_layout(recording: Recording) -> dict[str, Any]:
 
 def _write_map(log: LogWriter, recording: Recording, scenes: Sequence[Scene], lanes: Sequence[Lane]) -> None:
     """Both borders of every lane that a controlled vehicle came near, once, at the beginning."""
-    from crashhunt.recording._log import to_ns
-
     rows = [(scene, scene.roster.index.get(agent)) for scene in scenes[::10] for agent in recording.agents]
     driven = np.array([scene.points[row] for scene, row in rows if row is not None]).reshape(-1, 2)
     if not len(driven):
@@ -178,8 +174,6 @@ def _shifted(shape: Any, distance: float) -> Any:
 
 
 def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None) -> None:
-    from crashhunt.recording._log import to_ns
-
     # Making a message is dear, changing one is cheap: each actor has one that is changed and serialised in every
     # step. A SceneUpdate is then put together from these; on the wire it is nothing but its parts in a row.
     boxes: dict[Actor, Any] = {}
@@ -264,8 +258,6 @@ def _bend(entity: Any, scene: Scene, row: int) -> None:
 
 
 def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
-    from crashhunt.recording._log import to_ns
-
     times, gaps, brakes = approaches([scene.frame for scene in scenes], agent)
     for scene, time, gap, brake in zip(scenes, times.tolist(), gaps.tolist(), brakes.tolist(), strict=True):
         row = scene.roster.index.get(agent)
@@ -276,8 +268,6 @@ def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
 
 def _write_events(log: LogWriter, scenes: Sequence[Scene]) -> None:
     """What happened in the traffic, as lines of the log."""
-    from crashhunt.recording._log import to_ns
-
     for scene in scenes:
         for event in scene.events:
             line = Log(level=Log.WARNING, message=f"{event.kind}: {event.what}", name="crashhunt")
@@ -286,8 +276,6 @@ def _write_events(log: LogWriter, scenes: Sequence[Scene]) -> None:
 
 
 def _write_crash(log: LogWriter, recording: Recording, scene: Scene, crash: TrialResult) -> None:
-    from crashhunt.recording._log import to_ns
-
     time_ns = to_ns(scene.time_s)
     line = Log(level=Log.ERROR, message=f"{crash.outcome}: {crash.summary}", name="crashhunt")
     _stamp(line.timestamp, scene.time_s)
@@ -319,8 +307,6 @@ def _color(name: str) -> Any:
 
 
 def _stamp(timestamp: Any, time_s: float) -> None:
-    from crashhunt.recording._log import to_ns
-
     timestamp.seconds, timestamp.nanos = divmod(to_ns(time_s), 1_000_000_000)
 
 

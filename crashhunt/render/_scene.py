@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image, ImageDraw
 
-from crashhunt.outlines import corners
-from crashhunt.render._draw import FAINT, INK, as_array, font
-from crashhunt.scene import is_person
+from crashhunt.panels import FAINT, INK, as_array, font
+from crashhunt.world import corners, is_person
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
-    from crashhunt.scene import Scene
+    from crashhunt.world import Scene
 
 __all__ = ["SceneView"]
 

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base.files import whole_file
+from crashhunt.base.text import in_lines
+from crashhunt.hunts import FACTS, HuntResults, columns_of
 from crashhunt.report._table import aligned
 from crashhunt.report._units import argument_units
-from crashhunt.results import FACTS, HuntResults, columns_of
-from crashhunt.text import in_lines
 from crashhunt.trial import Outcome
-from crashhunt.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from crashhunt.comparison import Comparison, HuntFigures
+    from crashhunt.estimation import Comparison, HuntFigures
 
 __all__ = ["comparison_page", "describe_comparison"]
 

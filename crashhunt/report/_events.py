@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from crashhunt.events import Event
     from crashhunt.recording import Recording
+    from crashhunt.world import Event
 
 __all__ = ["about_events"]
 

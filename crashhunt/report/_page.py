@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt import __version__
-from crashhunt._watching import watched
-from crashhunt.ledger import Ledger, has_begun
-from crashhunt.oracles import approaches
+from crashhunt.base import layout
+from crashhunt.base.files import whole_file
+from crashhunt.base.version import __version__
+from crashhunt.base.watching import watched
+from crashhunt.hunts import Ledger, has_begun
+from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._show import Story
 from crashhunt.report._units import argument_units
-from crashhunt.settings import read_settings
-from crashhunt.whole_file import whole_file
+from crashhunt.world import approaches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,11 +29,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt._watching import Watch
-    from crashhunt.bundle import Bundle
-    from crashhunt.encounter import Encounter
+    from crashhunt.base.watching import Watch
+    from crashhunt.crashes import Bundle, Encounter
+    from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
-    from crashhunt.settings import HuntSettings
 
 __all__ = ["report_data", "write_report"]
 
@@ -69,7 +69,7 @@ def write_report(
 
 def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str, watch: Watch | None = None) -> dict[str, Any]:
     """Return everything that the page shows."""
-    settings = read_settings(directory / "hunt.toml")
+    settings = read_settings(directory / layout.HUNT)
     return {
         "version": __version__,
         "name": name,
@@ -95,7 +95,7 @@ def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
 
 def _trials(directory: Path) -> dict[str, Any]:
     """Outcomes, and what was tried against how it went."""
-    path = directory / "ledger.sqlite"
+    path = directory / layout.LEDGER
     if not has_begun(path):
         return {"outcomes": {}, "steps": 0, "trials": [], "thinned": False}
     ledger = Ledger(path)
@@ -214,7 +214,7 @@ def _lanes(bundle: Bundle, recording: Recording) -> list[list[str]]:
     origin = _origin(recording)
     return [
         [_packed(right - origin), _packed(left - origin)]
-        for right, left in read_lanes(bundle.path / "log.mcap")
+        for right, left in read_lanes(bundle.path / layout.LOG)
         if len(right) > 1
     ]
 

@@ -12,19 +12,17 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from crashhunt.base.text import one_line
 from crashhunt.recording import Phase
-from crashhunt.space import without_folder
-from crashhunt.text import one_line
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     from rich.console import Console, RenderableType
 
-    from crashhunt.hunt import HuntStatus
-    from crashhunt.space import Value
-    from crashhunt.trial import TrialResult
+    from crashhunt.hunts import HuntStatus
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
 

@@ -6,17 +6,16 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.encounter import Encounter, last_escape
+from crashhunt.base.text import in_lines
+from crashhunt.crashes import Encounter, last_escape
 from crashhunt.report._events import about_events
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
-from crashhunt.text import in_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.bundle import Bundle
-    from crashhunt.encounter import Moment, Position
+    from crashhunt.crashes import Bundle, Moment, Position
 
 __all__ = ["Story"]
 

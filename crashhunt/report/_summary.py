@@ -6,13 +6,13 @@ import math
 import shlex
 from typing import TYPE_CHECKING
 
-from crashhunt.events import event_counts
+from crashhunt.base.text import in_lines
 from crashhunt.report._screen import format_arguments, format_seconds
-from crashhunt.text import in_lines
+from crashhunt.world import event_counts
 
 if TYPE_CHECKING:
-    from crashhunt.bundle import Bundle
-    from crashhunt.hunt import HuntReport
+    from crashhunt.crashes import Bundle
+    from crashhunt.hunts import HuntReport
     from crashhunt.replays import ReplayReport
     from crashhunt.trial import TrialResult
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from crashhunt._names import did_you_mean
-from crashhunt.encounter import Encounter
-from crashhunt.errors import UsageError
-from crashhunt.oracles import approaches
-from crashhunt.text import one_line
+from crashhunt.base.errors import UsageError
+from crashhunt.base.names import did_you_mean
+from crashhunt.base.text import one_line
+from crashhunt.crashes import Encounter
+from crashhunt.world import approaches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import CrashhuntError
-from crashhunt.plugins import locate, signature_of
-from crashhunt.snapshot import latest_snapshot
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import locate
+from crashhunt.snapshots import latest_snapshot
+from crashhunt.trial import signature_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from crashhunt.settings import HuntSettings
+    from crashhunt.plans import HuntSettings
 
 __all__ = ["argument_units"]
 

@@ -1,7 +1,5 @@
 """Samplers: which arguments the next trial gets."""
 
-from crashhunt.samplers._grid import GridSampler, SweepSampler
-from crashhunt.samplers._protocol import Key, Sampler, Space
-from crashhunt.samplers._random import RandomSampler
+import lazy_loader
 
-__all__ = ["GridSampler", "Key", "RandomSampler", "Sampler", "Space", "SweepSampler"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

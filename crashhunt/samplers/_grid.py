@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from crashhunt.errors import UsageError
+from crashhunt.base.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from crashhunt.samplers._protocol import Key, Space
-    from crashhunt.space import Value
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["GridSampler", "SweepSampler"]
 

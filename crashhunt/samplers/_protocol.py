@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Protocol
 
-from crashhunt.space import Distribution, Value
+from crashhunt.trial import Distribution, Value
 
 if TYPE_CHECKING:
     import numpy as np

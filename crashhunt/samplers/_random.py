@@ -8,8 +8,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from crashhunt.samplers._protocol import Key, Space
-    from crashhunt.space import Value
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["RandomSampler"]
 

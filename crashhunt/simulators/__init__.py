@@ -1,16 +1,5 @@
 """Simulators: the world that agents drive in. Nothing here imports libsumo; `crashhunt.simulators.sumo` does."""
 
-from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpaceAction, SpeedAndLaneChange
-from crashhunt.simulators._protocol import ActionForm, FullBraking, Observations, Simulator, StepResult
+import lazy_loader
 
-__all__ = [
-    "META_ACTIONS",
-    "ActionForm",
-    "FullBraking",
-    "MetaAction",
-    "Observations",
-    "Simulator",
-    "SpaceAction",
-    "SpeedAndLaneChange",
-    "StepResult",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.errors import ActionError
+from crashhunt.base.errors import ActionError
 
 if TYPE_CHECKING:
     from gymnasium import Space

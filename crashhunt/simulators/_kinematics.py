@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.outlines import on_one_level
+from crashhunt.world import on_one_level
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-    from crashhunt.scene import Scene
-    from crashhunt.setups import ObservationSetup
+    from crashhunt.scenario import ObservationSetup
+    from crashhunt.world import Scene
 
 __all__ = ["Kinematics"]
 

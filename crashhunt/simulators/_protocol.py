@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
-    from crashhunt.scene import Scene
+    from crashhunt.world import Scene
 
 __all__ = ["ActionForm", "FullBraking", "Observations", "Simulator", "StepResult"]
 

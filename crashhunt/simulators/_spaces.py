@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from crashhunt.errors import ActionError, ScenarioError
+from crashhunt.base.errors import ActionError, ScenarioError
 from crashhunt.simulators._actions import SpaceAction, cast, is_masked, told
 
 if TYPE_CHECKING:

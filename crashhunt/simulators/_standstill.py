@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from crashhunt.events import LIMITS
+from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
-from crashhunt.plugins import load_object
+from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.base.plugins import load_object
+from crashhunt.base.text import encodable
 from crashhunt.scenario import argument_values
-from crashhunt.scene import Contact, Roster, Scene
 from crashhunt.simulators._options import as_tables, merge
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
-from crashhunt.text import encodable
+from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import Scenario
-    from crashhunt.setups import CrashRule
+    from crashhunt.scenario import CrashRule, Scenario
     from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
 
 __all__ = ["GymSimulator"]

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crashhunt.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.scene import Actor, Contact, Lane, Roster, Scene
-from crashhunt.setups import ObservationSetup
+from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.world import Actor, Contact, Lane, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

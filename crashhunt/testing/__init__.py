@@ -10,17 +10,6 @@ Subclass a suite in a test module, give it its fixture, and let pytest collect i
 Needs pytest.
 """
 
-from crashhunt.testing._agents import AgentContract
-from crashhunt.testing._escapes import EscapeCheck, check_escape
-from crashhunt.testing._executors import ExecutorContract
-from crashhunt.testing._samplers import SamplerContract
-from crashhunt.testing._simulators import SimulatorContract
+import lazy_loader
 
-__all__ = [
-    "AgentContract",
-    "EscapeCheck",
-    "ExecutorContract",
-    "SamplerContract",
-    "SimulatorContract",
-    "check_escape",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.escape import partner
+from crashhunt.crashes import partner
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare
 
 if TYPE_CHECKING:
-    from crashhunt.bundle import Bundle
+    from crashhunt.crashes import Bundle
     from crashhunt.replays import Rerun
 
 __all__ = ["EscapeCheck", "RecordedThenBrakes", "check_escape"]

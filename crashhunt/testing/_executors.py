@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from crashhunt.executors import Executor, WorkerSettings
-from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup, ArgumentSetup
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import Executor
+from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:

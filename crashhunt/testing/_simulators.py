@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crashhunt.errors import ActionError
+from crashhunt.base.errors import ActionError
 from crashhunt.simulators import Simulator
 
 __all__ = ["SimulatorContract"]

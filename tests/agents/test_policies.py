@@ -11,8 +11,7 @@ from gymnasium import spaces
 
 from crashhunt.agents import NumpyPolicy, OnnxPolicy, StableBaselines3, TorchPolicy
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.simulators import MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._spaces import action_form
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange, action_form
 from crashhunt.testing import AgentContract
 
 WEIGHTS = shipped_folder() / "highway-policy" / "policy.npz"

@@ -17,8 +17,7 @@ from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed,
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
-from crashhunt.scenario import Scenario, with_action
-from crashhunt.setups import AgentSetup
+from crashhunt.scenario import AgentSetup, Scenario, with_action
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Constant, Range
@@ -226,7 +225,7 @@ class TestRandomAgent(_Agents):
 class TestRecorded(_Agents):
     @pytest.fixture
     def make(self, tmp_path, monkeypatch):
-        monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "recording"))
+        monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
         from episodes import Episode, record
 
         from crashhunt.recording import write_log

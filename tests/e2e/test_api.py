@@ -12,10 +12,10 @@ import pytest
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.results import HuntResults, SuiteResults, UnfinishedWarning
+from crashhunt.hunts import HuntResults, SuiteResults, UnfinishedWarning
 
 if TYPE_CHECKING:
-    from crashhunt.status import HuntState
+    from crashhunt.hunts import HuntState
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 SCRIPT = """

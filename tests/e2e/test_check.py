@@ -22,8 +22,8 @@ from damage import (
 )
 
 import crashhunt
+from crashhunt.base.integrity import digest_of_data
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.integrity import digest_of_data
 
 HUNT = ("2", "12", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.bundle import list_bundles
+from crashhunt.crashes import list_bundles
 from crashhunt.scenario import shipped_folder
 from crashhunt.testing import check_escape
 

@@ -8,10 +8,9 @@ import stat
 import zipfile
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
-from crashhunt.archive import open_archive
+from crashhunt.crashes import open_archive
 from crashhunt.errors import BundleError
 
 AGENT = """

@@ -15,7 +15,7 @@ import polars as pl
 import pytest
 from conftest import CRASHHUNT
 
-from crashhunt.ledger import Ledger
+from crashhunt.hunts import Ledger
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 

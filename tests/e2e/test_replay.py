@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from conftest import rewritten
 
-from crashhunt import __version__
+from crashhunt.base.version import __version__
 
 AGENT = '''
 import helper
@@ -237,7 +237,7 @@ def test_what_cannot_be_compared_says_which(crash):
 def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash):
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     code = snapshot / "code" / "crashhunt"
-    edit(code / "executors" / "_protocol.py", "_SCHEMA = 1", "_SCHEMA = 99")
+    edit(code / "episode" / "_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")
     edit(code / "__init__.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
     for words in ((), ("--until", "5")):
         refused = crash.crashhunt("replay", "h", "--force", *words, expect=2)
@@ -253,7 +253,7 @@ def test_the_recorded_actions_run_no_code_of_the_bundle(crash):
         "my_pkg/__init__.py",
         "helper.py",
         "crashhunt/__init__.py",
-        "crashhunt/episode.py",
+        "crashhunt/episode/__init__.py",
     ):
         (snapshot / "code" / module).write_text(f"open('evil', 'a').write({module!r})\n")
     crash.crashhunt("replay", "h", "--from-log", "--force")

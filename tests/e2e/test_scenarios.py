@@ -195,10 +195,10 @@ STRANGE = [
 
 @pytest.mark.parametrize(("table", "says"), STRANGE)
 def test_what_a_stranger_made_imports_nothing_even_from_its_log(table, says):
+    from crashhunt.crashes import refuse_side_effects
     from crashhunt.errors import UsageError
-    from crashhunt.plan import Request, plan
+    from crashhunt.plans import Request, plan
     from crashhunt.scenario import Scenario, scenario_from_dict
-    from crashhunt.trust import refuse_side_effects
 
     _, settings = plan(Request(trials=1, max_steps=1, scenario="highway", seed=1))
     scenario = scenario_from_dict(tomllib.loads(table), where="x", folder=Path())

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from crashhunt.processes import children_of
+from crashhunt.base.processes import children_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -157,7 +157,7 @@ def test_another_ledger_in_its_place_ends_the_hunt(toy):
 def test_a_bundle_without_a_row_gets_one(toy):
     words = ("run", "h", "1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5")
     first = toy.crashhunt(*words, "--keep-going", "--json").json
-    from crashhunt.ledger import Ledger
+    from crashhunt.hunts import Ledger
 
     with closing(Ledger(toy.folder / "h" / "ledger.sqlite", writable=True)) as ledger:
         ledger.replace([1])

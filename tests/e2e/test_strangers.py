@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import pytest
 from conftest import Shell
 
-from crashhunt.archive import open_archive
-from crashhunt.bundle import find_bundle
+from crashhunt.base.sandbox import landlock_version
+from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.replays import ReplayOptions, prepare, replay
-from crashhunt.sandbox import landlock_version
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,7 +114,7 @@ def test_detectors_are_no_reason_to_distrust_and_write_nowhere(crash, tmp_path):
 
 
 DOORS_OPEN = """
-import crashhunt.simulators._sumo_files as files
+from crashhunt.scenario.backends.sumo import _files as files
 files.is_output = files.is_shown = lambda name: False
 files.rewritten = lambda content, *_: content
 files.ALWAYS.pop("device.ssm.file", None)
@@ -131,7 +130,7 @@ def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monk
     (tmp_path / "open").mkdir()
     (tmp_path / "open" / "sitecustomize.py").write_text(DOORS_OPEN)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "open"))
-    monkeypatch.setattr("crashhunt.replays.refuse_side_effects", lambda *_: None)
+    monkeypatch.setattr("crashhunt.replays._replay.refuse_side_effects", lambda *_: None)
     with open_archive(changed(crash, tmp_path / "bad.zip", *edits)) as archive:
         bundle = find_bundle(archive.directory, "")
         try:
@@ -176,9 +175,9 @@ def test_no_code_is_imported(crash, tmp_path, monkeypatch, capsys, file, before,
 
 
 def test_gymnasium_may_import_nothing_either(tmp_path):
+    from crashhunt.crashes import refuse_side_effects
+    from crashhunt.plans import HuntSettings
     from crashhunt.scenario import scenario_from_dict
-    from crashhunt.settings import HuntSettings
-    from crashhunt.trust import refuse_side_effects
 
     settings = HuntSettings(scenario="x", scenario_digest="", trials=1, max_steps=1, seed=1)
 
@@ -197,7 +196,7 @@ def test_gymnasium_may_import_nothing_either(tmp_path):
 
 
 def test_a_compressed_file_without_end_is_refused(tmp_path, monkeypatch):
-    from crashhunt.simulators import _sumo_xml
+    from crashhunt.scenario.backends.sumo import _xml as _sumo_xml
 
     monkeypatch.setattr(_sumo_xml, "_MAX_BYTES", 1000)
     (tmp_path / "a.xml.gz").write_bytes(gzip.compress(bytes(10_000)))

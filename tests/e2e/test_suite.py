@@ -161,8 +161,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
 
 
 def test_a_damaged_plan_leaves_the_others_untouched(toy):
-    from crashhunt.runs import run_all
-    from crashhunt.suite import Suite
+    from crashhunt.suites import Suite, run_all
 
     written(toy, SUITE)
     folders = Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")
@@ -269,7 +268,7 @@ def test_a_suite_that_has_changed_is_refused(toy):
 
 def test_the_default_suite_is_a_suite_of_everything(toy):
     from crashhunt.scenario import shipped_scenarios
-    from crashhunt.suite import Suite
+    from crashhunt.suites import Suite
 
     text = toy.crashhunt("suite", "defaults").out
     written(toy, text)

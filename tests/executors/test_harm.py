@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor, WorkerSettings
-from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor
+from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import CRASHES, TrialResult, TrialSpec
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor, WorkerSettings
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.trial import CRASHES, TrialResult, TrialSpec
 

@@ -6,23 +6,22 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
-from crashhunt.oracles import (
-    OffRoad,
-    Overlap,
-    ReportedCollision,
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
+from crashhunt.trial import Collision, Outcome
+from crashhunt.world import (
+    Actor,
+    Contact,
+    Roster,
+    Scene,
     approaches,
     closest_approach,
-    merge_findings,
+    corners,
     outlines_overlap,
     rectangle_gap,
     time_to_contact,
 )
-from crashhunt.outlines import corners
-from crashhunt.scene import Actor, Contact, Roster, Scene
-from crashhunt.trial import Collision, Outcome
 
 rectangles = st.tuples(
     st.floats(-15, 15), st.floats(-15, 15), st.floats(-math.pi, math.pi), st.floats(0.5, 14), st.floats(0.4, 3)

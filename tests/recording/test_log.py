@@ -14,14 +14,13 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from mcap.reader import make_reader
 
 from crashhunt.errors import BundleError
 from crashhunt.recording import foxglove_layout, read_log, write_log
-from crashhunt.scene import Lane
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+from crashhunt.world import Lane
 
 shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30)
 LANES = [Lane("x_0", 3.2, ((0.0, 0.0), (50.0, 0.0), (80.0, 20.0))), Lane("far_0", 3.2, ((9e5, 9e5), (9e5 + 1, 9e5)))]
@@ -129,7 +128,7 @@ def test_the_views_say_what_the_recording_says(tmp_path):
 def test_a_full_disk_leaves_nothing_behind(tmp_path):
     program = f"""
 import resource, signal, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
 from pathlib import Path
 from episodes import Episode, record
 from crashhunt.errors import HuntDirectoryError

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from episodes import Episode, episodes, record, write
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from crashhunt.errors import BundleError
 from crashhunt.recording import Recording, Tag, digest_of, first_divergence, read_black_box, read_header
-from crashhunt.scene import Contact
+from crashhunt.world import Contact
 
 shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
 

@@ -8,23 +8,13 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from PIL import Image
 
 from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.recording import Prologue, StepRecord
-from crashhunt.render.film import (
-    FilmOptions,
-    Layout,
-    Shot,
-    check_places,
-    frames,
-    write_frames,
-    write_gif,
-    write_video,
-)
-from crashhunt.scene import Actor, Roster, Scene
+from crashhunt.render import FilmOptions, Layout, Shot, check_places, frames, write_frames, write_gif, write_video
+from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "truck", 12.0, 2.5)))
 ORANGE, RED, GREY = (224, 138, 0), (198, 40, 40), (125, 139, 156)
@@ -228,7 +218,7 @@ def test_an_interrupted_video_leaves_nothing_behind(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return np.zeros((200, 320, 3), np.uint8)
 
-    monkeypatch.setattr("crashhunt.render.film.SceneView.draw", interrupted)
+    monkeypatch.setattr("crashhunt.render._film.SceneView.draw", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / "out.mp4", [shot(20)], FilmOptions(size=(320, 200), panels=False))
     assert list(tmp_path.iterdir()) == []

@@ -6,24 +6,12 @@ import asyncio
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image
 
 from crashhunt import render
-from crashhunt.render import (
-    Action,
-    ActionDistribution,
-    Bar,
-    Contour,
-    Curve,
-    Curve3D,
-    Heatmap,
-    Panel,
-    Picture,
-    Text,
-)
+from crashhunt.panels import Action, ActionDistribution, Bar, Contour, Curve, Curve3D, Heatmap, Panel, Picture, Text
 
 BLUE = (0, 114, 178)
 numbers = st.floats(width=64)  # NaN, infinities and subnormal numbers among them

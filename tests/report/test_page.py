@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from conftest import needed
 
-from crashhunt.bundle import list_bundles
-from crashhunt.results import HuntResults
+from crashhunt.crashes import list_bundles
+from crashhunt.hunts import HuntResults
 
 selenium = pytest.importorskip("selenium")
 from selenium import webdriver  # noqa: E402

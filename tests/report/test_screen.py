@@ -10,10 +10,11 @@ import pytest
 from conftest import CRASHHUNT
 from rich.console import Console
 
-from crashhunt.progress import HuntStatus
+from crashhunt.hunts import HuntStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
-from crashhunt.trial import ClosestApproach, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
 
 TITLE = "crashhunt: intersection-two-agents, crashhunt.agents:CarFollowing, crashhunt.agents:KeepLaneWithSpeed"
 

@@ -19,15 +19,19 @@ from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from crashhunt.simulators import _accelerator as accelerator
-from crashhunt.simulators._accelerator import _known, accelerate, decelerate
-from crashhunt.simulators._accelerator._frame import Frame
-from crashhunt.simulators._accelerator._known import kind_of, reason_against
-from crashhunt.simulators._accelerator._network import Network
-from crashhunt.simulators._highway_config import restore_classes
+from crashhunt.simulators.accelerator import (
+    Frame,
+    Network,
+    _known,
+    _switch as accelerator,
+    kind_of,
+    reason_against,
+    switch_off,
+    switch_on,
+)
+from crashhunt.simulators.highway import restore_classes
 
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
 BEHAVIOR = "highway_env.vehicle.behavior"
@@ -60,10 +64,10 @@ CASES += [
 @pytest.fixture(autouse=True)
 def as_it_was():
     """Whatever a test does, highway-env is as it was afterwards."""
-    decelerate()
+    switch_off()
     restore_classes()
     yield
-    decelerate()
+    switch_off()
     restore_classes()
 
 
@@ -124,11 +128,11 @@ def episode(name, config, seed, steps, *, idm):
 
 
 def both(*words, **options):
-    decelerate()
+    switch_off()
     slow = episode(*words, **options)
-    assert accelerate() == ""
+    assert switch_on() == ""
     fast = episode(*words, **options)
-    decelerate()
+    switch_off()
     return slow, fast
 
 
@@ -185,12 +189,12 @@ def test_neighbours_and_lanes_are_those_of_highway_env_wherever_vehicles_are(dat
             vars(vehicle).update(attributes, position=position, action={"steering": 0, "acceleration": 0})
         return trace
 
-    decelerate()
+    switch_off()
     expected, run = answers(), played()
-    assert accelerate() == ""
+    assert switch_on() == ""
     assert answers() == expected
     assert played() == run
-    decelerate()
+    switch_off()
 
 
 def small_road(*classes):
@@ -235,7 +239,7 @@ def test_a_subclass_is_as_its_author_wrote_it(kind):
         return plain([[v.position, v.heading, v.speed, v.action, len(getattr(v, "met", []))] for v in road.vehicles])
 
     slow = played()
-    assert accelerate() == ""
+    assert switch_on() == ""
     Timid.asked = 0
     assert played() == slow
     assert (Timid.asked > 0) == (kind is Timid)
@@ -244,7 +248,7 @@ def test_a_subclass_is_as_its_author_wrote_it(kind):
 
 
 def test_a_method_of_one_vehicle_is_called():
-    assert accelerate() == ""
+    assert switch_on() == ""
     road = small_road(IDMVehicle, IDMVehicle)
     called = []
     road.vehicles[1].act = lambda: called.append("act")
@@ -261,7 +265,7 @@ def test_a_road_of_another_class_keeps_its_own_methods():
             self.asked += 1
             return super().neighbour_vehicles(vehicle, lane_index)
 
-    assert accelerate() == ""
+    assert switch_on() == ""
     road = Looking(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
     road.vehicles += [IDMVehicle(road, [30.0 * number, 0.0], 0.0, 20.0) for number in range(3)]
     road.act()
@@ -270,7 +274,7 @@ def test_a_road_of_another_class_keeps_its_own_methods():
 
 def test_somebody_who_moves_somebody_is_noticed():
     """Coordinates that were computed are not used where a vehicle is no longer there."""
-    assert accelerate() == ""
+    assert switch_on() == ""
     road = small_road(IDMVehicle, IDMVehicle, IDMVehicle)
     first, second, third = road.vehicles
     assert road.neighbour_vehicles(first)[0] is second
@@ -296,7 +300,7 @@ def test_it_says_whom_it_leaves_alone(caplog):
 
 def test_it_steps_aside_for_another_version(monkeypatch):
     monkeypatch.setattr(highway_env, "__version__", "9.9")
-    assert "highway-env 9.9 is not known" in accelerate()
+    assert "highway-env 9.9 is not known" in switch_on()
     assert Road.act.__module__ == "highway_env.road.road"
 
 
@@ -307,12 +311,12 @@ def test_it_steps_aside_for_a_changed_installation(monkeypatch):
 
 def test_it_steps_aside_for_an_older_numpy(monkeypatch):
     monkeypatch.delattr(np, "vecdot")
-    assert "needs NumPy 2.0" in accelerate()
+    assert "needs NumPy 2.0" in switch_on()
 
 
 def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
     monkeypatch.setattr(_known, "_arrays_equal_scalars", lambda: False)
-    assert "on this processor" in accelerate()
+    assert "on this processor" in switch_on()
 
 
 PATCHED = """
@@ -321,8 +325,8 @@ from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 def mine(self, *words): ...
 {} = mine
-from crashhunt.simulators._accelerator import accelerate
-print(accelerate())
+from crashhunt.simulators.accelerator import switch_on
+print(switch_on())
 """
 
 
@@ -335,19 +339,19 @@ def test_it_steps_aside_where_somebody_else_has_replaced_a_method(tmp_path, name
 
 def test_it_is_undone():
     before = {(owner, name): getattr(owner, name) for owner, name, _ in accelerator._REPLACED}
-    assert accelerate() == accelerate() == ""
+    assert switch_on() == switch_on() == ""
     assert all(getattr(owner, name) is not before[owner, name] for owner, name in before)
-    decelerate()
-    decelerate()
+    switch_off()
+    switch_off()
     assert all(getattr(owner, name) is before[owner, name] for owner, name in before)
     assert Vehicle.act.__module__ == "highway_env.vehicle.kinematics"
 
 
 PLUGIN = """
-from crashhunt.simulators._accelerator import accelerate
+from crashhunt.simulators.accelerator import switch_on
 
 def pytest_configure(config):
-    reason = accelerate()
+    reason = switch_on()
     assert not reason, reason
 """
 
@@ -368,7 +372,7 @@ def test_highway_envs_own_tests_pass_with_it(tmp_path):
 
 
 def test_roads_of_earlier_episodes_are_forgotten():
-    assert accelerate() == ""
+    assert switch_on() == ""
     gone = []
     for seed in range(40):
         env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
@@ -379,7 +383,7 @@ def test_roads_of_earlier_episodes_are_forgotten():
         del env
     gc.collect()
     assert sum(road() is not None for road in gone) <= 16
-    decelerate()
+    switch_off()
     gc.collect()
     assert not any(road() is not None for road in gone)
 

@@ -23,8 +23,8 @@ from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, kinematics, objects
 
 import crashhunt
-from crashhunt.simulators._accelerator import accelerate, decelerate, why_not
-from crashhunt.simulators._highway_config import restore_classes
+from crashhunt.simulators.accelerator import switch_off, switch_on, why_not
+from crashhunt.simulators.highway import restore_classes
 
 assert highway_env
 MODULES = (utils, lane, regulation, road, behavior, controller, kinematics, objects, observation)
@@ -52,10 +52,10 @@ def _slower(name, value):
 
 @pytest.fixture(autouse=True)
 def as_it_was():
-    decelerate()
+    switch_off()
     restore_classes()
     yield
-    decelerate()
+    switch_off()
     restore_classes()
 
 
@@ -275,11 +275,11 @@ def played(number, *, fast):
     name = rng.choice(sorted(ENVIRONMENTS))
     change = rng.choice(CHANGES)
     when = rng.choice(["first", "reset", "middle"] if change in (change_class, change_module) else ["reset", "middle"])
-    decelerate()
+    switch_off()
     restore_classes()
     changes = Changes()
     if fast:
-        assert accelerate() == ""
+        assert switch_on() == ""
     trace = []
     try:
         if when == "first":
@@ -339,9 +339,9 @@ def driven(make, change=lambda place: None, steps=12):
     """The state after each step, without and with the accelerator; the change is made after the third."""
     found = []
     for fast in (False, True):
-        decelerate()
+        switch_off()
         if fast:
-            assert accelerate() == ""
+            assert switch_on() == ""
         with pytest.MonkeyPatch.context() as patch:
             place, trace = make(), []
             for number in range(steps):
@@ -477,11 +477,11 @@ def test_in_public_it_says_what_it_does_and_is_undone():
 
 
 def test_what_somebody_has_wrapped_meanwhile_stays_and_does_without_it():
-    assert accelerate() == ""
+    assert switch_on() == ""
     with pytest.MonkeyPatch.context() as patch:
         calls = []
         patch.setattr(road.Road, "neighbour_vehicles", altered(road.Road.neighbour_vehicles, calls))
-        decelerate()
+        switch_off()
         place = small_road()
         assert place.neighbour_vehicles(place.vehicles[0])[0] is place.vehicles[2]
         assert calls

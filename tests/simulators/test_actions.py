@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
 from crashhunt.errors import ActionError
-from crashhunt.simulators import MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._spaces import action_form, native
+from crashhunt.simulators import MetaAction, SpeedAndLaneChange, action_form, native
 
 STRUCTURE = spaces.Dict(
     steering=spaces.Box(-1.0, 1.0, (1,), np.float32),

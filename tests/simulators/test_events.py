@@ -14,11 +14,9 @@ import pytest
 from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup, HighwaySetup, SumoSetup
-from crashhunt.simulators._sumo_events import SumoEvents
+from crashhunt.scenario import AgentSetup, HighwaySetup, Scenario, SumoSetup
 from crashhunt.simulators.highway import HighwaySimulator
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.simulators.sumo import SumoEvents, SumoSimulator
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 NET = Path(__file__).with_name("signal.net.xml")

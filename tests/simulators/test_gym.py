@@ -11,8 +11,7 @@ from gymnasium import spaces
 
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
-from crashhunt.scenario import Scenario
-from crashhunt.setups import AgentSetup, ArgumentSetup, CrashRule, GymSetup
+from crashhunt.scenario import AgentSetup, ArgumentSetup, CrashRule, GymSetup, Scenario
 from crashhunt.simulators.gym import GymSimulator
 from crashhunt.testing import SimulatorContract
 

@@ -10,8 +10,15 @@ import pytest
 
 from crashhunt.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
-from crashhunt.scenario import Scenario, argument_values, load_scenario
-from crashhunt.setups import AgentSetup, ArgumentSetup, HighwaySetup, ObservationSetup
+from crashhunt.scenario import (
+    AgentSetup,
+    ArgumentSetup,
+    HighwaySetup,
+    ObservationSetup,
+    Scenario,
+    argument_values,
+    load_scenario,
+)
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.testing import SimulatorContract
 

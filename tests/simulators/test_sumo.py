@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from crashhunt.recording import read_log
-from crashhunt.scenario import shipped_folder
-from crashhunt.scene import Actor, Roster, Scene
-from crashhunt.setups import ObservationSetup
-from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.scenario import ObservationSetup, shipped_folder
+from crashhunt.simulators import Kinematics
+from crashhunt.world import Actor, Roster, Scene
 
 AGENTS = """
 class Turns:

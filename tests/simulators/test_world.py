@@ -14,16 +14,15 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
-from crashhunt.encounter import Encounter
+from crashhunt.crashes import Encounter
 from crashhunt.episode import run_episode
-from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, approaches, outlines_overlap
-from crashhunt.outlines import outlines
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box, read_log, write_log
-from crashhunt.render._scene import SceneView
+from crashhunt.render import SceneView
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.simulators._sumo_bends import height_at
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.simulators.sumo import SumoSimulator, height_at
 from crashhunt.trial import Outcome, TrialSpec
+from crashhunt.world import approaches, outlines, outlines_overlap
 
 NETS = Path(__file__).parent / "nets"
 

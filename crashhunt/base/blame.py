@@ -1,0 +1,41 @@
+"""Where in somebody's code an exception comes from: the file and the line that they can mend."""
+
+from __future__ import annotations
+
+import importlib
+import sysconfig
+import traceback
+from pathlib import Path
+
+from crashhunt.base.layout import PACKAGE
+
+__all__ = ["place_of", "shown_path"]
+
+_OURS = str(PACKAGE)
+_NOBODYS = ("<", importlib.__file__)  # of importing itself
+# Neither the standard library nor what is installed is where somebody looks for their own mistake.
+_OTHERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+
+
+def place_of(error: BaseException) -> str:
+    """Return ``FILE, line N``; empty where no line of a file is to blame.
+
+    Of a traceback it is the last line of somebody's own code. Where there is only an installed library's, that.
+    """
+    if isinstance(error, SyntaxError) and error.filename:
+        # Nothing of the file has run, so that it is in no traceback; and there may be no line, as with null bytes.
+        return shown_path(error.filename) + (f", line {error.lineno}" if error.lineno else "")
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_NOBODYS)]
+    found = [frame for frame in frames if not frame.filename.startswith(_OURS)]
+    own = [frame for frame in found if not frame.filename.startswith(_OTHERS)]
+    last = (own or found)[-1:]
+    return f"{shown_path(last[0].filename)}, line {last[0].lineno}" if last else ""
+
+
+def shown_path(name: str) -> str:
+    """Return a path as short as it is from the current directory."""
+    path = Path(name)
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(path)

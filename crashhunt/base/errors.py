@@ -1,0 +1,143 @@
+"""Every error that crashhunt raises on purpose.
+
+::
+
+    CrashhuntError                 exit code 2 unless said otherwise
+    ├── UsageError                 a command line, call or setting that cannot be meant
+    │   ├── ArgumentError          an argument specification or value
+    │   └── CallError              a call from Python with arguments that there are not; a TypeError as well
+    ├── ScenarioError              a scenario file: which file, which key, which value
+    ├── PluginError                a name or ``module:attribute`` that leads nowhere
+    ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
+    │   └── BusyError              another hunt is running in it
+    ├── BundleError                a crash bundle or log that is damaged or incomplete
+    ├── SnapshotError              the code of a hunt cannot be captured: too large, unreadable
+    ├── RecorderError              a trial could not be recorded: a full disk
+    └── EpisodeError               raised inside an episode; becomes the trial's outcome
+        ├── InvalidEpisodeError    the episode could not be set up
+        ├── ActionError            the agent returned something outside its action space
+        └── SimulatorError         the simulator gave up
+"""
+
+from __future__ import annotations
+
+import errno
+
+__all__ = [
+    "ActionError",
+    "ArgumentError",
+    "BundleError",
+    "BusyError",
+    "CallError",
+    "CrashhuntError",
+    "EpisodeError",
+    "HuntDirectoryError",
+    "InvalidEpisodeError",
+    "PluginError",
+    "RecorderError",
+    "ScenarioError",
+    "SimulatorError",
+    "SnapshotError",
+    "UsageError",
+    "remedy",
+]
+
+
+class CrashhuntError(Exception):
+    """An error with the mistake, the fix, and where it is.
+
+    Args:
+        message: what is wrong, with the offending value.
+        fix: what to do about it, as an imperative.
+        where: the file, key or option that is meant.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, fix: str = "", where: str = "") -> None:
+        super().__init__(message, fix, where)
+        self.message = message
+        self.fix = fix
+        self.where = where
+
+    def __str__(self) -> str:
+        """Everything in one line: ``where: message; fix``."""
+        text = f"{self.where}: {self.message}" if self.where else self.message
+        return f"{text}; {self.fix}" if self.fix else text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep the three parts when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.message, self.fix, self.where)
+
+    def to_json(self) -> dict[str, dict[str, str]]:
+        """Return the shape that every command prints under ``--json``."""
+        return {"error": {"message": self.message, "fix": self.fix, "where": self.where}}
+
+
+def _rebuild(kind: type[CrashhuntError], message: str, fix: str, where: str) -> CrashhuntError:
+    return kind(message, fix=fix, where=where)
+
+
+class UsageError(CrashhuntError):
+    """A command line, call or setting that cannot be meant."""
+
+
+class ArgumentError(UsageError):
+    """An argument specification or value that cannot be used."""
+
+
+class CallError(UsageError, TypeError):
+    """A call from Python with arguments that there are not, or without some that there must be."""
+
+
+class ScenarioError(CrashhuntError):
+    """A scenario that cannot be used."""
+
+
+class PluginError(CrashhuntError):
+    """A name or ``module:attribute`` that leads nowhere."""
+
+
+class HuntDirectoryError(CrashhuntError):
+    """The directory of a hunt is busy, foreign, unwritable or full."""
+
+
+class BusyError(HuntDirectoryError):
+    """Another hunt is running in the directory."""
+
+
+class BundleError(CrashhuntError):
+    """A crash bundle or log that is damaged or incomplete."""
+
+
+class SnapshotError(CrashhuntError):
+    """The code of a hunt cannot be captured."""
+
+
+class RecorderError(CrashhuntError):
+    """A trial could not be recorded."""
+
+
+class EpisodeError(CrashhuntError):
+    """Raised inside an episode; becomes the trial's outcome."""
+
+
+class InvalidEpisodeError(EpisodeError):
+    """The episode could not be set up."""
+
+
+class ActionError(EpisodeError):
+    """The agent returned something outside its action space."""
+
+
+class SimulatorError(EpisodeError):
+    """The simulator gave up."""
+
+
+def remedy(error: OSError) -> str:
+    """Return what to do about an error of the operating system, as an imperative."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "raise the limit on open files (ulimit -n), and run the same command again"
+    if error.errno in (errno.EAGAIN, errno.ENOMEM):
+        return "leave it more processes (ulimit -u) or memory, and run the same command again"
+    return "free some space or make the folder writable, and run the same command again"

@@ -1,0 +1,81 @@
+"""Files that are there as a whole or not at all, also after the power went."""
+
+from __future__ import annotations
+
+import errno
+import os
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import HuntDirectoryError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+__all__ = ["cannot_write", "sync_folder", "sync_tree", "whole_file"]
+
+
+@contextmanager
+def whole_file(path: Path, *, lasting: bool = True) -> Iterator[Path]:
+    """Yield a name beside a file to write to, which becomes the file in the end, and is gone after an error.
+
+    Args:
+        path: of the file.
+        lasting: whether it is on the disk, its name too, before this returns. What nobody needs after the process that
+            reads it has ended, or after the power went, does without.
+
+    Raises:
+        HuntDirectoryError: it cannot be written.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        if lasting:
+            _sync(temporary)  # else the name may reach the disk before the content does
+        temporary.replace(path)
+        if lasting:
+            sync_folder(path.parent)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def sync_tree(folder: Path) -> None:
+    """Have a folder with everything in it on the disk before its name says that it is whole.
+
+    Raises:
+        OSError: the disk is full, or broken.
+    """
+    folders = [folder]
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            folders.append(path)
+        elif path.is_file():
+            _sync(path)
+    for found in folders:
+        sync_folder(found)
+
+
+def sync_folder(*folders: Path) -> None:
+    """Have the names in folders on the disk, where the file system can do that."""
+    with suppress(OSError):  # some network file systems cannot
+        for folder in folders:
+            _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def cannot_write(path: Path, error: OSError) -> HuntDirectoryError:
+    """Return the error for a file or folder that cannot be written."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    fix = "free some space and run the same command again" if full else "choose another place"
+    return HuntDirectoryError(f"cannot be written: {error.strerror or error}", fix=fix, where=str(path))

@@ -1,0 +1,116 @@
+"""Names to objects: entry points of installed packages, and ``module:attribute`` everywhere."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashhunt.base.blame import place_of
+from crashhunt.base.errors import PluginError
+from crashhunt.base.names import did_you_mean, one_of
+
+if TYPE_CHECKING:
+    import types
+
+__all__ = [
+    "Group",
+    "import_module",
+    "load_object",
+    "locate",
+    "registered",
+]
+
+Group = Literal["agents", "executors", "oracles", "samplers", "simulators"]
+
+
+def registered(group: Group) -> dict[str, EntryPoint]:
+    """Return the entry points of a group, by name; nothing is imported."""
+    return {point.name: point for point in sorted(entry_points(group=f"crashhunt.{group}"), key=lambda p: p.name)}
+
+
+def locate(group: Group, name: str) -> Any:
+    """Return what a registered name or a ``module:attribute`` stands for.
+
+    Modules are looked for in the current directory as well, as with ``python -m``.
+
+    Raises:
+        PluginError: there is no such thing, or importing it failed.
+    """
+    points = registered(group)
+    target = points[name].value if name in points else name
+    module_name, colon, attribute = target.partition(":")
+    if not colon or not module_name or not attribute:
+        fix = f"{one_of(name, points, none='(none)')}, or module:attribute"
+        raise PluginError(f"{name!r} is not a registered name of {group}", fix=fix)
+    return load_object(target, shown=name)
+
+
+def load_object(target: str, *, shown: str = "") -> Any:
+    """Import what a ``module:attribute`` stands for.
+
+    Args:
+        target: the module and what in it can be called.
+        shown: how errors name it.
+
+    Raises:
+        PluginError: there is no such thing, or importing it failed.
+    """
+    name = shown or target
+    module_name, _, attribute = target.partition(":")
+    module = import_module(module_name, shown=name)
+    found: Any = module
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []
+            raise PluginError(
+                f"{name!r}: {module_name} has no attribute {attribute!r}",
+                fix=did_you_mean(part, public) or "mend the name",
+            )
+        found = getattr(found, part)
+    if not callable(found):
+        raise PluginError(
+            f"{name!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function"
+        )
+    return found
+
+
+def import_module(name: str, *, shown: str = "") -> types.ModuleType:
+    """Import a module, which may lie in the current directory.
+
+    Args:
+        name: of the module.
+        shown: how errors name what is asked for.
+
+    Raises:
+        PluginError: importing it failed.
+    """
+    if os.getcwd() not in sys.path and "" not in sys.path:  # noqa: PTH109 - sys.path holds strings
+        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        raise _not_imported(name, shown or name, error) from error
+
+
+def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
+    """Tell a module that is not there from one that is and fails."""
+    what = error.msg if isinstance(error, SyntaxError) else str(error)
+    said = " ".join(f"{type(error).__name__}: {what}".split())
+    missing = error.name or "" if isinstance(error, ModuleNotFoundError) else ""
+    if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
+        hint = did_you_mean(missing.rpartition(".")[2], _modules_beside(missing))
+        fix = f"{hint} run from the folder that holds the module, install it, or mend the name".lstrip()
+        return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
+    fix = f"install {missing.partition('.')[0]!r}, or mend the import" if missing else "mend it"
+    return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
+
+
+def _modules_beside(name: str) -> list[str]:
+    """The modules of the same package, or of the current directory."""
+    package, _, _ = name.rpartition(".")
+    places = getattr(sys.modules.get(package), "__path__", None) if package else [os.getcwd()]  # noqa: PTH109
+    return [module.name for module in pkgutil.iter_modules(places)] if places else []

@@ -1,0 +1,14 @@
+from ._archive import Archive as Archive, export_crash as export_crash, open_archive as open_archive
+from ._bundle import (
+    Bundle as Bundle,
+    files_of as files_of,
+    find_bundle as find_bundle,
+    list_bundles as list_bundles,
+    read_bundle as read_bundle,
+    read_params as read_params,
+    write_bundle as write_bundle,
+    write_trial as write_trial,
+)
+from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
+from ._escape import find_escape as find_escape, partner as partner
+from ._trust import refuse_side_effects as refuse_side_effects

@@ -1,0 +1,232 @@
+"""A crash as one file: everything that its replay needs, for another machine."""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import socket
+import stat
+import tempfile
+import time
+import zipfile
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.base.files import whole_file
+from crashhunt.base.integrity import FILES, parse_object, typed
+from crashhunt.base.watching import watched
+from crashhunt.snapshots import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.crashes._bundle import Bundle
+
+__all__ = ["Archive", "export_crash", "open_archive"]
+
+SCHEMA = 1
+_MAX_BYTES = 4 * 10**9
+_MAX_FILES = 100_000
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Archive:
+    """An archive that has been unpacked and checked.
+
+    Args:
+        directory: where its hunt is now.
+        made_by: who made it, as it says itself.
+        made_at: when, as it says itself.
+        made_here: whether this user made it on this machine, which its signature proves.
+    """
+
+    directory: Path
+    made_by: str
+    made_at: str
+    made_here: bool
+
+
+def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:
+    """Write a crash, its hunt's settings and its snapshot into one zip file, all of it or nothing.
+
+    Args:
+        bundle: the crash.
+        target: the file; one that is there is replaced.
+        watch: called after each file with how many are done, and how many there are.
+
+    Returns:
+        Its size in bytes.
+
+    Raises:
+        BundleError: something of the crash is missing or damaged.
+        HuntDirectoryError: the file cannot be written.
+    """
+    hunt = bundle.hunt
+    bundle.recording()  # refuses what is damaged
+    snapshot = Snapshot(hunt / layout.SNAPSHOTS / bundle.snapshot)
+    snapshot.verify()
+    files = [hunt / layout.HUNT, *sorted(bundle.path.rglob("*"))]
+    # Of the snapshot what its manifest names: an agent may have left data beside its code.
+    files += [snapshot.path / name for name in snapshot.manifest["files"]]
+    files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
+    entries: dict[str, dict[str, Any]] = {}
+    with whole_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in watched(files, len(files), watch):
+            if path.is_file() and not path.is_symlink():
+                name = path.relative_to(hunt).as_posix()
+                data = path.read_bytes()
+                entries[name] = {"size": len(data), "blake2b": _hash(data)}
+                archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+        index = {
+            "schema": SCHEMA,
+            "crash": bundle.id,
+            "made_by": f"{getpass.getuser()}@{socket.gethostname()}",
+            "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
+            "files": entries,
+        }
+        index["signature"] = _signature(index)
+        archive.writestr(zipfile.ZipInfo(layout.ARCHIVE_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
+    return target.stat().st_size
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[Archive]:
+    """Unpack an archive into a folder that is removed afterwards.
+
+    Nothing is believed: names, sizes and hashes are checked, and nothing is run.
+
+    Raises:
+        BundleError: it is not one, or it has something that it should not have.
+    """
+    with tempfile.TemporaryDirectory(prefix="crashhunt-archive-") as name:
+        directory = Path(name)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                index = _read_index(archive, path)
+                for entry in _checked(archive, index, path):
+                    _extract(archive, entry, directory, index["files"][entry.filename], path)
+        except BundleError:
+            raise
+        except OSError as error:
+            raise _refusal(path, f"cannot be unpacked: {error.strerror or error}") from None
+        except Exception as error:  # zipfile and what it unpacks with have an error of their own for every damage
+            name = "" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: "
+            raise _refusal(path, f"not an undamaged zip file: {name}{' '.join(str(error).split())}") from None
+        yield Archive(
+            directory,
+            str(index.get("made_by", "?")),
+            str(index.get("made_at", "?")),
+            hmac.compare_digest(str(index.get("signature", "")), _signature(index)),
+        )
+
+
+def _read_index(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
+    try:
+        info = archive.getinfo(layout.ARCHIVE_INDEX)
+        if info.file_size > 50 * 10**6:
+            raise _refusal(path, f"its {layout.ARCHIVE_INDEX} is too large")
+        index = parse_object(archive.read(info))
+        typed(index, {"schema": int})
+        if index["schema"] != SCHEMA:
+            raise BundleError(
+                f"schema {index['schema']} is not {SCHEMA}", fix="use the version that wrote it", where=str(path)
+            )
+        typed(index, {"files": FILES})
+        for entry in index["files"].values():
+            typed(entry, {"size": int, "blake2b": str})
+    except (KeyError, ValueError) as error:
+        raise _refusal(path, f"not an exported crash: {type(error).__name__}: {error}") from None
+    return index
+
+
+def _checked(archive: zipfile.ZipFile, index: dict[str, Any], path: Path) -> list[zipfile.ZipInfo]:
+    """The entries to unpack, or a refusal."""
+    entries = [entry for entry in archive.infolist() if entry.filename != layout.ARCHIVE_INDEX]
+    names = [entry.filename for entry in entries]
+    if len(entries) > _MAX_FILES or sum(entry.file_size for entry in entries) > _MAX_BYTES:
+        raise _refusal(path, "it is too large")
+    if len(set(names)) != len(names):
+        raise _refusal(path, "a file comes twice")
+    for entry in entries:
+        name = entry.filename
+        parts = PurePosixPath(name).parts
+        if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or ":" in parts[0]:
+            raise _refusal(path, f"the name {name!r} leads out of it")
+        if parts[0] not in (layout.HUNT, "crashes", "snapshots"):
+            raise _refusal(path, f"it has {name!r}, which is no part of a crash")
+        kind = stat.S_IFMT(entry.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG) or name.endswith("/"):
+            raise _refusal(path, f"{name!r} is not a file")
+        if name not in index["files"]:
+            raise _refusal(path, f"{name!r} is not listed in its {layout.ARCHIVE_INDEX}")
+    for name in index["files"]:
+        if name not in names:
+            raise _refusal(path, f"{name!r} is missing")
+    return entries
+
+
+def _extract(
+    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, listed: dict[str, Any], path: Path
+) -> None:
+    target = directory / entry.filename
+    target.parent.mkdir(parents=True, exist_ok=True)
+    digest, size = hashlib.blake2b(digest_size=16), 0
+    with archive.open(entry) as source, target.open("xb") as copy:
+        while chunk := source.read(_CHUNK):
+            size += len(chunk)
+            if size > listed["size"]:  # whatever the zip says of itself
+                raise _refusal(path, f"{entry.filename!r} is larger than it says")
+            digest.update(chunk)
+            copy.write(chunk)
+    if size != listed["size"] or digest.hexdigest() != listed["blake2b"]:
+        raise _refusal(path, f"{entry.filename!r} has changed")
+
+
+def _refusal(path: Path, message: str) -> BundleError:
+    return BundleError(message, fix="get an undamaged copy from whoever exported it", where=str(path))
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def _signature(index: dict[str, Any]) -> str:
+    """What only this user on this machine can know of an archive."""
+    content = {name: value for name, value in index.items() if name != "signature"}
+    text = json.dumps(content, sort_keys=True, default=str).encode()
+    return hmac.new(_key(), text, "sha256").hexdigest()
+
+
+def _key() -> bytes:
+    """The secret of this user on this machine, made when it is first needed."""
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    file = Path(state) / "crashhunt" / "archive-key"
+    try:
+        return file.read_bytes()
+    except OSError:
+        pass  # none yet, or it may not be read
+    key = secrets.token_bytes(32)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = file.with_name(f".{file.name}.{os.getpid()}")
+        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+            opened.write(key)
+            opened.flush()
+            os.fsync(opened.fileno())
+        try:
+            os.link(temporary, file)  # the first of two wins
+        finally:
+            temporary.unlink()
+        return file.read_bytes()
+    except OSError:
+        return key  # nowhere to keep it: every archive is a stranger's

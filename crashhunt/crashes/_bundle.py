@@ -1,0 +1,389 @@
+"""Crash bundles: the folder that holds everything needed to replay one crash."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.base.files import sync_folder, sync_tree, whole_file
+from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
+from crashhunt.base.names import listed, near_path, one_of
+from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
+from crashhunt.snapshots import versions
+from crashhunt.trial import Collision, Escape, Failure, Outcome, TrialResult, TrialSpec, check_parts
+from crashhunt.world import ClosestApproach, Event
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from crashhunt.world import Lane
+
+__all__ = [
+    "Bundle",
+    "files_of",
+    "find_bundle",
+    "list_bundles",
+    "read_bundle",
+    "read_params",
+    "write_bundle",
+    "write_trial",
+]
+
+SCHEMA = 2
+_PROTECTED = 2  # the first version with a digest of itself and of the files beside it
+_KNOWN = bool | float | str | None
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("trial", "seed", "hunt_seed", "max_steps", "step"), int),
+    **dict.fromkeys(("outcome", "digest", "snapshot"), str),
+    "arguments": dict[str, dict[str, _KNOWN]],
+    "scenario_arguments": dict[str, _KNOWN],
+    "sim_time_s": float,
+    "confirmed": bool | None,
+    "divergence": dict | None,
+}
+_UNDAMAGED = "get an undamaged copy, or see with crashhunt check what can be saved"
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A crash on disk.
+
+    Args:
+        path: of its folder.
+        result: the crash.
+        hunt_seed: of the hunt that found it.
+        snapshot: the digest of the code that it ran.
+        confirmed: whether a fresh process did the same to the bit; None where nobody tried.
+        divergence: where it did not.
+        files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
+    """
+
+    path: Path
+    result: TrialResult
+    hunt_seed: int
+    snapshot: str
+    confirmed: bool | None = None
+    divergence: dict[str, Any] | None = None
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """Its name within the hunt, such as ``000012-collision``."""
+        return self.path.name
+
+    @property
+    def hunt(self) -> Path:
+        """The hunt's directory."""
+        return self.path.parent.parent
+
+    @property
+    def driver(self) -> str:
+        """The agent that it is about; of one that is about none, the first."""
+        result = self.result
+        about = next((found.agent for found in (result.collision, result.event, result.failure) if found), "")
+        return about or next(iter(self.result.spec.arguments), "")
+
+    def recording(self) -> Recording:
+        """Read the log.
+
+        Raises:
+            BundleError: it is missing, damaged, or that of another crash.
+        """
+        log = self.path / layout.LOG
+        found = read_log(log)
+        if found.digest != self.result.digest:
+            raise BundleError("the log does not have the digest that crash.json says", fix=_UNDAMAGED, where=str(log))
+        # The views for people, which have no part in the digest of the trial.
+        wrong = changed_file(log, self.files[log.name]) if log.name in self.files else ""
+        if wrong:
+            raise BundleError(f"it {wrong} since it was written", fix=_UNDAMAGED, where=str(log))
+        return found
+
+    def faults(self) -> list[str]:
+        """Return which files beside ``crash.json`` are not as they were written, and those that were not there."""
+        found = [
+            f"{name} {wrong}" for name, entry in self.files.items() if (wrong := changed_file(self.path / name, entry))
+        ]
+        if self.files:
+            names = {path.name for path in self.path.iterdir()} - {layout.CRASH}
+            found += [f"{name} was not there" for name in sorted(names - self.files.keys()) if name[0] != "."]
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Return the shape that ``run --json`` prints."""
+        result = self.result
+        return {
+            "id": self.id,
+            "trial": result.spec.number,
+            "seed": result.spec.seed,
+            "outcome": str(result.outcome),
+            "step": result.steps,
+            "arguments": {agent: dict(values) for agent, values in result.spec.arguments.items()},
+            "scenario_arguments": dict(result.spec.scenario_arguments),
+            "path": str(self.path),
+            "digest": result.digest,
+            "confirmed": self.confirmed,
+        }
+
+    def write(self, into: Path | None = None) -> None:
+        """Write ``crash.json``, all of it or nothing; into another folder where the bundle is still being built."""
+        folder = into or self.path
+        result = self.result
+        data = {
+            "schema": SCHEMA,
+            "id": self.id,
+            "hunt_seed": self.hunt_seed,
+            "trial": result.spec.number,
+            "seed": result.spec.seed,
+            "max_steps": result.spec.max_steps,
+            "arguments": {agent: dict(values) for agent, values in result.spec.arguments.items()},
+            "scenario_arguments": dict(result.spec.scenario_arguments),
+            "outcome": str(result.outcome),
+            "category": result.outcome.category,
+            "summary": result.summary,
+            "step": result.steps,
+            "sim_time_s": result.sim_time_s,
+            "collision": result.to_json()["collision"],
+            "failure": result.to_json()["failure"],
+            "escape": result.to_json()["escape"],
+            "event": result.to_json()["event"],
+            "events": result.to_json()["events"],
+            "closest_approach": result.closest.to_json(),
+            "digest": result.digest,
+            "snapshot": self.snapshot,
+            "versions": versions(),
+            "confirmed": self.confirmed,
+            "divergence": self.divergence,
+            "files": self.files or _files_beside(folder),
+        }
+        data["integrity"] = digest_of_data(data)
+        with whole_file(folder / layout.CRASH) as temporary:
+            text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+            temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Read a crash bundle.
+
+    Raises:
+        BundleError: it is not one, or it is damaged.
+    """
+    file = path / layout.CRASH
+    try:
+        data = read_object(file)
+        typed(data, {"schema": int})
+        if not 1 <= data["schema"] <= SCHEMA:
+            raise BundleError(
+                f"schema {data['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
+            )
+        if data["schema"] >= _PROTECTED or "integrity" in data:
+            _see_that_it_is_whole(data)
+        return _bundle(path, data)
+    except OSError as error:
+        raise BundleError(
+            f"no crash bundle here: {error.strerror}",
+            fix="give another folder, or see with crashhunt check what can be saved",
+            where=str(file),
+        ) from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise BundleError(f"not an undamaged crash.json: {reason}", fix=_UNDAMAGED, where=str(file)) from None
+
+
+def _see_that_it_is_whole(data: dict[str, Any]) -> None:
+    typed(data, {"integrity": str, "files": FILES})
+    said = data.pop("integrity")
+    if digest_of_data(data) != said:
+        raise ValueError("it has changed since it was written")
+    for name, entry in data["files"].items():
+        typed(entry, {"size": int, "blake2b": str})
+        if "/" in name or name in ("", ".", ".."):
+            raise ValueError(f"the file {name!r} is not beside it")
+
+
+def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
+    typed(data, _TYPES)
+    hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
+    check_parts(data["closest_approach"], hit, failure, escape, event)
+    typed({"events": data.get("events")}, {"events": dict[str, int] | None})
+    if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
+        raise ValueError("trial, seed, step or max_steps is out of its range")
+    if not re.fullmatch(r"\w+", data["snapshot"]):
+        raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
+    spec = TrialSpec(
+        data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
+    )
+    result = TrialResult(
+        spec,
+        Outcome(data["outcome"]),
+        steps=data["step"],
+        sim_time_s=data["sim_time_s"],
+        digest=data["digest"],
+        closest=ClosestApproach.from_json(data["closest_approach"]),
+        collision=Collision.from_json(hit) if hit else None,
+        failure=Failure(**failure) if failure else None,
+        escape=Escape(**escape) if escape else None,
+        event=Event.from_json(event) if event else None,
+        events=data.get("events"),
+    )
+    files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
+    return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"], files)
+
+
+def list_bundles(directory: Path) -> list[Bundle]:
+    """Return the crashes of a hunt, in order of their trials."""
+    return [read_bundle(folder) for folder in _folders(directory)]
+
+
+def _folders(directory: Path) -> list[Path]:
+    """The folders of crashes, also of one that has lost its ``crash.json``."""
+    found = (path for path in (directory / layout.CRASHES).glob("[!.]*") if path.is_dir())
+    return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
+
+
+def find_bundle(directory: Path, crash: str = "") -> Bundle:
+    """Return one crash of a hunt: the one that is named, or the one with the fewest steps.
+
+    Args:
+        directory: of the hunt, or of the bundle itself.
+        crash: its id, the beginning of it, or its trial's number, with leading zeros or without.
+
+    Raises:
+        BundleError: there is no such crash.
+    """
+    if (directory / layout.CRASH).is_file() and not crash:
+        return read_bundle(directory)
+    bundles = _readable(directory, crash) if crash else list_bundles(directory)
+    if not bundles:
+        if not directory.is_dir():
+            fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
+            raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
+        raise BundleError(
+            "no crash was saved here", fix="give the directory of a hunt that found one", where=str(directory)
+        )
+    if not crash:
+        return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+    return _named(bundles, crash, directory)
+
+
+def _readable(directory: Path, crash: str) -> list[Bundle]:
+    """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
+    found = []
+    for path in _folders(directory):
+        try:
+            found.append(read_bundle(path))
+        except BundleError:
+            name = path.name
+            if name.startswith(crash) or name.partition("-")[0].lstrip("0") == crash.lstrip("0"):
+                raise
+    return found
+
+
+def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
+    """The one crash that somebody can mean; an id is exact, and else a number, before the beginning of an id."""
+    number = int(crash) if crash.isdecimal() else None
+    for meant in (
+        [bundle for bundle in bundles if bundle.id == crash],
+        [bundle for bundle in bundles if bundle.result.spec.number == number],
+        [bundle for bundle in bundles if bundle.id.startswith(crash)],
+    ):
+        if len(meant) == 1:
+            return meant[0]
+        if meant:
+            fix = f"give one of {listed(bundle.id for bundle in meant)}"
+            raise BundleError(f"{crash!r} may be several crashes", fix=fix, where=str(directory))
+    fix = one_of(crash, (bundle.id for bundle in bundles))
+    raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))
+
+
+def write_bundle(
+    directory: Path, result: TrialResult, scratch: Path, *, hunt_seed: int, snapshot: str, lanes: Sequence[Lane]
+) -> Bundle:
+    """Make the bundle of a crash from what its trial left behind.
+
+    Args:
+        directory: of the hunt.
+        result: the crash.
+        scratch: the trial's scratch folder; it is emptied.
+        hunt_seed: of the hunt.
+        snapshot: the digest of the code that ran.
+        lanes: of the map, for whoever looks at the log.
+    """
+    name = f"{result.spec.number:06d}-{result.outcome}"
+    final, building = directory / layout.CRASHES / name, directory / layout.CRASHES / f".{name}.part"
+    shutil.rmtree(building, ignore_errors=True)
+    building.mkdir(parents=True)
+    recording = Recording(read_black_box(scratch / layout.BLACK_BOX))
+    metadata = {"trial": str(result.spec.number), "seed": str(result.spec.seed), "outcome": str(result.outcome)}
+    write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=result)
+    view = json.dumps(foxglove_layout(recording), indent=1)
+    (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
+    _collect_output(result, scratch, building)
+    bundle = Bundle(final, result, hunt_seed, snapshot, files=_files_beside(building))
+    bundle.write(into=building)
+    sync_tree(building)
+    shutil.rmtree(final, ignore_errors=True)
+    building.rename(final)
+    sync_folder(final.parent, directory)
+    shutil.rmtree(scratch, ignore_errors=True)
+    return bundle
+
+
+def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
+    """Keep what a trial printed that is no crash; its scratch folder is emptied."""
+    target = directory / layout.TRIALS / f"{result.spec.number:06d}"
+    target.mkdir(parents=True, exist_ok=True)
+    _collect_output(result, scratch, target)
+    data = {**result.to_json(), "schema": SCHEMA, "files": _files_beside(target)}
+    data["integrity"] = digest_of_data(data)
+    with whole_file(target / layout.PARAMS, lasting=False) as temporary:
+        temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
+    shutil.rmtree(scratch, ignore_errors=True)
+
+
+def files_of(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
+    for name in (layout.CRASH, layout.PARAMS):
+        with suppress(OSError, ValueError):
+            data = read_object(folder / name)
+            if "integrity" in data:
+                _see_that_it_is_whole(data)
+                return dict(data["files"])
+    return {}
+
+
+def read_params(folder: Path) -> list[str]:
+    """Return what of a trial that was kept is not as it was written."""
+    try:
+        data = read_object(folder / layout.PARAMS)
+        if "integrity" in data:  # which earlier versions did not write
+            _see_that_it_is_whole(data)
+        files = data.get("files", {}).items()
+        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
+    except (OSError, ValueError) as error:
+        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
+
+
+def _files_beside(folder: Path) -> dict[str, dict[str, Any]]:
+    found = describe_files(folder)
+    return {
+        name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
+    }
+
+
+def _collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
+    run_log = scratch / layout.RUN_LOG
+    if run_log.is_file():
+        shutil.copyfile(run_log, target / layout.RUN_LOG)
+    failure = result.failure
+    if failure is not None:
+        parts = (f"{failure.kind}: {failure.message}", failure.traceback, failure.last_output)
+        text = "\n\n".join(part.rstrip() for part in parts if part.strip())
+        (target / layout.ERROR_LOG).write_text(text + "\n", encoding="utf-8", errors="replace")

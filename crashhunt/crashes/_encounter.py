@@ -1,0 +1,296 @@
+"""Two actors of a recording: how they stood to each other, and how long the crash could still have been avoided."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from crashhunt.world import Roster, Scene, approaches, outlines_overlap, rectangle_gap, time_to_contact
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.recording import Recording
+
+__all__ = ["Encounter", "Manner", "Moment", "Position", "last_escape"]
+
+_LOOKS_BACK_S = 30.0
+_PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
+
+Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "crossing from the right", "left", "right"]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """How the other one stands to the agent after one step.
+
+    Args:
+        step: of the episode.
+        time_s: simulation time.
+        speed: of the agent, in m/s.
+        other_speed: in m/s.
+        gap_m: between the outlines.
+        closing_speed: at which their centres come nearer, in m/s; negative when they part.
+        time_to_collision_s: at constant velocities; infinite where they would miss each other.
+        required_deceleration: that the agent would need, v / (2 TTC) with v the relative speed, in m/s².
+    """
+
+    step: int
+    time_s: float
+    speed: float
+    other_speed: float
+    gap_m: float
+    closing_speed: float
+    time_to_collision_s: float
+    required_deceleration: float
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where the other one is, as seen from the agent.
+
+    Args:
+        place: on which side of it.
+        turn: its heading less the agent's, in rad, within -pi and pi.
+    """
+
+    place: Literal["ahead", "behind", "left", "right"]
+    turn: float
+
+    @property
+    def faces(self) -> Literal["same", "other", "left", "right"]:
+        """Where it heads: the same way, the other way, or to the agent's left or right."""
+        if abs(self.turn) > math.radians(135):
+            return "other"
+        if abs(self.turn) > math.radians(45):
+            return "left" if self.turn > 0 else "right"
+        return "same"
+
+
+class Encounter:
+    """The steps of a recording in which two actors were both there.
+
+    Args:
+        recording: of the episode.
+        agent: one of them.
+        other: the other.
+    """
+
+    def __init__(self, recording: Recording, agent: str, other: str) -> None:
+        self.agent = agent
+        self.other = other
+        self._scenes = [
+            (step.step, step.scene)
+            for step in recording.all_steps
+            if step.scene is not None and agent in step.scene.roster.index and other in step.scene.roster.index
+        ]
+        self.moments = self._measure()
+
+    def position(self, step: int) -> Position | None:
+        """Where the other one was after a step, as seen from the agent; None where one of them was not there."""
+        scene = next((scene for number, scene in self._scenes if number == step), None)
+        if scene is None:
+            return None
+        own, other = scene.roster.index[self.agent], scene.roster.index[self.other]
+        offset = scene.centers[other] - scene.centers[own]
+        c, s = math.cos(scene.headings[own]), math.sin(scene.headings[own])
+        ahead, left = float(offset[0] * c + offset[1] * s), float(offset[1] * c - offset[0] * s)
+        turn = math.remainder(scene.headings[other] - scene.headings[own], math.tau)
+        one, two = scene.roster.actors[own], scene.roster.actors[other]
+        along, across = abs(math.cos(turn)), abs(math.sin(turn))
+        # Beside: their lengths overlap, seen from the agent, and not by touching ends only.
+        beside = (
+            abs(ahead) < (one.length + two.length * along + two.width * across) / 2
+            and abs(left) > (one.width + two.width * along + two.length * across) / 3
+        )
+        if beside or abs(left) > abs(ahead):
+            return Position("left" if left > 0 else "right", turn)
+        return Position("ahead" if ahead > 0 else "behind", turn)
+
+    def manner(self, step: int) -> Manner | None:
+        """How they came together, as of a step; None where one of them was not there."""
+        found = self.position(step)
+        if found is None:
+            return None
+        if found.faces == "other":
+            return "oncoming"
+        if found.faces == "same":
+            return found.place
+        return "crossing from the right" if found.faces == "left" else "crossing from the left"
+
+    def _measure(self) -> list[Moment]:
+        if not self._scenes:
+            return []
+        rows = [(scene.roster.index[self.agent], scene.roster.index[self.other]) for _, scene in self._scenes]
+        states = np.array(
+            [
+                (*scene.centers[own], *scene.centers[other], scene.headings[own], scene.headings[other],
+                 scene.speeds[own], scene.speeds[other])
+                for (_, scene), (own, other) in zip(self._scenes, rows, strict=True)
+            ]
+        )  # fmt: skip
+        half_own, half_other = (
+            np.array(
+                [scene.roster.half_sizes[pair[which]] for (_, scene), pair in zip(self._scenes, rows, strict=True)]
+            )
+            for which in (0, 1)
+        )
+        heading, other_heading, speed, other_speed = states[:, 4:].T
+        offset = states[:, 2:4] - states[:, 0:2]
+        own_velocity = speed[:, None] * np.stack((np.cos(heading), np.sin(heading)), axis=1)
+        velocity = (
+            other_speed[:, None] * np.stack((np.cos(other_heading), np.sin(other_heading)), axis=1) - own_velocity
+        )
+        distance = np.maximum(np.hypot(*offset.T), 1e-9)
+        closing = -np.einsum("ij,ij->i", offset, velocity) / distance
+        turn = other_heading - heading
+        gap = rectangle_gap(_turned(offset, heading), turn, half_own, half_other)
+        contact = time_to_contact(_turned(offset, heading), _turned(velocity, heading), turn, half_own, half_other)
+        for place, (_, scene) in enumerate(self._scenes):
+            if any(row in scene.spines for row in rows[place]):
+                contact[place], gap[place] = self._bent(scene, rows[place], gap[place])
+        needed = np.where(contact > 0, np.hypot(*velocity.T) / (2 * np.maximum(contact, 1e-9)), 0.0)
+        return [
+            Moment(number, scene.time_s, *map(float, values))
+            for (number, scene), *values in zip(
+                self._scenes, speed, other_speed, gap, closing, contact, needed, strict=True
+            )
+        ]
+
+    def _bent(self, scene: Scene, rows: tuple[int, int], straight_m: float) -> tuple[float, float]:
+        """Time to collision and gap of two of whom one is bent; further away, the gap is as if it were straight."""
+        pair = Scene(
+            scene.time_s,
+            Roster(tuple(scene.roster.actors[row] for row in rows)),
+            [scene.points[row] for row in rows],
+            [scene.headings[row] for row in rows],
+            [scene.speeds[row] for row in rows],
+            spines={place: scene.spines[row] for place, row in enumerate(rows) if row in scene.spines},
+        )
+        times, gaps, _ = approaches([pair.frame], self.agent)
+        return float(times[0]), float(gaps[0]) if math.isfinite(gaps[0]) else straight_m
+
+
+def last_escape(recording: Recording, agent: str, other: str, *, braking: float) -> int | None:
+    """Return the last step after which full braking would have avoided the crash, as calculated.
+
+    The agent goes on along the path that it drove, braking from that step on; the other one does what it did, and
+    beyond the end of the recording goes on at its last velocity. That is not what would have happened, since others
+    react (see `crashhunt.escape`, which runs it).
+
+    Args:
+        recording: of the crash.
+        agent: who brakes.
+        other: whom it crashed into, or who crashed into it.
+        braking: deceleration, in m/s².
+
+    Returns:
+        None where there was no such step, or where the calculation does not collide without braking either, so that
+        it says nothing.
+    """
+    model = _Model(recording, agent, other)
+    if not model.collides_without_braking():
+        return None
+    last = len(model.steps) - 1
+    first = max(0, last - math.ceil(_LOOKS_BACK_S / recording.prologue.step_length_s))
+    return next((model.steps[start] for start in range(last - 1, first - 1, -1) if model.avoids(start, braking)), None)
+
+
+class _Model:
+    """The two of a crash, the other one moving as it did, the agent along the path that it drove."""
+
+    def __init__(self, recording: Recording, agent: str, other: str) -> None:
+        found = Encounter(recording, agent, other)._scenes
+        self.steps = [step for step, _ in found]
+        self._dt = recording.prologue.step_length_s
+        scenes = [scene for _, scene in found]
+        own = [scene.roster.index[agent] for scene in scenes]
+        them = [scene.roster.index[other] for scene in scenes]
+        self._speeds = [scene.speeds[row] for scene, row in zip(scenes, own, strict=True)]
+        self._path, self._others = (
+            _Path([(*scene.points[row], scene.headings[row]) for scene, row in zip(scenes, rows, strict=True)])
+            for rows in (own, them)
+        )
+        self._beyond = scenes[-1].speeds[them[-1]] if scenes else 0.0
+        self._sizes = [
+            (actor.length, actor.width)
+            for actor in (scenes[-1].roster.actors[own[-1]], scenes[-1].roster.actors[them[-1]])
+        ] if scenes else []  # fmt: skip
+
+    def collides_without_braking(self) -> bool:
+        """Whether what was recorded touches in its last step or on the way there, or would by the next."""
+        last = len(self.steps) - 1
+        if last < 1:
+            return False
+        before, end = self._path.distances[last - 1 :]
+        beyond = end + max(0.0, self._speeds[last]) * self._dt
+        return self._touch_on_the_way(last - 1, before, end) or self._touch_on_the_way(last, end, beyond)
+
+    def avoids(self, start: int, braking: float) -> bool:
+        """Whether braking from a scene on avoids any touch until the agent stands."""
+        speed, driven, index = max(0.0, self._speeds[start]), self._path.distances[start], start
+        if self._touch(driven, float(index)):
+            return False
+        while speed > 0:
+            slower = max(0.0, speed - braking * self._dt)
+            after = driven + (speed + slower) / 2 * self._dt
+            if self._touch_on_the_way(index, driven, after):
+                return False
+            speed, driven, index = slower, after, index + 1
+        # The other one may still drive into somebody who stands; that is not for the agent's brakes to avoid.
+        return True
+
+    def _touch_on_the_way(self, index: int, driven: float, after: float) -> bool:
+        """Whether they touch within a step, the beginning left out."""
+        (x, y, _), (x_after, y_after, _) = self._other(float(index)), self._other(float(index + 1))
+        way = after - driven + math.hypot(x_after - x, y_after - y)
+        parts = min(_MOST_PARTS, max(1, math.ceil(way / _PART_M)))
+        return any(
+            self._touch(driven + (after - driven) * part / parts, index + part / parts) for part in range(1, parts + 1)
+        )
+
+    def _touch(self, driven: float, index: float) -> bool:
+        return outlines_overlap((*self._path.at(driven), *self._sizes[0]), (*self._other(index), *self._sizes[1]))
+
+    def _other(self, index: float) -> tuple[float, float, float]:
+        distances, whole = self._others.distances, int(index)
+        if whole >= len(distances) - 1:
+            return self._others.at(distances[-1] + (index - len(distances) + 1) * self._dt * self._beyond)
+        return self._others.between(whole, index - whole)
+
+
+class _Path:
+    """A driven path, and its straight continuation."""
+
+    def __init__(self, poses: list[tuple[float, float, float]]) -> None:
+        self._poses = np.array(poses)
+        lengths = np.hypot(*np.diff(self._poses[:, :2], axis=0).T)
+        self.distances = [0.0, *np.cumsum(lengths).tolist()]
+
+    def at(self, distance: float) -> tuple[float, float, float]:
+        index = int(np.searchsorted(self.distances, distance))
+        if index >= len(self.distances):
+            x, y, heading = self._poses[-1]
+            beyond = distance - self.distances[-1]
+            return float(x + beyond * math.cos(heading)), float(y + beyond * math.sin(heading)), float(heading)
+        if index == 0:
+            x, y, heading = self._poses[0]
+            return float(x), float(y), float(heading)
+        length = self.distances[index] - self.distances[index - 1]
+        return self.between(index - 1, (distance - self.distances[index - 1]) / max(length, 1e-9))
+
+    def between(self, index: int, share: float) -> tuple[float, float, float]:
+        """The pose a share of the way from one recorded pose to the next."""
+        before, after = self._poses[index], self._poses[index + 1]
+        x, y = before[:2] + share * (after[:2] - before[:2])
+        heading = before[2] + share * math.remainder(after[2] - before[2], math.tau)
+        return float(x), float(y), float(heading)
+
+
+def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors of the map in frames with these headings."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack((vectors[:, 0] * c + vectors[:, 1] * s, vectors[:, 1] * c - vectors[:, 0] * s), axis=1)

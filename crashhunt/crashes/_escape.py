@@ -1,0 +1,184 @@
+"""Until when braking would have avoided a crash: found out by running the trial again, with the agent overruled."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.crashes._encounter import Encounter, last_escape
+from crashhunt.trial import Escape, Outcome, Overruled
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.recording import Recording
+    from crashhunt.simulators import FullBraking
+    from crashhunt.trial import TrialResult, TrialSpec
+
+__all__ = ["find_escape", "partner"]
+
+_RUNS = 12
+_BEFORE_S = 10.0  # nobody asks what could have been done longer ago
+_WALL_S = 60.0
+_GUESS = 4.5  # m/s², where nobody knows better; a guess costs nothing but runs
+_STANDS = 0.1  # m/s
+_AFTERWARDS_S = 5.0
+_AS_IT_CAN = "as hard as it can"
+
+Ending = Literal["avoided", "hit", "unclear"]
+
+
+def partner(result: TrialResult) -> str:
+    """Return the other one of a collision; empty where there was none."""
+    hit = result.collision
+    if hit is None or hit.role == "alone":
+        return ""
+    return hit.victim if hit.role == "collider" else hit.collider
+
+
+def find_escape(
+    result: TrialResult,
+    recording: Recording,
+    braking: FullBraking,
+    run: Callable[[TrialSpec], tuple[TrialResult, Recording]],
+) -> Escape | None:
+    """Return until when braking would have avoided a collision into which the agent drove.
+
+    Nothing is computed that is not run: the same trial once more, in which the agent brakes as hard as it can after
+    some step, and the others react as they then do. Two runs, a step apart, are the answer: the first ends without a
+    crash, the second in the same one.
+
+    Args:
+        result: of the trial.
+        recording: of it.
+        braking: how the vehicle brakes.
+        run: runs a trial in the same way.
+
+    Returns:
+        None where it was no such collision, or where the runs do not say it clearly.
+    """
+    hit = result.collision
+    if result.outcome is not Outcome.COLLISION or hit is None or hit.role != "collider":
+        return None
+    search = _Search(result, recording, braking, run)
+    found = search.last()
+    if found is None:
+        return None
+    deceleration = max(search.decelerations, default=0.0)
+    return Escape(*found, deceleration if deceleration > _STANDS else None, search.how(deceleration))
+
+
+@dataclass(slots=True)
+class _Search:
+    result: TrialResult
+    recording: Recording
+    braking: FullBraking
+    run: Callable[[TrialSpec], tuple[TrialResult, Recording]]
+    endings: dict[int, Ending] = field(default_factory=dict)
+    decelerations: list[float] = field(default_factory=list)
+    began: float = field(default_factory=time.monotonic)
+
+    def last(self) -> tuple[int | None, int | None] | None:
+        """Return the last step after which braking helps, and the next, after which it does not."""
+        assert self.result.collision is not None
+        end = self.result.steps
+        dt = self.recording.prologue.step_length_s
+        both = [moment.step for moment in self._encounter(self.recording).moments if moment.step < end]
+        if not both:
+            return None
+        first = max(both[0], end - math.ceil(_BEFORE_S / dt), 0)
+        agent, guess = self.result.collision.agent, self.braking.deceleration or _GUESS
+        start = last_escape(self.recording, agent, self._other, braking=guess)
+        start = min(max(first, end - 2 if start is None else start), end - 1)
+        helps, late = -1, end  # after the step of the crash it is too late by itself
+        step, stride = start, 1
+        while first <= step < end:
+            ending = self._ending(step)
+            if ending == "unclear":
+                return None
+            if ending == "avoided":
+                helps = step
+            else:
+                late = step
+            if helps >= 0 and late - helps == 1:
+                return helps, late if late < end else None
+            if helps < 0:
+                if step == first:
+                    return None, first
+                step, stride = max(first, step - stride), 2 * stride
+            elif late == end:
+                step, stride = min(end - 1, step + stride), 2 * stride
+            else:
+                step = (helps + late) // 2
+        return None
+
+    def how(self, deceleration: float) -> str:
+        """What is said about the braking: no number that the vehicle has not done when it was run."""
+        said = self.braking.deceleration
+        if said is None:
+            return self.braking.how
+        return f"at {said:.3g} m/s², {self.braking.how}," if abs(said - deceleration) < 0.01 * said else _AS_IT_CAN
+
+    @property
+    def _other(self) -> str:
+        return partner(self.result)
+
+    def _encounter(self, recording: Recording) -> Encounter:
+        assert self.result.collision is not None
+        return Encounter(recording, self.result.collision.agent, self._other)
+
+    def _ending(self, after: int) -> Ending:
+        """Run the trial with the agent overruled after a step, and say what became of the crash."""
+        if len(self.endings) >= _RUNS or time.monotonic() - self.began > _WALL_S:
+            return "unclear"
+        if after not in self.endings:
+            self.endings[after] = self._run(after)
+        return self.endings[after]
+
+    def _run(self, after: int) -> Ending:
+        hit, dt = self.result.collision, self.recording.prologue.step_length_s
+        assert hit is not None
+        before = self.recording.scene(after)
+        speed = before.speeds[before.roster.index[hit.agent]]
+        slowest = self.braking.deceleration or _GUESS
+        afterwards = _AFTERWARDS_S + max(0.0, speed) / slowest
+        spec = replace(
+            self.result.spec,
+            overruled=Overruled(hit.agent, after),
+            max_steps=self.result.steps + math.ceil(afterwards / dt),
+        )
+        result, recording = self.run(spec)
+        # The same up to there, to the bit: else it says nothing about this crash.
+        if recording.steps < after or any(
+            self.recording.scene(step).frame[1].tobytes() != recording.scene(step).frame[1].tobytes()
+            for step in range(after + 1)
+        ):
+            return "unclear"
+        crashed = result.outcome is not Outcome.SURVIVED and result.outcome is not Outcome.FINISHED
+        self._measure(recording, hit.agent, after, crashed=crashed)
+        if result.outcome is Outcome.COLLISION:
+            same = result.collision is not None and {result.collision.collider, result.collision.victim} == {
+                hit.collider,
+                hit.victim,
+            }
+            return "hit" if same else "unclear"
+        return "avoided" if not crashed and self._is_over(recording, hit.agent) else "unclear"
+
+    def _is_over(self, recording: Recording, agent: str) -> bool:
+        """Whether the danger has passed, and is not put off only: one of them has left, stands, or goes elsewhere."""
+        scene = recording.scenes()[-1]
+        row = scene.roster.index.get(agent)
+        if row is None or self._other not in scene.roster.index or scene.speeds[row] < _STANDS:
+            return True
+        return math.isinf(self._encounter(recording).moments[-1].time_to_collision_s)
+
+    def _measure(self, recording: Recording, agent: str, after: int, *, crashed: bool) -> None:
+        """Note how hard it braked, without what a collision itself does to the speed."""
+        dt = recording.prologue.step_length_s
+        scenes = recording.scenes()[after : -1 if crashed else None]
+        speeds = [scene.speeds[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index]
+        found = [(was - now) / dt for was, now in itertools.pairwise(speeds)]
+        self.decelerations.append(max(found, default=0.0))

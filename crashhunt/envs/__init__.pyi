@@ -1,0 +1,1 @@
+from ._sumo_env import SumoEnv as SumoEnv

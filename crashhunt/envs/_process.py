@@ -1,0 +1,138 @@
+"""Episodes in a process of their own: libsumo has one simulation per process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import weakref
+from contextlib import suppress
+from multiprocessing.connection import Connection, Pipe
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import SimulatorError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+__all__ = ["RemoteEpisodes"]
+
+_LOOK_EVERY_S = 1.0  # whether whoever asks is still there
+_GOOD_BYE_S = 5.0
+
+
+class RemoteEpisodes:
+    """The same as `Episodes`, in a process that ends with this object, and with this process.
+
+    What it raises comes through. The arguments are those of `Episodes`.
+    """
+
+    def __init__(self, scenario: str | Path, agent: str, action: str) -> None:
+        here, there = Pipe()
+        # A program of its own rather than a child of multiprocessing's: those of an AsyncVectorEnv may not have one.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "crashhunt.envs._process", str(there.fileno()), str(os.getpid())],
+            pass_fds=(there.fileno(),),
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # Ctrl-C is for whoever asks
+        )
+        there.close()
+        self._pipe = here
+        self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
+        found = self._ask("made", str(scenario), agent, action)
+        self.observation_space: Space[Any] = found["observation_space"]
+        self.action_space: Space[Any] = found["action_space"]
+        self.step_length_s: float = found["step_length_s"]
+        self.agent: str = found["agent"]
+
+    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Begin an episode."""
+        found: tuple[NDArray[Any], dict[str, Any]] = self._ask("reset", seed, dict(arguments))
+        return found
+
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, dict[str, Any]]:
+        """Advance one control step."""
+        found: tuple[NDArray[Any], float, bool, dict[str, Any]] = self._ask("step", action)
+        return found
+
+    def picture(self) -> NDArray[Any]:
+        """Return the scene from above."""
+        found: NDArray[Any] = self._ask("picture")
+        return found
+
+    def close(self) -> None:
+        """End the process."""
+        self._end()
+
+    def _ask(self, name: str, *words: Any) -> Any:
+        if self._pipe.closed:
+            raise SimulatorError("the environment has been closed", fix="make a new one")
+        try:
+            self._pipe.send((name, words))
+            fine, answer = self._pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            self._end()
+            code = self._process.returncode
+            how = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
+            raise SimulatorError(f"the process of the environment ended {how}", fix="make a new one") from error
+        if not fine:
+            raise answer
+        return answer
+
+
+def _end(process: subprocess.Popen[bytes], pipe: Connection[Any, Any], owner: int) -> None:
+    """Have a process end; a copy of its owner, made by forking, has no say in that."""
+    pipe.close()
+    if os.getpid() != owner:
+        return
+    try:
+        process.wait(_GOOD_BYE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def main() -> None:
+    """Answer until whoever asks is gone."""
+    from crashhunt.envs._episodes import Episodes
+
+    pipe: Connection[Any, Any] = Connection(int(sys.argv[1]))
+    parent = int(sys.argv[2])
+    episodes: Episodes | None = None
+    with suppress(EOFError, ConnectionError):
+        while True:
+            # Copies of the parent hold the other end open as well, so that its end is no sign of the parent's.
+            while not pipe.poll(_LOOK_EVERY_S):
+                if os.getppid() != parent:
+                    return
+            name, words = pipe.recv()
+            answer: Any
+            try:
+                if episodes is None:
+                    episodes = Episodes(*words)
+                    names = ("observation_space", "action_space", "step_length_s", "agent")
+                    answer = {name: getattr(episodes, name) for name in names}
+                else:
+                    answer = getattr(episodes, name)(*words)
+            except Exception as error:
+                _fail(pipe, error)
+            else:
+                pipe.send((True, answer))
+    if episodes is not None:
+        episodes.close()
+
+
+def _fail(pipe: Connection[Any, Any], error: Exception) -> None:
+    try:
+        pipe.send((False, error))
+    except Exception:  # it cannot be pickled
+        pipe.send((False, SimulatorError(f"{type(error).__name__}: {error}")))
+
+
+if __name__ == "__main__":
+    main()

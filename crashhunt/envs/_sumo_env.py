@@ -1,0 +1,129 @@
+"""SUMO as a Gymnasium environment: one controlled vehicle, for whoever trains or tries an agent."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.names import one_of
+from crashhunt.envs._episodes import Episodes
+from crashhunt.envs._process import RemoteEpisodes
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+__all__ = ["SumoEnv"]
+
+# Which environment has this process's one simulation, and in which process that was said: a copy, made by forking, has
+# none. Weakly, so that one that is forgotten need not be closed.
+_here: weakref.WeakSet[Episodes] = weakref.WeakSet()
+_process: list[int] = []
+
+
+class SumoEnv(gymnasium.Env[Any, Any]):
+    """``gymnasium.make("crashhunt:crashhunt/SUMO-v0")``.
+
+    The observation has the layout of highway-env's Kinematics: float32, shape (vehicles, features). The reward is the
+    distance driven in a step, in m. An episode is terminated by arrival and by a crash, and ``info["outcome"]`` says
+    which; it is truncated after ``max_steps``.
+
+    Args:
+        scenario: a shipped name, or a path.
+        agent: the controlled vehicle; the scenario's first by default. The others keep their lane.
+        action: ``continuous`` is (target speed in m/s, lane change), ``meta`` highway-env's DiscreteMetaAction; the
+            scenario's own choice by default.
+        max_steps: None for no bound.
+        render_mode: None, or ``rgb_array``: `render` returns the scene from above, uint8, shape (540, 960, 3).
+        process: whether it runs in a process of its own, which costs up to a millisecond a step. libsumo is one
+            simulation per process, so that by default the first environment of a process runs in it, and the others in
+            one of their own each.
+
+    Raises:
+        CrashhuntError: the scenario or the agent does not exist.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's base class declares it so
+
+    def __init__(
+        self,
+        scenario: str | Path = "loop",
+        *,
+        agent: str = "",
+        action: str = "",
+        max_steps: int | None = None,
+        render_mode: str | None = None,
+        process: bool | None = None,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise UsageError(f"render_mode is {render_mode!r}", fix=one_of(str(render_mode), ("rgb_array",)))
+        if render_mode is not None and importlib.util.find_spec("PIL") is None:
+            raise UsageError("render_mode needs Pillow", fix="pip install 'crashhunt[video]'")
+        self._max_steps = max_steps
+        self._episodes: Episodes | RemoteEpisodes
+        if process is None:
+            process = _process == [os.getpid()] and len(_here) > 0
+        if process:
+            self._episodes = RemoteEpisodes(scenario, agent, action)
+        else:
+            self._episodes = Episodes(scenario, agent, action)
+            if _process != [os.getpid()]:
+                _here.clear()
+                _process[:] = [os.getpid()]
+            _here.add(self._episodes)
+        self.agent = self._episodes.agent
+        self.observation_space = self._episodes.observation_space
+        self.action_space = self._episodes.action_space
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._episodes.step_length_s))}
+        self._steps = -1
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: of this episode and, through the environment's generator, of those that follow.
+            options: ``{"arguments": {name: value}}``, scenario arguments that differ from their defaults.
+        """
+        super().reset(seed=seed)
+        drawn = int(self.np_random.integers(2**31))
+        self._steps = 0
+        return self._episodes.reset(drawn, (options or {}).get("arguments", {}))
+
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+        """Advance one control step.
+
+        Raises:
+            ActionError: the action is not in the space.
+            SimulatorError: SUMO gave up, its process ended, or another simulation has begun in this process.
+        """
+        observation, reward, terminated, info = self._episodes.step(action)
+        self._steps += 1
+        truncated = not terminated and self._max_steps is not None and self._steps >= self._max_steps
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> NDArray[Any] | None:
+        """Return the scene from above, where ``render_mode`` asks for it.
+
+        Raises:
+            UsageError: no episode has begun.
+        """
+        if self.render_mode is None:
+            return None
+        if self._steps < 0:
+            raise UsageError("there is nothing to render yet", fix="call reset first")
+        return self._episodes.picture()
+
+    def close(self) -> None:
+        """End the simulation and remove its files; may be called twice."""
+        self._episodes.close()
+        if isinstance(self._episodes, Episodes):
+            _here.discard(self._episodes)

@@ -1,0 +1,139 @@
+"""Everything that a process needs to run trials of one hunt, and where it writes. It crosses process boundaries."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.version import __version__
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import TrialResult
+
+__all__ = ["WorkerSettings", "answer_file", "scratch_of"]
+
+
+_AUDIT = 1  # apart from what draws the trial itself
+
+
+_SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerSettings:
+    """Everything that a worker needs to run the trials of one hunt. It crosses process boundaries.
+
+    Args:
+        scenario: where the trials take place.
+        oracles: names of registered oracles, or ``module:attribute``.
+        crash_on: the outcomes that end a trial as a crash.
+        scratch: the folder in which workers keep black boxes and output while trials run.
+        code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.
+        argument_files: the value of an argument that names a file, to the file of the snapshot that stands for it.
+        timeout_s: wall-clock limit of a trial, in s.
+        keep_trials: whether the scratch folder of every trial is kept, not of crashes only.
+        sealed: of a stranger's crash, what the process may read besides what is installed and its scratch folder,
+            where alone it may write; None where it may do everything.
+        find_escapes: whether it is found out until when braking would have avoided a collision, by running the trial a
+            few times more; only in a fresh process.
+        audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
+        hunt_seed: what decides which.
+    """
+
+    scenario: Scenario
+    oracles: tuple[str, ...]
+    crash_on: tuple[Outcome, ...]
+    scratch: Path
+    code: tuple[str, ...] = ()
+    argument_files: dict[str, str] = field(default_factory=dict)
+    timeout_s: float = 60.0
+    keep_trials: bool = False
+    sealed: tuple[str, ...] | None = None
+    find_escapes: bool = False
+    audit: float = 0.0
+    hunt_seed: int = 0
+
+    def is_audited(self, result: TrialResult) -> bool:
+        """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
+        if self.audit <= 0.0 or result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
+            return False
+        draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
+        return bool(draw < self.audit * 2**32)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dicts, strings and numbers."""
+        # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
+        # what has come since is written only where it is asked for. For this the defaults may never change.
+        scenario: dict[str, Any] = _asked(replace(self.scenario, file=type(self.scenario).file))
+        return {
+            **{item.name: getattr(self, item.name) for item in fields(self)},
+            "schema": _SCHEMA,
+            "scenario": {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)},
+            "scratch": str(self.scratch),
+            "crash_on": [str(outcome) for outcome in self.crash_on],
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
+        """Rebuild what `to_json` returned.
+
+        Raises:
+            CrashhuntError: a crashhunt of another version wrote it.
+        """
+        from crashhunt.scenario import scenario_from_dict
+
+        if data.get("schema") != _SCHEMA:
+            raise CrashhuntError(
+                f"the snapshot has crashhunt {__version__}, and the one that replays is of a version that runs trials "
+                "in another way",
+                fix=f"pip install crashhunt=={__version__}, or replay with --code current",
+            )
+        scenario = dict(data["scenario"])
+        folder = Path(scenario.pop("folder"))
+        notes = tuple(scenario.pop("notes", ()))
+        return cls(
+            scenario=scenario_from_dict({**scenario, "notes": notes}, where="worker settings", folder=folder),
+            oracles=tuple(data["oracles"]),
+            crash_on=tuple(Outcome(name) for name in data["crash_on"]),
+            scratch=Path(data["scratch"]),
+            code=tuple(data["code"]),
+            argument_files=data.get("argument_files", {}),
+            timeout_s=data["timeout_s"],
+            keep_trials=data["keep_trials"],
+            sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
+            find_escapes=data.get("find_escapes", False),
+            audit=data.get("audit", 0.0),
+            hunt_seed=data.get("hunt_seed", 0),
+        )
+
+
+def _asked(value: Any) -> Any:
+    """Plain data, in which a dataclass has only the fields that are not at their default."""
+    if is_dataclass(value):
+        pairs = ((item, getattr(value, item.name)) for item in fields(value))
+        return {item.name: _asked(held) for item, held in pairs if held != _default(item)}
+    if isinstance(value, dict):
+        return {name: _asked(held) for name, held in value.items()}
+    return [_asked(held) for held in value] if isinstance(value, list | tuple) else value
+
+
+def _default(item: Field[Any]) -> Any:
+    return item.default_factory() if item.default_factory is not MISSING else item.default
+
+
+def scratch_of(scratch: Path, number: int) -> Path:
+    """Return the folder that a running trial writes to, and that stays if it is kept."""
+    return scratch / f"trial-{number:06d}"
+
+
+def answer_file(scratch: Path, number: int) -> Path:
+    """Return the file for what came of a trial, where its process has no other way to say so."""
+    return scratch / f"answer-{number:06d}.json"

@@ -1,0 +1,1 @@
+from ._comparison import Comparison as Comparison, HuntFigures as HuntFigures, compare as compare

@@ -1,0 +1,18 @@
+from ._check import Checked as Checked, check as check
+from ._directory import HuntDirectory as HuntDirectory
+from ._hunt import Hunt as Hunt
+from ._ledger import Ledger as Ledger, has_begun as has_begun
+from ._logs import LogKind as LogKind, LogReader as LogReader
+from ._preflight import Preflight as Preflight
+from ._progress import HuntReport as HuntReport, HuntStatus as HuntStatus
+from ._results import (
+    FACTS as FACTS,
+    HuntResults as HuntResults,
+    SuiteResults as SuiteResults,
+    UnfinishedWarning as UnfinishedWarning,
+    columns_of as columns_of,
+    load as load,
+)
+from ._salvage import salvage as salvage
+from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
+from ._tables import write_parquet as write_parquet, write_text as write_text

@@ -1,0 +1,158 @@
+"""The audit: a sample of trials that did not crash is run again, and has to be the same to the bit.
+
+A crash is confirmed in a fresh process anyway. A trial without one that depends on the trials before it in its worker,
+on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import FreshProcessExecutor
+from crashhunt.recording import Recording, first_divergence, read_black_box
+
+if TYPE_CHECKING:
+    from crashhunt.trial import TrialResult
+
+__all__ = ["Audit", "AuditReport", "Difference"]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where a trial went another way in a fresh process.
+
+    Args:
+        trial: its number.
+        step: the first that differs.
+        agent: the agent or actor; empty where it is about neither.
+        field: what of it.
+        recorded: what it was in the hunt.
+        replayed: what it was in the fresh process.
+    """
+
+    trial: int
+    step: int
+    agent: str
+    field: str
+    recorded: Any
+    replayed: Any
+
+    def __str__(self) -> str:
+        whose = f" of {self.agent}" if self.agent else ""
+        return (
+            f"trial {self.trial} is another one in a fresh process: at step {self.step}, {self.field}{whose} was "
+            f"{self.recorded} and is {self.replayed}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain strings and numbers."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport:
+    """What came of an audit.
+
+    Args:
+        trials: how many trials were run again.
+        differences: of those that were not the same.
+    """
+
+    trials: int = 0
+    differences: tuple[Difference, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the shape that ``run --json`` prints."""
+        return {"trials": self.trials, "differences": [found.to_json() for found in self.differences]}
+
+
+class Audit:
+    """Runs the sample again while the hunt goes on, one trial at a time.
+
+    Args:
+        settings: of the hunt; they say which trials.
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._settings = settings
+        self._scratch = settings.scratch / "audit"
+        self._scratch.mkdir(exist_ok=True)
+        again = replace(settings, scratch=self._scratch, audit=0.0, keep_trials=True)
+        self._executor = FreshProcessExecutor(again)
+        self._waiting: dict[int, TrialResult] = {}
+        self._done = 0
+        self._differences: list[Difference] = []
+
+    @property
+    def waiting(self) -> int:
+        """How many trials have not been run again yet."""
+        return len(self._waiting)
+
+    @property
+    def report(self) -> AuditReport:
+        """What has come of it so far."""
+        return AuditReport(self._done, tuple(self._differences))
+
+    @property
+    def parallel(self) -> int:
+        """How many trials run at a time."""
+        return self._executor.parallel
+
+    @parallel.setter
+    def parallel(self, parallel: int) -> None:
+        self._executor.parallel = parallel
+
+    def add(self, result: TrialResult) -> TrialResult:
+        """Take over the recording of a trial of the sample; return the trial as the hunt goes on with it."""
+        if not self._settings.is_audited(result):
+            return result
+        number = result.spec.number
+        recorded, folder = self._scratch / f"recorded-{number:06d}", scratch_of(self._settings.scratch, number)
+        recorded.mkdir()
+        (folder / layout.BLACK_BOX).rename(recorded / layout.BLACK_BOX)
+        self._waiting[number] = result
+        self._executor.submit(result.spec)
+        if self._settings.keep_trials:
+            return result
+        shutil.rmtree(folder, ignore_errors=True)
+        return replace(result, kept=False)
+
+    def look(self, timeout_s: float = 0.0) -> list[Difference]:
+        """Return what has been found since the last call, waiting so long for a trial to end, if one runs."""
+        if not self._waiting:
+            return []
+        found = []
+        for result in self._executor.completed(timeout_s):
+            was = self._waiting.pop(result.spec.number)
+            difference = self._compare(was, result)
+            self._done += 1
+            if difference is not None:
+                found.append(difference)
+        self._differences += found
+        return found
+
+    def close(self) -> None:
+        """Give up what has not been run again."""
+        self._executor.close()
+
+    def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:
+        number = was.spec.number
+        folders = self._scratch / f"recorded-{number:06d}", scratch_of(self._scratch, number)
+        try:
+            recorded, replayed = (Recording(read_black_box(folder / layout.BLACK_BOX)) for folder in folders)
+            found = first_divergence(recorded, replayed)
+        except BundleError:  # it could not even be set up
+            found = None
+        finally:
+            for folder in folders:
+                shutil.rmtree(folder, ignore_errors=True)
+        if found is not None:
+            return Difference(number, found.step, found.agent, found.field, found.recorded, found.replayed)
+        if (was.outcome, was.digest) != (now.outcome, now.digest):
+            return Difference(number, now.steps, "", "the outcome", str(was.outcome), str(now.outcome))
+        return None

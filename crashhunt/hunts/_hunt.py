@@ -1,0 +1,378 @@
+"""The hunt: samples trials, runs them in parallel, stops at the first crash, and saves it."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
+from crashhunt.base.plugins import locate
+from crashhunt.base.signals import stop_requests
+from crashhunt.base.text import encodable
+from crashhunt.crashes import list_bundles, write_bundle, write_trial
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import PoolExecutor, read_map
+from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._directory import HuntDirectory
+from crashhunt.hunts._ledger import Ledger
+from crashhunt.hunts._preflight import Preflight
+from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.hunts._state import this_process
+from crashhunt.plans import spec_of, with_settings
+from crashhunt.replays import confirm
+from crashhunt.scenario.backends.sumo import explained
+from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
+from crashhunt.trial import Outcome, TrialResult
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.plans import HuntSettings
+    from crashhunt.recording import BlackBoxHeader
+    from crashhunt.samplers import Sampler
+    from crashhunt.scenario import Scenario
+
+__all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
+
+_TICK_S = 0.1
+_HEARTBEAT_S = 1.0
+_INVALID_BEFORE_GIVING_UP = 10
+_QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
+
+
+class Hunt:
+    """One hunt in one directory.
+
+    The same hunt on the same directory goes on where it was; with settings that make other trials it refuses.
+
+    Args:
+        directory: made where it does not exist.
+        scenario: where the trials take place.
+        settings: what was asked.
+        command: the command line, as a comment in ``hunt.toml``.
+        overwrite: begin anew, whatever is there.
+        seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
+        snapshot: what the snapshot of the code takes in.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        scenario: Scenario,
+        settings: HuntSettings,
+        *,
+        command: list[str] | None = None,
+        overwrite: bool = False,
+        seed_given: bool = True,
+        snapshot: SnapshotOptions | None = None,
+    ) -> None:
+        self.directory = directory
+        self.scenario = scenario
+        self._place = HuntDirectory(directory)
+        self.settings = settings
+        self._command = command or ["crashhunt", "run", str(directory)]
+        self._overwrite = overwrite
+        self._seed_given = seed_given
+        self._snapshot_options = snapshot
+        self._stops: Sequence[int] = ()
+
+    def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
+        """Hunt until a crash, the last trial or an interrupt.
+
+        Args:
+            watch: called about ten times a second.
+
+        Raises:
+            HuntDirectoryError: the directory is busy, foreign, unwritable or full.
+            CrashhuntError: the machinery failed.
+        """
+        with self._place.locked(), stop_requests() as self._stops:
+            self.settings = self._place.claim(
+                self.settings, self._command, overwrite=self._overwrite, seed_given=self._seed_given
+            )
+            ledger = Ledger(self.directory / layout.LEDGER, writable=True)
+            try:
+                return self._run(ledger, watch or (lambda _: None))
+            except CrashhuntError as error:
+                self._fail(ledger, str(error))
+                raise
+            except OSError as error:
+                self._fail(ledger, f"{error.strerror or error}: {error.filename or self.directory}")
+                raise HuntDirectoryError(
+                    f"{error.strerror or error}", fix=remedy(error), where=str(error.filename or self.directory)
+                ) from error
+            except Exception as error:
+                self._fail(ledger, f"{type(error).__name__}: {error}")
+                raise
+            finally:
+                with suppress(CrashhuntError):
+                    ledger.note(owner=None, heartbeat=time.time())
+                ledger.close()
+                shutil.rmtree(self._place.scratch, ignore_errors=True)
+
+    def _fail(self, ledger: Ledger, why: str) -> None:
+        """Write down why the hunt ends, where that can still be written."""
+        shutil.rmtree(self._place.scratch, ignore_errors=True)  # on a disk that is full, this makes room for a line
+        with suppress(CrashhuntError):
+            ledger.enter("error", encodable(why))
+
+    def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
+        settings = self.settings
+        snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
+        sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
+        progress = Progress()
+        finished = ledger.finished()
+        for bundle in list_bundles(self.directory):
+            if bundle.result.spec.number not in finished:  # it was killed between saving the one and the other
+                ledger.record(bundle.result, snapshot=bundle.snapshot)
+                finished.add(bundle.result.spec.number)
+        progress.outcomes.update(ledger.outcomes())
+        progress.nearest = ledger.nearest_miss()
+        progress.crashes = list_bundles(self.directory)
+        for result in ledger.results() if sampler.learns else ():
+            self._teach(result, sampler, progress)
+        ledger.enter(
+            "running",
+            owner=this_process(),
+            began=time.time(),
+            done_before=len(finished),
+            heartbeat=time.time(),
+            planned=settings.trials,
+            hunt_seed=settings.seed,
+        )
+        stopped: StoppedBecause | None = None
+        if progress.crashes and not settings.run.keep_going:
+            stopped = "crash"
+        if stopped is None:
+            stopped = self._hunt(ledger, sampler, snapshot, progress, finished, watch)
+        watch(self._status(progress, "confirming"))
+        self._confirm(progress)
+        watch(self._status(progress, "done"))
+        self._see_to(ledger, progress)
+        reason = ""
+        if stopped == "no_valid_trial" and progress.last_invalid is not None:
+            reason = _why_invalid(progress.last_invalid, self.scenario)
+        ledger.enter(stopped, reason, heartbeat=time.time())
+        crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+        return HuntReport(
+            self.directory,
+            settings,
+            stopped,
+            ledger.outcomes(),
+            ledger.steps_total(),
+            time.monotonic() - progress.began,
+            tuple(crashes),
+            reason,
+            tuple(progress.notes),
+            ledger.traffic_events(),
+            progress.audit,
+        )
+
+    def _hunt(
+        self,
+        ledger: Ledger,
+        sampler: Sampler,
+        snapshot: Snapshot,
+        progress: Progress,
+        finished: set[int],
+        watch: Callable[[HuntStatus], None],
+    ) -> StoppedBecause:
+        settings, run = self.settings, self.settings.run
+        # The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
+        worker_settings = WorkerSettings(
+            scenario=with_settings(snapshot.scenario(), settings),
+            oracles=settings.oracles,
+            crash_on=settings.crash_on,
+            scratch=self._place.scratch,
+            code=snapshot.code,
+            argument_files=snapshot.argument_files,
+            timeout_s=run.timeout_s,
+            keep_trials=run.keep_trials,
+            audit=run.audit,
+            hunt_seed=settings.seed,
+        )
+        waiting = iter(number for number in range(settings.trials) if number not in finished)
+        parallel = min(run.parallel, max(1, settings.trials - len(finished)))
+        executor = PoolExecutor(worker_settings, parallel=parallel, recycle_after=run.recycle_after)
+        preflight = Preflight(
+            settings, settings.trials - len(finished), files=snapshot.argument_files, code=snapshot.code
+        )
+        audit = Audit(worker_settings)
+        in_flight: set[int] = set()
+        heartbeat = 0.0
+        try:
+            while True:
+                stopping = bool(progress.found)
+                while not stopping and len(in_flight) < run.parallel * (1 + _QUEUED_PER_WORKER):
+                    number = next(waiting, None)
+                    if number is None:
+                        break
+                    executor.submit(spec_of(number, settings, sampler))
+                    in_flight.add(number)
+                if not in_flight:
+                    break
+                for result in executor.completed(_TICK_S):
+                    in_flight.discard(result.spec.number)
+                    for known in preflight.sift(audit.add(result)):
+                        self._take(known, ledger, snapshot, sampler, progress)
+                    if result.outcome in settings.crash_on and not run.keep_going:
+                        above = min(progress.found) if run.deterministic else -1
+                        executor.cancel(above=above)
+                        in_flight = {number for number in in_flight if number <= above}
+                        if not run.deterministic:
+                            break
+                if self._stops:
+                    break
+                if self._hopeless(progress, finished):
+                    return "no_valid_trial"
+                self._listen(executor, audit, ledger, progress)
+                if time.monotonic() - heartbeat > _HEARTBEAT_S:
+                    heartbeat = time.monotonic()
+                    self._see_to(ledger, progress)
+                    ledger.note(heartbeat=time.time())
+                watch(self._status(progress, "hunting", executor.where()))
+            executor.cancel()
+            if progress.found:
+                watch(self._status(progress, "saving"))
+                lowest = min(progress.found)
+                self._save(progress.found[lowest], ledger, snapshot, progress)
+            executor.close()
+            audit.parallel = run.parallel
+            while audit.waiting and not bool(self._stops):
+                watch(self._status(progress, "auditing"))
+                self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
+            if progress.found:
+                return "crash"
+        except CrashhuntError as error:  # of which file is for somebody who wants to mend it
+            mine, theirs = worker_settings.scenario.origin, self.scenario.origin
+            if mine not in error.where:
+                raise
+            raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
+        finally:
+            executor.close()
+            audit.close()
+        if self._stops:
+            return "interrupted"
+        if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
+            return "no_valid_trial"
+        return "all_trials"
+
+    def _listen(
+        self, executor: PoolExecutor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
+    ) -> None:
+        """Write down what people should know about how the trials were run, and whether they are the same again."""
+        for note in executor.notes():
+            ledger.remark(note)
+            progress.notes.append(note)
+        for difference in audit.look(wait_s):
+            ledger.remark(f"audit: {difference}")
+        if self.settings.run.audit > 0:
+            progress.audit = audit.report
+
+    def _see_to(self, ledger: Ledger, progress: Progress) -> None:
+        """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
+
+        Raises:
+            HuntDirectoryError: another file is in its place, or the directory is gone.
+        """
+        if ledger.restore():
+            note = "ledger.sqlite was removed while the hunt ran, and was written anew with everything that was in it"
+            ledger.remark(note)
+            progress.notes.append(note)
+
+    def _take(
+        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: Progress
+    ) -> None:
+        """Account for a trial that has ended."""
+        settings = self.settings
+        self._teach(result, sampler, progress)
+        progress.ended_here += 1
+        progress.outcomes[str(result.outcome)] += 1
+        if result.outcome in settings.crash_on:
+            if settings.run.keep_going:
+                self._save(result, ledger, snapshot, progress)
+            else:
+                progress.found[result.spec.number] = result
+            return
+        if result.outcome is Outcome.INVALID:
+            progress.last_invalid = result
+        elif result.collision is None and result.failure is None:
+            nearest = progress.nearest
+            if nearest is None or result.closest.time_to_collision_s < nearest.closest.time_to_collision_s:
+                progress.nearest = result
+        if result.kept:
+            write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
+        ledger.record(result, snapshot=snapshot.digest)
+
+    def _teach(self, result: TrialResult, sampler: Sampler, progress: Progress) -> None:
+        """Tell a sampler that learns how trials ended, in the order of their numbers."""
+        if not sampler.learns:
+            return
+        progress.untold[result.spec.number] = result
+        while progress.next_told in progress.untold:
+            sampler.tell(progress.untold.pop(progress.next_told))
+            progress.next_told += 1
+
+    def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
+        """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""
+        trial = scratch_of(self._place.scratch, result.spec.number)
+        bundle = write_bundle(
+            self.directory,
+            result,
+            trial,
+            hunt_seed=self.settings.seed,
+            snapshot=snapshot.digest,
+            lanes=read_map(self._place.scratch, trial),
+        )
+        progress.crashes.append(bundle)
+        ledger.record(result, snapshot=snapshot.digest)
+
+    def _confirm(self, progress: Progress) -> None:
+        """Run every crash that nobody has confirmed yet once more, in a fresh process."""
+
+        def confirmed(bundle: Bundle) -> Bundle:
+            if bundle.confirmed is None and not self._stops:
+                found = confirm(bundle, lambda: bool(self._stops))
+                if found is not None:
+                    bundle = found
+                    bundle.write()
+            return bundle
+
+        with ThreadPoolExecutor(self.settings.run.parallel) as threads:  # which only wait for their process
+            progress.crashes = list(threads.map(confirmed, progress.crashes))
+
+    def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
+        enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
+        invalid = progress.outcomes[str(Outcome.INVALID)]
+        return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
+
+    def _status(self, progress: Progress, phase: str, workers: dict[int, BlackBoxHeader] | None = None) -> HuntStatus:
+        elapsed = time.monotonic() - progress.began
+        return HuntStatus(
+            phase,
+            self.settings.trials,
+            sum(progress.outcomes.values()),
+            dict(progress.outcomes),
+            progress.ended_here / elapsed if elapsed > 0 else 0.0,
+            elapsed,
+            progress.nearest,
+            workers or {},
+            len(progress.crashes) + (1 if progress.found else 0),
+        )
+
+
+def _why_invalid(result: TrialResult, scenario: Scenario) -> str:
+    """Why a trial could not be set up, with what the simulator said about it last."""
+    if scenario.sumo is not None and result.failure is not None:
+        error = explained(result.summary, result.failure.last_output, scenario)
+        if error is not None:
+            return str(error)
+    said = result.failure.last_output.strip().splitlines() if result.failure else []
+    last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
+    return f"{result.summary}\n  last output: {last}" if last else result.summary

@@ -1,0 +1,97 @@
+"""What hunts and trials have printed, wherever it is."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.integrity import changed_file
+from crashhunt.crashes import files_of
+from crashhunt.hunts._ledger import Ledger, has_begun
+from crashhunt.hunts._state import hunt_state, is_hunt
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+__all__ = ["LogKind", "LogReader"]
+
+LogKind = Literal["run", "error", "state"]
+
+_MOST = 1_000_000  # bytes of one file, from its end
+
+
+class LogReader:
+    """Reads the logs of a hunt and its trials, each time what is new.
+
+    Args:
+        hunt: its directory.
+        kinds: what of it.
+        trial: only of this one.
+    """
+
+    def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
+        self._hunt = hunt
+        self._kinds = kinds
+        self._trial = trial
+        self._read: dict[Path, int] = {}
+        self._files: dict[Path, dict[str, dict[str, Any]]] = {}
+        self._told = 0
+
+    def fresh(self) -> Iterator[tuple[str, str]]:
+        """Yield title and text of what has come since the last time."""
+        if self._trial is None:
+            if "state" in self._kinds:
+                yield from self._states()
+            yield from self._texts(self._hunt, "")
+        folders = [*(self._hunt / layout.CRASHES).glob("[!.]*"), *(self._hunt / layout.TRIALS).glob("[!.]*")]
+        for folder in sorted(folders, key=lambda folder: folder.name):
+            number = folder.name.partition("-")[0]
+            if number.isdecimal() and self._trial in (None, int(number)):
+                yield from self._texts(folder, f"trial {int(number)}, ")
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        if not has_begun(self._hunt / layout.LEDGER):
+            if is_hunt(self._hunt) and (state := hunt_state(self._hunt)).damaged:
+                raise HuntDirectoryError(state.detail)
+            return
+        with closing(Ledger(self._hunt / layout.LEDGER)) as ledger:
+            events = ledger.events()[self._told :]
+        self._told += len(events)
+        lines = [
+            f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
+            for at, state, why in events
+        ]
+        if lines:
+            yield "state", "\n".join(lines)
+
+    def _texts(self, folder: Path, title: str) -> Iterator[tuple[str, str]]:
+        for kind in ("run", "error"):
+            path = folder / f"{kind}.log"
+            if kind not in self._kinds:
+                continue
+            try:
+                with path.open("rb") as file:
+                    size = file.seek(0, os.SEEK_END)
+                    begin = self._read.get(path, max(0, size - _MOST))
+                    if size <= begin:
+                        continue
+                    file.seek(begin)
+                    text = file.read(size - begin).decode("utf-8", "replace")
+            except OSError:
+                continue
+            self._read[path] = size
+            if text.strip():
+                changed = "" if self._as_written(path) else ", which has changed since it was written"
+                yield f"{title}{kind}{changed}", text
+
+    def _as_written(self, path: Path) -> bool:
+        """Whether a file beside a crash is what that says; those of a hunt itself, and of early ones, nobody says."""
+        if path.parent not in self._files:
+            self._files[path.parent] = files_of(path.parent)
+        entry = self._files[path.parent].get(path.name)
+        return entry is None or not changed_file(path, entry)

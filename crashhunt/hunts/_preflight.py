@@ -1,0 +1,96 @@
+"""Agents that do not start are told once, instead of as so many trials that could not be set up."""
+
+from __future__ import annotations
+
+import re
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import ArgumentError
+from crashhunt.trial import Constant, Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import TrialResult
+
+__all__ = ["Preflight"]
+
+_ENOUGH = 4
+"""Trials; one that fails by chance would do so as often as this only rarely."""
+
+
+class Preflight:
+    """Holds back the first results of a hunt for as long as each says that the same agent failed to start, and how.
+
+    It costs no time: these are the hunt's own first trials. Where an argument of the agent varies, another value of it
+    may well do, and nothing is held back.
+
+    Args:
+        settings: of the hunt.
+        planned: how many trials there are to be.
+        files: of arguments that name files, to where the snapshot has them.
+        code: folders of the snapshot from which agents are imported.
+    """
+
+    def __init__(
+        self, settings: HuntSettings, planned: int, *, files: Mapping[str, str] = MappingProxyType({}),
+        code: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        self._settings = settings
+        self._names = {there: here for here, there in files.items()} | {f"{folder}/": "" for folder in code}
+        self._enough = min(_ENOUGH, planned)
+        self._held: list[TrialResult] = []
+        self._passed = False
+
+    def sift(self, result: TrialResult) -> list[TrialResult]:
+        """Return what is to be accounted for now: nothing yet, or this result with those that were held back.
+
+        Raises:
+            ArgumentError: the agent does not start, whatever the trial.
+        """
+        if self._passed or not self._is_of_an_agent(result):
+            self._passed = True
+            found, self._held = [*self._held, result], []
+            return found
+        self._held.append(result)
+        if len(self._held) >= self._enough:
+            raise self._refusal(result)
+        return []
+
+    def _is_of_an_agent(self, result: TrialResult) -> bool:
+        failure = result.failure
+        if result.outcome is not Outcome.INVALID or failure is None or failure.agent not in self._settings.agents:
+            return False
+        first = self._held[0].failure if self._held else failure
+        same = first is not None and (first.agent, first.kind, first.message) == (
+            failure.agent,
+            failure.kind,
+            failure.message,
+        )
+        varied = any(
+            agent == failure.agent and not isinstance(distribution, Constant)
+            for (agent, _), distribution in self._settings.space.items()
+        )
+        return same and not varied
+
+    def _refusal(self, result: TrialResult) -> ArgumentError:
+        failure = result.failure
+        assert failure is not None
+        message, trace = self._as_asked(failure.message), self._as_asked(failure.traceback)
+        kind = "" if failure.kind in ("ValueError", "invalid") else f"{failure.kind}: "
+        given = result.spec.arguments.get(failure.agent, {})
+        names = ", ".join(f"--arg {name}={value}" for name, value in given.items() if isinstance(value, str))
+        places = re.findall(r'^  File "([^"]+)", line (\d+)', trace, re.MULTILINE)
+        return ArgumentError(
+            f"{self._settings.agents[failure.agent].agent} does not start: {kind}{message}",
+            fix=f"mend {names or 'the agent'}",
+            where=":".join(places[-1]) if kind and places else f"agent {failure.agent}",
+        )
+
+    def _as_asked(self, text: str) -> str:
+        """The same with the names of files as they were given, instead of where the snapshot has them."""
+        for there, here in self._names.items():
+            text = text.replace(there, here)
+        return text

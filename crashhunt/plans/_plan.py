@@ -1,0 +1,352 @@
+"""From what somebody asks for to a scenario and settings that say everything."""
+
+from __future__ import annotations
+
+import math
+import os
+import secrets
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.base.blame import place_of
+from crashhunt.base.errors import ArgumentError, CrashhuntError, PluginError, ScenarioError, UsageError
+from crashhunt.base.names import one_of
+from crashhunt.base.plugins import locate
+from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.scenario import Scenario, load_scenario, scenario_digest, with_action
+from crashhunt.simulators.accelerator import ACCELERATED
+from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, TrialSpec, parse_spec, signature_of
+from crashhunt.world import LIMITS, TOLD_BY
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from crashhunt.samplers import Sampler
+    from crashhunt.trial import Signature
+
+__all__ = ["Request", "parse_crash_on", "plan", "spec_of", "with_settings"]
+
+_ZERO = {"PARALLEL": " (0: one per core)", "--recycle-after": " (0: never)"}  # what nought means, where it may be given
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What somebody asks of a hunt; everything else is decided by `plan`.
+
+    Args:
+        trials: how many.
+        max_steps: the bound on each, in steps.
+        scenario: a shipped name, or a path.
+        ego: which vehicle of a bare ``.sumocfg``.
+        action: how agents act on SUMO, ``continuous`` or ``meta``; empty: as the scenario says.
+        agents: agent id to locator; the id may be empty where the scenario has one controlled vehicle.
+        arguments: ``NAME`` or ``AGENT.NAME`` to specification.
+        scenario_arguments: name to specification.
+        sampler: its name.
+        points: how many values grid and sweep try of a range without a step.
+        seed: of the hunt; drawn where it is None.
+        crash_on: the outcomes that count; a traffic event may have a limit, as in ``not_moving:30``.
+        run: how it is run.
+    """
+
+    trials: int
+    max_steps: int
+    scenario: str | Path = "loop"
+    ego: str = ""
+    action: str = ""
+    agents: Mapping[str, str] = field(default_factory=dict)
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    scenario_arguments: Mapping[str, str] = field(default_factory=dict)
+    sampler: str = "random"
+    points: int = 10
+    seed: int | None = None
+    crash_on: Sequence[str] = CRASHES
+    run: RunSettings = field(default_factory=RunSettings)
+
+
+def plan(request: Request) -> tuple[Scenario, HuntSettings]:
+    """Resolve a request.
+
+    Raises:
+        CrashhuntError: with what is wrong with it.
+    """
+    _check_numbers(request)
+    run = replace(request.run, parallel=request.run.parallel or len(os.sched_getaffinity(0)))  # of this machine
+    scenario = load_scenario(request.scenario, ego=request.ego)
+    scenario = _acting(
+        scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
+    )
+    sampler = locate("samplers", request.sampler)
+    hunted = not getattr(sampler, "only_asked", False)
+    signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
+    crash_on, limits = parse_crash_on(request.crash_on)
+    settings = HuntSettings(
+        scenario=str(request.scenario),
+        scenario_digest=scenario_digest(scenario),
+        trials=request.trials,
+        max_steps=request.max_steps,
+        seed=request.seed if request.seed is not None else secrets.randbits(32),
+        sampler=request.sampler,
+        points=request.points,
+        crash_on=crash_on,
+        events=limits,
+        agents=_agents(request, scenario, signatures, hunted=hunted),
+        scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
+        run=run,
+    )
+    if request.action:
+        acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
+        settings = replace(settings, agents=acting)
+    scenario = _with_untold(_noted(scenario, run), crash_on)
+    _try_sampler(sampler, settings)
+    return scenario, settings
+
+
+def _try_sampler(sampler: Callable[..., Sampler], settings: HuntSettings) -> None:
+    """Make the sampler, which refuses what it cannot sample, before anything runs."""
+    try:
+        sampler(settings.space, points=settings.points)
+    except CrashhuntError:
+        raise
+    except Exception as error:  # somebody's own
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        message = f"the sampler {settings.sampler!r} cannot be made: {said}"
+        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+
+
+def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
+    """Tell whoever hunts in an unknown version of highway-env that it will not be fast."""
+    if scenario.highway is None or not (run.accelerate and scenario.highway.accelerate):
+        return scenario
+    version = metadata.version("highway-env")
+    if version in ACCELERATED:
+        return scenario
+    known = ", ".join(ACCELERATED)
+    note = f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
+    return replace(scenario, notes=(*scenario.notes, note))
+
+
+def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
+    """Return the scenario as the settings say: who is at the wheel, and whether its simulator is sped up."""
+    missing = scenario.agents.keys() ^ settings.agents.keys()
+    if missing:
+        raise UsageError(
+            f"hunt.toml and the scenario do not agree on the controlled vehicle {min(missing)!r}",
+            fix="name the same vehicles in both",
+        )
+    if scenario.highway is not None and not settings.run.accelerate:
+        scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
+    if settings.events:
+        scenario = replace(scenario, events={**scenario.events, **settings.events})
+    if scenario.sumo is not None:  # elsewhere than it was hunted, it may be another simulator's
+        scenario = _acting(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
+    return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
+
+
+def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
+    """Return the scenario with the forms of action that are asked for; an empty one is as the scenario says."""
+    for agent, action in actions.items():
+        if action and scenario.sumo is None:
+            fix = "leave it out; the environment has its own"
+            raise UsageError(f"--action {action} is for SUMO, and {scenario.name} is not", fix=fix)
+        if action:
+            scenario = with_action(scenario, agent, action)
+    return scenario
+
+
+def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
+    """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
+    told = TOLD_BY.get(scenario.simulator)
+    never = [kind for kind in crash_on if kind.is_traffic_event and told is not None and kind not in told]
+    if not never:
+        return scenario
+    names = ",".join(never)
+    if len(never) == len(crash_on):
+        fix = f"it tells {', '.join(told)}" if told else "leave it out"
+        raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never tells that", fix=fix)
+    return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never tells {names}"))
+
+
+def _check_numbers(request: Request) -> None:
+    for name, value, least in (
+        ("TRIALS", request.trials, 1),
+        ("MAX_STEPS", request.max_steps, 1),
+        ("PARALLEL", request.run.parallel, 0),
+        ("--points", request.points, 1),
+        ("--recycle-after", request.run.recycle_after, 0),
+        ("--seed", request.seed or 0, 0),
+    ):
+        if value < least:
+            raise UsageError(f"{name} is {value}", fix=f"give at least {least}{_ZERO.get(name, '')}")
+    if not 0 <= request.run.audit <= 1:
+        raise UsageError(f"--audit is {request.run.audit:g}", fix="give a share of the trials, from 0 to 1")
+    if not 0 < request.run.timeout_s < float("inf"):
+        raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
+
+
+def parse_crash_on(words: Sequence[str]) -> tuple[tuple[Outcome, ...], dict[str, float]]:
+    """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
+
+    Raises:
+        UsageError: there is no such outcome or limit.
+    """
+    crashes = [str(outcome) for outcome in (*CRASHES, *EVENTS)]
+    names, limits = [], {}
+    for word in words:
+        name, colon, limit = str(word).partition(":")
+        if name not in crashes:
+            raise UsageError(f"--crash-on {name!r} is not a crash", fix=one_of(name, crashes, give="give some of"))
+        if colon:
+            limits[name] = _limit(name, limit)
+        names.append(name)
+    if not names:
+        raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
+    return tuple(outcome for outcome in (*CRASHES, *EVENTS) if outcome in names), limits
+
+
+def _limit(name: str, text: str) -> float:
+    if name not in LIMITS:
+        raise UsageError(f"--crash-on {name}:{text}: {name} has no limit", fix=f"{' and '.join(LIMITS)} have one")
+    unit = LIMITS[name][1]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        fix = f"give {unit} above 0, such as {name}:{'30' if unit == 's' else '6'}"
+        raise UsageError(f"--crash-on {name}:{text}: {text!r} is no limit", fix=fix)
+    return value
+
+
+def _locators(request: Request, scenario: Scenario) -> dict[str, str]:
+    locators: dict[str, str] = {}
+    ids = ", ".join(scenario.agents)
+    for agent, locator in request.agents.items():
+        if not agent and len(scenario.agents) > 1:
+            raise UsageError(
+                f"--agent {locator!r} does not say which vehicle, and the scenario has {ids}",
+                fix=f"write --agent {next(iter(scenario.agents))}={locator}",
+            )
+        if agent and agent not in scenario.agents:
+            fix = one_of(agent, scenario.agents, give="the scenario has")
+            raise UsageError(f"--agent: there is no controlled vehicle {agent!r}", fix=fix)
+        locators[agent or next(iter(scenario.agents))] = locator
+    return locators
+
+
+def _agents(
+    request: Request, scenario: Scenario, signatures: Mapping[str, Signature], *, hunted: bool
+) -> dict[str, AgentSettings]:
+    asked: dict[str, dict[str, str]] = {agent: {} for agent in scenario.agents}
+    for name, spec in request.arguments.items():
+        agent, argument = _owner(name, scenario, signatures)
+        asked[agent][argument] = spec
+    agents: dict[str, AgentSettings] = {}
+    for agent, setup in scenario.agents.items():
+        signature = signatures[agent]
+        known = scenario.agent_arguments(agent)
+        for name in known:
+            if name not in signature.arguments and not signature.open:
+                raise ScenarioError(
+                    f"agents.{agent}.arguments.{name}: {setup.agent} takes no such argument",
+                    fix=one_of(name, signature.arguments, give="it takes", none="no arguments"),
+                    where=scenario.origin,
+                )
+        specs: dict[str, ArgumentSpec] = {}
+        for name in sorted({*signature.arguments, *known, *asked[agent]}):
+            found = _spec(name, signature.arguments.get(name), known.get(name), asked[agent].get(name), hunted=hunted)
+            if found is not None:
+                specs[name] = found
+            elif (
+                name in signature.arguments
+                and signature.arguments[name].default is None
+                and not _has_default(setup.agent, name)
+            ):
+                raise ArgumentError(
+                    f"{setup.agent} needs the argument {name!r}", fix=f"give --arg {name}=SPEC", where=f"agent {agent}"
+                )
+        agents[agent] = AgentSettings(agent=setup.agent, arguments=specs)
+    return agents
+
+
+def _has_default(locator: str, name: str) -> bool:
+    import inspect
+
+    parameter = inspect.signature(locate("agents", locator)).parameters[name]
+    return parameter.default is not parameter.empty
+
+
+def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
+    """Which agent an ``--arg`` is for."""
+    for agent in sorted(scenario.agents, key=len, reverse=True):
+        if name.startswith(f"{agent}."):
+            argument = name.removeprefix(f"{agent}.")
+            signatures[agent].check([argument], where=f"--arg {name}: {scenario.agents[agent].agent}")
+            return agent, argument
+    takers = [agent for agent, signature in signatures.items() if name in signature.arguments or signature.open]
+    if len(takers) > 1:
+        fix = " or ".join(f"--arg {agent}.{name}=…" for agent in takers)
+        raise ArgumentError(f"--arg {name}: several agents take it", fix=f"write {fix}")
+    if not takers:
+        if name in scenario.arguments:
+            raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
+        agent = next(iter(scenario.agents))
+        signatures[agent].check([name], where=f"--arg: {scenario.agents[agent].agent}")
+    return takers[0], name
+
+
+def _spec(
+    name: str, declared: Argument | None, known: Argument | None, asked: str | None, *, hunted: bool
+) -> ArgumentSpec | None:
+    kind = (declared.kind if declared else None) or (known.kind if known else None)
+    if asked is not None:
+        distribution = parse_spec(asked, kind, where=f"--arg {name}")
+        return ArgumentSpec(spec=str(distribution), kind=kind)
+    for argument in (known, declared) if hunted else ():
+        if argument is not None and argument.distribution is not None:
+            # The same text may mean whole numbers or not, depending on the agent's own type.
+            return ArgumentSpec(spec=str(parse_spec(str(argument.distribution), kind, where=name)), kind=kind)
+    for argument in (known, declared):
+        # The constructor's own default too: it may be another one by the time of a replay.
+        if argument is not None and argument.default is not None:
+            constant = parse_spec(str(Constant(argument.default)), kind, where=name)
+            # A text such as "a|b" would be read as a choice; it is left to whoever has it as a default.
+            return ArgumentSpec(spec=str(constant), kind=kind) if isinstance(constant, Constant) else None
+    return None
+
+
+def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -> dict[str, ArgumentSpec]:
+    known = scenario.scenario_arguments()
+    for name in request.scenario_arguments:
+        if name not in known:
+            raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))
+    specs: dict[str, ArgumentSpec] = {}
+    for name, argument in known.items():
+        asked = request.scenario_arguments.get(name)
+        if asked is not None:
+            spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
+        elif argument.distribution is not None and (hunted or argument.default is None):
+            spec = str(argument.distribution)
+        elif argument.default is not None:
+            spec = str(Constant(argument.default))
+        else:
+            raise ScenarioError(
+                f"arguments.{name} has neither a default nor a range", fix="give it one", where=scenario.origin
+            )
+        specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
+    return specs
+
+
+def spec_of(number: int, settings: HuntSettings, sampler: Sampler) -> TrialSpec:
+    """Return a trial of a hunt; it depends on the hunt's seed and on the number only."""
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
+    seed = int(rng.integers(2**31))
+    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
+    scenario_arguments: dict[str, Any] = {}
+    for (agent, name), value in sorted(sampler.ask(number, rng).items()):
+        (arguments[agent] if agent else scenario_arguments)[name] = value
+    return TrialSpec(number, seed, arguments, scenario_arguments, max_steps=settings.max_steps)

@@ -1,0 +1,192 @@
+"""What a hunt was asked, fully resolved: ``hunt.toml``."""
+
+from __future__ import annotations
+
+import shlex
+import tomllib
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.files import whole_file
+from crashhunt.base.names import near_path
+from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
+
+if TYPE_CHECKING:
+    from crashhunt.samplers import Space
+
+__all__ = ["AgentSettings", "ArgumentSpec", "HuntSettings", "RunSettings", "read_settings", "write_settings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArgumentSpec:
+    """What is tried for one argument.
+
+    Args:
+        spec: as in ``--arg NAME=SPEC``.
+        kind: the type of its values.
+    """
+
+    spec: str
+    kind: Kind | None = None
+
+    @property
+    def distribution(self) -> Distribution:
+        """What the specification says."""
+        return parse_spec(self.spec, self.kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSettings:
+    """``[agents.ID]``: who drives a vehicle, and what is tried for its arguments; how it acts, where that was asked."""
+
+    agent: str
+    arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
+    action: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """``[run]``: how the hunt is run. None of it changes what a trial is, so a resumed hunt may have other values.
+
+    Args:
+        parallel: trials at a time.
+        keep_going: collect all crashes instead of stopping at the first.
+        deterministic: at a crash, let running trials of lower numbers finish; the lowest crash counts.
+        keep_trials: keep the logs of every trial.
+        timeout_s: wall-clock limit of a trial, in s.
+        recycle_after: trials after which a worker is replaced by a fresh one.
+        audit: the share of trials without a crash that are run again in a fresh process, 0 to 1.
+        accelerate: whether simulators are sped up where that changes no bit.
+    """
+
+    parallel: int = 1
+    keep_going: bool = False
+    deterministic: bool = False
+    keep_trials: bool = False
+    timeout_s: float = 60.0
+    recycle_after: int = 1000
+    audit: float = 0.0
+    accelerate: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class HuntSettings:
+    """``hunt.toml``.
+
+    Args:
+        scenario: the name or path that was given.
+        scenario_digest: of the scenario's files and settings.
+        trials: how many to run.
+        max_steps: the bound on each, in steps.
+        seed: of the hunt; with a trial's number it determines the trial.
+        sampler: the name of a registered sampler, or ``module:attribute``.
+        points: how many values grid and sweep try of a range without a step.
+        crash_on: the outcomes that count as a crash.
+        oracles: names of registered oracles, or ``module:attribute``.
+        agents: agent id to who drives it.
+        scenario_arguments: what is tried for the scenario's arguments.
+        events: limits of traffic events that were asked for, such as ``not_moving`` in s.
+        run: how it is run.
+        schema: of the file format.
+    """
+
+    scenario: str
+    scenario_digest: str
+    trials: int
+    max_steps: int
+    seed: int
+    sampler: str = "random"
+    points: int = 10
+    crash_on: tuple[Outcome, ...] = CRASHES
+    oracles: tuple[str, ...] = ("reported-collision", "overlap", "off-road")
+    agents: dict[str, AgentSettings] = field(default_factory=dict)
+    scenario_arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
+    events: dict[str, float] = field(default_factory=dict)
+    run: RunSettings = field(default_factory=RunSettings)
+    schema: Literal[1] = 1
+
+    @property
+    def crash_on_words(self) -> tuple[str, ...]:
+        """What ``--crash-on`` was given, limits included."""
+        return tuple(f"{kind}:{self.events[kind]:g}" if kind in self.events else str(kind) for kind in self.crash_on)
+
+    @property
+    def space(self) -> Space:
+        """Everything that varies, and the constants."""
+        found = {("", name): spec.distribution for name, spec in self.scenario_arguments.items()}
+        for agent, settings in self.agents.items():
+            found |= {(agent, name): spec.distribution for name, spec in settings.arguments.items()}
+        return found
+
+    def differences(self, other: HuntSettings) -> list[str]:
+        """Say in words what makes the trials of two hunts different; how they are run does not."""
+        mine, theirs = _flat(asdict(self)), _flat(asdict(other))
+        return [
+            f"{key} was {mine.get(key, '(not there)')} and is now {theirs.get(key, '(not there)')}"
+            for key in sorted(mine.keys() | theirs.keys(), key=lambda key: (key.count("."), key))
+            if mine.get(key) != theirs.get(key)
+            and not key.startswith("run.")
+            and key != "trials"
+            # The kind of an argument that only one of them has says nothing more.
+            and not (key.endswith(".kind") and key.removesuffix(".kind") in mine.keys() ^ theirs.keys())
+        ]
+
+
+def _flat(data: Any, prefix: str = "") -> dict[str, str]:
+    if isinstance(data, dict):
+        found: dict[str, str] = {}
+        for key, value in data.items():
+            found |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+        return found
+    if isinstance(data, list | tuple):
+        return {prefix: ",".join(str(item) for item in data)}
+    return {prefix.removesuffix(".spec"): str(data)}
+
+
+def write_settings(path: Path, settings: HuntSettings, command: list[str]) -> None:
+    """Write ``hunt.toml``, with the command line as a comment on top; all of it or nothing."""
+    import tomli_w
+
+    data = _without_none(asdict(settings))
+    if not settings.events:
+        del data["events"]
+    # No line break of an argument may end the comment.
+    line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
+    text = f"# {line}\n{tomli_w.dumps(data)}"
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_settings(path: Path) -> HuntSettings:
+    """Read ``hunt.toml``.
+
+    Raises:
+        HuntDirectoryError: it is missing or not valid, with the key, its value and the fix.
+    """
+    from crashhunt.base.validation import validate
+
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        place = str(path.parent)
+        what = "is not the directory of a hunt: it has no hunt.toml" if path.parent.is_dir() else "does not exist"
+        hint = "" if path.parent.is_dir() else near_path(path.parent, ".zip")
+        fix = f"{hint}give the directory that crashhunt run was given"
+        raise HuntDirectoryError(f"{place!r} {what}", fix=fix) from None
+    except (ValueError, RecursionError) as error:
+        raise HuntDirectoryError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
+    except OSError as error:
+        raise HuntDirectoryError(f"cannot be read: {error.strerror}", where=str(path)) from None
+    return validate(HuntSettings, data, where=str(path), error=HuntDirectoryError)
+
+
+def _without_none(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {str(key): _without_none(value) for key, value in data.items() if value is not None}
+    if isinstance(data, list | tuple):
+        return [_without_none(item) for item in data]
+    if isinstance(data, Outcome | Path):
+        return str(data)
+    return data

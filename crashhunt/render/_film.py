@@ -1,0 +1,341 @@
+"""Films of crashes: the scene, the panels beside it, and where they are written."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.files import cannot_write, whole_file
+from crashhunt.base.watching import watched
+from crashhunt.crashes import Encounter
+from crashhunt.panels import Action, Curve
+from crashhunt.render._scene import SceneView
+from crashhunt.world import approaches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.panels import Panel
+    from crashhunt.recording import Recording
+
+__all__ = ["FilmOptions", "Layout", "Shot", "check_places", "frames", "write_frames", "write_gif", "write_video"]
+
+_PANEL = (240, 160)
+_PAPER = 255
+_SHOWN_S = 10.0  # of the built-in curves
+_BUILTIN = ("time to collision s", "gap to the other m", "speed m/s", "action")
+_NEAREST = "nearest gap m"  # of a crash that has no other one
+_WITHOUT_SCENE = ("reward", "action")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmOptions:
+    """What a film looks like.
+
+    Args:
+        fps: pictures a second; as many as there are steps by default, so that it runs in real time.
+        size: of the scene, in pixels.
+        last_s: only the last so many seconds; 0 for all.
+        last_step_repeats: how often the last picture is shown again.
+        blank_frames: between two crashes.
+        panels: whether to show panels at all.
+        scale: pixels a metre.
+    """
+
+    fps: float = 0.0
+    size: tuple[int, int] = (960, 540)
+    last_s: float = 0.0
+    last_step_repeats: int = 10
+    blank_frames: int = 10
+    panels: bool = True
+    scale: float = 8.0
+
+    def __post_init__(self) -> None:
+        for name, value, least in (
+            ("--fps", self.fps, 0), ("--last-seconds", self.last_s, 0), ("--blank-frames", self.blank_frames, 0),
+            ("--last-step-repeats", self.last_step_repeats, 0), ("--size", min(self.size), 64),
+        ):  # fmt: skip
+            if not value >= least or not math.isfinite(value):
+                raise UsageError(f"{name} is {value:g}", fix=f"give at least {least}")
+        if max(self.size) > 8192:
+            raise UsageError(f"--size is {self.size[0]}x{self.size[1]}", fix="give at most 8192 each way")
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One crash of a film.
+
+    Args:
+        recording: what to show.
+        lanes: of its map.
+        agent: whom to follow.
+        other: the one it crashed with.
+        crash_step: where the crash is.
+        panels: step to the agent's own panels, by label, as pictures.
+        meanings: what the numbers of its discrete actions stand for, where that is known.
+    """
+
+    recording: Recording
+    lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    agent: str
+    other: str
+    crash_step: int
+    panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]
+    meanings: Sequence[str] = ()
+
+
+class Layout:
+    """Where panels go: beside the scene or below it, whichever makes the smaller picture; decided once.
+
+    Args:
+        frame: width and height of the scene.
+        labels: of all panels.
+        panel: width and height of one.
+    """
+
+    def __init__(self, frame: tuple[int, int], labels: Sequence[str], panel: tuple[int, int] = _PANEL) -> None:
+        width, height = frame
+        count = len(labels)
+        rows = max(1, height // panel[1])
+        columns = max(1, width // panel[0])
+        beside = width + math.ceil(count / rows) * panel[0], max(height, min(rows, count) * panel[1])
+        below = max(width, min(columns, count) * panel[0]), height + math.ceil(count / columns) * panel[1]
+        self.places: dict[str, tuple[int, int]] = {}
+        if beside[0] * beside[1] <= below[0] * below[1]:
+            self.size = beside
+            for number, label in enumerate(labels):
+                self.places[label] = width + number // rows * panel[0], number % rows * panel[1]
+        else:
+            self.size = below
+            for number, label in enumerate(labels):
+                self.places[label] = number % columns * panel[0], height + number // columns * panel[1]
+        # What players expect: an even number of pixels each way.
+        self.size = self.size[0] + self.size[0] % 2, self.size[1] + self.size[1] % 2
+
+    def compose(self, scene: NDArray[np.uint8], panels: Mapping[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """Return one picture; a panel that is not there leaves its place white."""
+        picture = np.full((self.size[1], self.size[0], 3), _PAPER, np.uint8)
+        picture[: scene.shape[0], : scene.shape[1]] = scene
+        for label, panel in panels.items():
+            if label in self.places:
+                x, y = self.places[label]
+                picture[y : y + panel.shape[0], x : x + panel.shape[1]] = panel
+        return picture
+
+
+def check_places(*, video: Path | None = None, gif: Path | None = None, folder: Path | None = None) -> None:
+    """Find out before a film is made whether it can be written.
+
+    Raises:
+        UsageError: a name has the wrong ending or is in no folder, the folder for frames has something in it, or PyAV
+            is not installed.
+    """
+    for option, place, ending in (("--video", video, ".mp4"), ("--gif", gif, ".gif"), ("--frames", folder, "")):
+        if place is None:
+            continue
+        if ending and place.suffix != ending:
+            raise UsageError(f"{option} {str(place)!r} does not end in {ending}", fix="name it so")
+        if not place.parent.is_dir():
+            raise UsageError(f"{option} {str(place)!r}: there is no folder {str(place.parent)!r}", fix="make it first")
+    if folder is not None and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise UsageError(f"--frames {str(folder)!r} is not an empty folder", fix="name one that is new")
+    if video is not None:
+        try:
+            import av  # noqa: F401
+        except ImportError as error:
+            raise UsageError(
+                f"--video needs PyAV: {error}", fix="pip install 'crashhunt[video]', or give --gif or --frames"
+            ) from None
+
+
+def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.uint8]]:
+    """Yield the pictures of a film, all of the same size."""
+    labels: dict[str, None] = {}
+    if options.panels:
+        for shot in shots:
+            labels |= dict.fromkeys(_builtin_labels(shot) if shot.recording.actors else _WITHOUT_SCENE)
+        for shot in shots:
+            for panels in shot.panels.values():
+                labels |= dict.fromkeys(panels)
+    layout = Layout(options.size, list(labels))
+    for number, shot in enumerate(shots):
+        if number:
+            blank = np.full((layout.size[1], layout.size[0], 3), _PAPER, np.uint8)
+            yield from [blank] * options.blank_frames
+        view = SceneView(
+            shot.recording,
+            shot.lanes,
+            agent=shot.agent,
+            other=shot.other,
+            width=options.size[0],
+            height=options.size[1],
+            scale=options.scale,
+            crash_step=shot.crash_step,
+        )
+        builtin = _Builtin(shot) if options.panels else None
+        last: tuple[int, NDArray[np.uint8]] | None = None
+        for step in _steps(shot, options):
+            if last is None or last[0] != step:
+                drawn: dict[str, NDArray[np.uint8]] = {}
+                if builtin is not None:
+                    drawn |= shot.panels.get(step, {})
+                    drawn |= {label: panel.draw(*_PANEL, label) for label, panel in builtin.panels(step)}
+                last = step, layout.compose(view.draw(step), drawn)
+            yield last[1]
+        if last is not None:
+            yield from [last[1]] * options.last_step_repeats
+
+
+def _count(shots: Sequence[Shot], options: FilmOptions) -> int:
+    """Return how many pictures `frames` yields."""
+    shown = sum(len(_steps(shot, options)) + options.last_step_repeats for shot in shots)
+    return shown + max(0, len(shots) - 1) * options.blank_frames
+
+
+def _frame_rate(shots: Sequence[Shot], options: FilmOptions) -> float:
+    """Return how many pictures a second the film has."""
+    return options.fps or 1.0 / min(shot.recording.prologue.step_length_s for shot in shots)
+
+
+def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
+    """Write an MP4 file, all of it or nothing; return how many pictures it has.
+
+    Raises:
+        HuntDirectoryError: the file cannot be written.
+    """
+    from fractions import Fraction
+
+    import av
+
+    count = 0
+    with whole_file(path) as temporary, av.open(str(temporary), "w") as container:
+        stream: Any = None
+        for picture in watched(frames(shots, options), _count(shots, options), watch):
+            if stream is None:
+                rate = Fraction(_frame_rate(shots, options)).limit_denominator(1000)
+                stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
+                stream.height, stream.width = picture.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            count += 1
+        if stream is not None:
+            container.mux(stream.encode())
+    return count
+
+
+def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
+    """Write an animated GIF; return how many pictures it has.
+
+    Raises:
+        HuntDirectoryError: the file cannot be written.
+    """
+    pictures = [
+        Image.fromarray(picture).quantize(64)
+        for picture in watched(frames(shots, options), _count(shots, options), watch)
+    ]
+    with whole_file(path) as temporary:
+        pictures[0].save(
+            temporary,
+            save_all=True,
+            append_images=pictures[1:],
+            duration=max(20, round(1000 / _frame_rate(shots, options))),  # players slow down what is faster
+            loop=0,
+        )
+    return len(pictures)
+
+
+def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, watch: Watch | None = None) -> int:
+    """Write ``000000.png`` and so on; return how many.
+
+    Raises:
+        HuntDirectoryError: the folder cannot be written.
+    """
+    made: list[Path] = []
+    new = not folder.exists()
+    try:
+        folder.mkdir(exist_ok=True)
+        for picture in watched(frames(shots, options), _count(shots, options), watch):
+            made.append(folder / f"{len(made):06d}.png")
+            Image.fromarray(picture).save(made[-1])
+    except BaseException as error:  # Ctrl-C too: half a film is none, and would be in the way of the next
+        for path in made:
+            path.unlink(missing_ok=True)
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            raise cannot_write(folder, error) from error
+        raise
+    return len(made)
+
+
+def _builtin_labels(shot: Shot) -> tuple[str, ...]:
+    return _BUILTIN if shot.other else (_BUILTIN[0], _NEAREST, *_BUILTIN[2:])
+
+
+class _Builtin:
+    """The panels that every agent has: how near it came, and what it decided."""
+
+    def __init__(self, shot: Shot) -> None:
+        recording, agent = shot.recording, shot.agent
+        scenes = recording.scenes()
+        self._dt = recording.prologue.step_length_s
+        self._times, self._gaps, _ = approaches([scene.frame for scene in scenes], agent)
+        if shot.other:
+            moments = {moment.step: moment for moment in Encounter(recording, agent, shot.other).moments}
+            self._gaps = np.array([moments[n].gap_m if n in moments else np.nan for n in range(len(scenes))])
+        rows = [scene.roster.index.get(agent) for scene in scenes]
+        self._speeds = np.array(
+            [np.nan if row is None else scene.speeds[row] for scene, row in zip(scenes, rows, strict=True)]
+        )
+        self._rewards = np.array([step.rewards.get(agent, 0.0) for step in recording.all_steps if step.whole])
+        self._seconds = np.array([scene.time_s for scene in scenes])
+        self._shot = shot
+        channel = next((found for found in recording.prologue.agents if found.id == agent), None)
+        self._names = tuple(channel.action_names) if channel is not None else ()
+        taken = [step.actions[agent] for step in recording.all_steps if agent in step.actions]
+        spread = np.array(taken).reshape(len(taken), -1) if taken else np.zeros((1, 1))
+        # The bounds are not recorded; what was decided in the whole episode says enough.
+        self._low, self._high = np.minimum(spread.min(axis=0), 0.0), np.maximum(spread.max(axis=0), 1.0)
+
+    def panels(self, step: int) -> list[tuple[str, Panel]]:
+        """Return label and panel."""
+        first = max(0, step - round(_SHOWN_S / self._dt))
+        part = slice(first, step + 1)
+        x = self._seconds[part]
+        times = np.where(np.isfinite(self._times[part]), np.minimum(self._times[part], 10.0), np.nan)
+        found: list[tuple[str, Panel]] = [
+            (_BUILTIN[0], Curve(times, x, low=0.0, high=10.0)),
+            (_builtin_labels(self._shot)[1], Curve(np.minimum(self._gaps[part], 100.0), x, low=0.0)),
+            (_BUILTIN[2], Curve(self._speeds[part], x, low=0.0)),
+        ]
+        if not self._shot.recording.actors:
+            found = [(_WITHOUT_SCENE[0], Curve(self._rewards[part], x))]
+        action = self._shot.recording.all_steps[step].actions.get(self._shot.agent)
+        if action is not None:
+            value = action.reshape(-1)
+            if value.size == 1 and np.issubdtype(value.dtype, np.integer):
+                found.append((_BUILTIN[3], Action(int(value[0]), names=self._shot.meanings)))
+            else:
+                found.append((_BUILTIN[3], Action(value, self._low, self._high, self._names)))
+        return found
+
+
+def _steps(shot: Shot, options: FilmOptions) -> list[int]:
+    """Which step each picture shows."""
+    dt, last = shot.recording.prologue.step_length_s, shot.recording.steps
+    first = max(0, last - round(options.last_s / dt)) if options.last_s else 0
+    fps = options.fps or 1.0 / dt
+    count = math.floor((last - first) * dt * fps + 1e-6) + 1
+    steps = [min(last, first + int(number / fps / dt + 1e-6)) for number in range(count)]
+    return steps if steps[-1] == last else [*steps, last]

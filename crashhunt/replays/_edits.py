@@ -1,0 +1,136 @@
+"""A recorded trial with something changed on purpose: by hand in ``hunt.toml``, or on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import ArgumentError, UsageError
+from crashhunt.base.names import did_you_mean, listed
+from crashhunt.trial import Constant, parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.plans import ArgumentSpec, HuntSettings
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["Edits", "edited_spec"]
+
+Values = dict[tuple[str, str], Any]  # (agent, or empty for the scenario; name) to value
+
+
+@dataclass(frozen=True, slots=True)
+class Edits:
+    """What is not as it was recorded, in words.
+
+    Args:
+        agents: who drives, and with which arguments.
+        others: everything else: traffic, length, what counts. If a crash does not come again, that may be why.
+        ignored: what is written otherwise in ``hunt.toml`` and makes no difference to a replay.
+    """
+
+    agents: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """What makes it another trial."""
+        return (*self.agents, *self.others)
+
+
+def edited_spec(
+    recorded: TrialSpec, settings: HuntSettings, original: HuntSettings, changes: Mapping[str, str]
+) -> tuple[TrialSpec, Edits]:
+    """Return the trial as it is to be replayed, and what is not as it was recorded.
+
+    Args:
+        recorded: the trial.
+        settings: ``hunt.toml`` as it is now.
+        original: ``hunt.toml`` as it was when the trial ran.
+        changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
+
+    Raises:
+        ArgumentError: an argument does not exist, or a range is given where it takes one value.
+    """
+    agents: list[str] = []
+    others: list[str] = []
+    values: Values = {}
+    before, after = _specs(original), _specs(settings)
+    for key in sorted(before.keys() | after.keys()):
+        spec = after.get(key)
+        if spec is not None and spec != before.get(key):
+            values[key] = _constant(spec.spec, spec, f"hunt.toml, {_name(key)}")
+    for agent, chosen in settings.agents.items():
+        if agent in original.agents and chosen.agent != original.agents[agent].agent:
+            agents.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
+    for name in ("max_steps", "crash_on", "events", "oracles"):
+        before_it, now = getattr(original, name), getattr(settings, name)
+        if before_it != now:
+            longer = name == "max_steps" and now > before_it  # which leaves nothing out
+            (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
+    for name, text in changes.items():
+        key = _find(name, recorded, settings)
+        values[key] = _constant(text, after.get(key), f"--set {name}")
+    arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
+    scenario_arguments = dict(recorded.scenario_arguments)
+    for (agent, name), value in values.items():
+        target = arguments.setdefault(agent, {}) if agent else scenario_arguments
+        if name not in target or target[name] != value:
+            (agents if agent else others).append(
+                f"{_name((agent, name))} was {target.get(name, '(not there)')} and is {value}"
+            )
+            target[name] = value
+    max_steps = settings.max_steps if settings.max_steps != original.max_steps else recorded.max_steps
+    trial = replace(recorded, arguments=arguments, scenario_arguments=scenario_arguments, max_steps=max_steps)
+    kept = [
+        f"{name} was {was} and is {now} in hunt.toml; a replay keeps that of the recorded trial"
+        for name in ("seed", "scenario")
+        if (was := getattr(original, name)) != (now := getattr(settings, name))
+    ]
+    return trial, Edits(tuple(agents), tuple(others), tuple(kept))
+
+
+def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:
+    found = {("", name): spec for name, spec in settings.scenario_arguments.items()}
+    for agent, chosen in settings.agents.items():
+        found |= {(agent, name): spec for name, spec in chosen.arguments.items()}
+    return found
+
+
+def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Any:
+    distribution = parse_spec(text, spec.kind if spec else None, where=where)
+    if not isinstance(distribution, Constant):
+        raise ArgumentError(f"{where}: {text!r} is not one value, and a replay needs one", fix="give a value")
+    return distribution.value
+
+
+def _find(name: str, recorded: TrialSpec, settings: HuntSettings) -> tuple[str, str]:
+    for agent in sorted(recorded.arguments, key=len, reverse=True):
+        if name.startswith(f"{agent}."):
+            return agent, name.removeprefix(f"{agent}.")
+    takers = [agent for agent, values in recorded.arguments.items() if name in values]
+    if len(takers) > 1:
+        raise UsageError(
+            f"--set {name}: several agents take it", fix="write " + " or ".join(f"{agent}.{name}=…" for agent in takers)
+        )
+    if takers:
+        return takers[0], name
+    if name in recorded.scenario_arguments:
+        return "", name
+    bare = {_name(key): key[1] for key in _specs(settings)}
+    known = list(bare)
+    near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(name, [part]))
+    hint = did_you_mean(name, known) or next(near, "")
+    fix = f"{hint} it has {listed(known)}".lstrip()
+    raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=fix)
+
+
+def _name(key: tuple[str, str]) -> str:
+    agent, name = key
+    return f"{agent}.{name}" if agent else name
+
+
+def _plain(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

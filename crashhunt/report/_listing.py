@@ -1,0 +1,100 @@
+"""Lists of what there is: agents and scenarios, with their arguments, ranges and units."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import locate, registered
+from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.trial import signature_of, without_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from crashhunt.trial import Argument
+
+__all__ = ["describe", "list_agents", "list_scenarios"]
+
+
+def list_agents() -> list[dict[str, Any]]:
+    """Return the registered agents. One that cannot be imported is listed with a warning: nobody asked for it."""
+    found: list[dict[str, Any]] = []
+    for name, point in registered("agents").items():
+        entry: dict[str, Any] = {"name": name, "locator": point.value}
+        try:
+            factory = locate("agents", name)
+            entry["title"] = (inspect.getdoc(factory) or "").partition("\n")[0]
+            entry["arguments"] = _arguments(signature_of(factory).arguments.values())
+        except CrashhuntError as error:
+            entry |= {"title": "", "arguments": [], "warning": str(error)}
+        found.append(entry)
+    return found
+
+
+def list_scenarios() -> list[dict[str, Any]]:
+    """Return the scenarios that come with crashhunt."""
+    found = []
+    for name in shipped_scenarios():
+        scenario = load_scenario(name)
+        found.append(
+            {
+                "name": name,
+                "locator": ", ".join(f"{agent} driven by {setup.agent}" for agent, setup in scenario.agents.items()),
+                "title": scenario.title,
+                "simulator": scenario.simulator,
+                "arguments": _arguments(scenario.scenario_arguments().values()),
+                "agents": {agent: _arguments(scenario.agent_arguments(agent).values()) for agent in scenario.agents},
+            }
+        )
+    return found
+
+
+def describe(entries: list[dict[str, Any]]) -> str:
+    """Return a list for people."""
+    blocks = []
+    for entry in entries:
+        lines = [f"{entry['name']}  ({entry['locator']})", f"    {entry['title']}"]
+        lines += _table("    ", entry["arguments"])
+        for agent, arguments in entry.get("agents", {}).items():
+            if arguments:
+                lines += [f"    arguments of {agent}, as they are hunted here:", *_table("        ", arguments)]
+        blocks.append("\n".join(lines))
+    return "\n\n".join(blocks)
+
+
+def _arguments(arguments: Iterable[Argument]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": argument.name,
+            "kind": argument.kind,
+            "default": argument.default,
+            "range": str(argument.distribution) if argument.distribution is not None else None,
+            "unit": argument.unit,
+            "help": argument.help,
+        }
+        for argument in arguments
+    ]
+
+
+def _table(indent: str, arguments: list[dict[str, Any]]) -> list[str]:
+    rows = [
+        (
+            entry["name"],
+            entry["range"] or "",
+            f"default {without_folder(entry['default'])}"
+            if entry["default"] is not None
+            else "required"
+            if not entry["range"]
+            else "",
+            entry["unit"],
+            entry["help"],
+        )
+        for entry in arguments
+    ]
+    widths = [max((len(row[column]) for row in rows), default=0) for column in range(4)]
+    return [
+        (indent + "  ".join(cell.ljust(width) for cell, width in zip(row, [*widths, 0], strict=True))).rstrip()
+        for row in rows
+    ]

@@ -1,0 +1,45 @@
+"""A digest of what a scenario is: its files, and what it says."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.integrity import digest_of_file
+
+if TYPE_CHECKING:
+    from crashhunt.scenario._scenario import Scenario
+
+__all__ = ["as_plain_data", "digest_of_described", "scenario_digest"]
+
+
+def scenario_digest(scenario: Scenario) -> str:
+    """Return a digest of the scenario's files and of what it says, whoever drives in it."""
+    files = {name: {"blake2b": digest_of_file(scenario.folder / name)} for name in scenario.files()}
+    says = as_plain_data(scenario)
+    del says["agents"]
+    return digest_of_described({**files, "": {"blake2b": json.dumps(says, sort_keys=True)}})
+
+
+def digest_of_described(files: dict[str, Any], *, says: object = None) -> str:
+    """Return a digest of files that have been described (name to an entry with ``blake2b``), and of plain data."""
+    content: Any = {name: entry["blake2b"] for name, entry in files.items()}
+    text = json.dumps(content if says is None else [content, says], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def as_plain_data(scenario: Scenario) -> dict[str, Any]:
+    """Return what a scenario says, as TOML can hold it, without what is nobody's business but this process's."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items() if item is not None}
+        return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+    data: dict[str, Any] = plain(asdict(replace(scenario, folder=Path())))
+    if not data["events"]:
+        del data["events"]  # which an earlier crashhunt does not know
+    return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}

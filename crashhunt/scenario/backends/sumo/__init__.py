@@ -1,0 +1,5 @@
+"""SUMO as a scenario names it: its configurations, options and files, and what of them a stranger may say."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,25 @@
+from ._files import StagedFiles as StagedFiles, filled_in as filled_in
+from ._known import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
+from ._names import check_names as check_names
+from ._options import (
+    HARMLESS as HARMLESS,
+    INPUTS as INPUTS,
+    RESERVED as RESERVED,
+    canonical as canonical,
+    is_output as is_output,
+    is_shown as is_shown,
+    is_true as is_true,
+    writes as writes,
+)
+from ._says import explained as explained
+from ._sumocfg import load_sumocfg as load_sumocfg
+from ._xml import (
+    READ as READ,
+    WRITTEN as WRITTEN,
+    movable as movable,
+    nested_files as nested_files,
+    read_xml as read_xml,
+    references as references,
+    rewritten as rewritten,
+    written_by as written_by,
+)

@@ -1,0 +1,173 @@
+"""Everybody on a road at one instant, with their coordinates on the lanes: computed once, shared by all who ask."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from highway_env.vehicle.objects import Landmark
+
+from crashhunt.simulators.accelerator._known import kinds_of
+
+if TYPE_CHECKING:
+    from highway_env.road.road import Road
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
+
+    from crashhunt.simulators.accelerator._network import Network
+
+__all__ = ["Frame", "are_plain"]
+
+
+class Frame:
+    """Positions do not change while vehicles decide.
+
+    Args:
+        network: of the road.
+        road: with its vehicles and objects.
+
+    Attributes:
+        plain: whether all have a place of the usual kind; otherwise nothing here may be used.
+    """
+
+    def __init__(self, network: Network, road: Road) -> None:
+        self.network = network
+        self.road = road
+        self.things: list[RoadObject] = road.vehicles + road.objects
+        self._looks_further = road.neighbour_vehicles_connected_lanes
+        self.row = {id(thing): row for row, thing in enumerate(self.things)}
+        self.plain = are_plain(self.things)
+        if not self.plain:
+            return
+        self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
+        self._columns: dict[int, tuple[list[float], list[float]]] = {}
+        self._single: dict[tuple[int, int], tuple[float, float]] = {}
+        self._queues: dict[Any, tuple[list[float], list[RoadObject]]] = {}
+
+    def is_of(self, road: Road) -> bool:
+        """Whether everybody is still there, and where they were."""
+        things = road.vehicles + road.objects
+        # By identity: a class of somebody's may call two vehicles equal.
+        if list(map(id, things)) != list(self.row) or self._looks_further != road.neighbour_vehicles_connected_lanes:
+            return False
+        if not self.plain or not are_plain(things):
+            return False
+        return np.array_equal(np.array([thing.position for thing in things], float).reshape(-1, 2), self.places)
+
+    @cached_property
+    def on_axis(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coordinates of all on the lanes along an axis, each of shape (things, lanes)."""
+        return self.network.on_axis(self.places[:, 0], self.places[:, 1])
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Lower bounds of the distances of all from the other lanes."""
+        return self.network.box_distance(self.places[:, 0], self.places[:, 1])
+
+    def coordinates(self, row: int, lane: int) -> tuple[float, float]:
+        """Coordinates of one on one lane."""
+        if self.network.is_axis[lane]:
+            s, r = self.column(lane)
+            return s[row], r[row]
+        found = self._single.get((row, lane))
+        if found is None:
+            found = self._single[row, lane] = self.network.coordinates(lane, self.things[row].position)
+        return found
+
+    def column(self, lane: int) -> tuple[list[float], list[float]]:
+        """Coordinates of all on one lane along an axis."""
+        found = self._columns.get(lane)
+        if found is None:
+            (s, r), column = self.on_axis, self.network.column[lane]
+            found = self._columns[lane] = s[:, column].tolist(), r[:, column].tolist()
+        return found
+
+    def neighbours(self, vehicle: RoadObject, row: int, key: Any) -> tuple[Any, Any] | None:
+        """Who is ahead and who is behind on a lane: `Road.neighbour_vehicles`. None where that must be asked."""
+        lane = self.network.index.get(key)
+        if lane is None:
+            return None
+        queue = self._queues.get(lane)
+        if queue is None:
+            queue = self._queues[lane] = self._queue(lane)
+        places, things = queue
+        s = self.coordinates(row, lane)[0]
+        if s != s:
+            return None, None
+        ahead = behind = None
+        at = s
+        first = bisect_left(places, s)
+        for number in range(first, len(places)):  # of those in the same place, the last one counts
+            if things[number] is not vehicle:
+                if ahead is not None and places[number] != at:
+                    break
+                ahead, at = things[number], places[number]
+        for number in range(first - 1, -1, -1):  # and here the first one
+            if things[number] is not vehicle:
+                if behind is not None and places[number] != at:
+                    break
+                behind, at = things[number], places[number]
+        return ahead, behind
+
+    def _queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
+        """Those on a lane, and with it on those that lead to it and on from it, by their place along it."""
+        if not self._looks_further:
+            found = self._on_lane(lane)
+        else:
+            found = []
+            seen: set[int] = set()
+            for other, offset in self._connected(lane):
+                for s, row in self._on_lane(other):
+                    if row not in seen:  # the first lane on which it is decides
+                        seen.add(row)
+                        found.append((s + offset, row))
+        found.sort()
+        return [s for s, _ in found], [self.things[row] for _, row in found]
+
+    def _on_lane(self, lane: int) -> list[tuple[float, int]]:
+        network = self.network
+        if network.is_axis[lane]:
+            s, r = self.column(lane)
+            rows: Any = range(len(self.things))
+        else:
+            limit = network.half_widths[lane] + 5
+            rows = np.flatnonzero(self.boxes[:, network.column[lane]] <= limit).tolist()
+        found = []
+        for row in rows:
+            place = (s[row], r[row]) if network.is_axis[lane] else self.coordinates(row, lane)
+            if network.is_on(lane, *place) and not isinstance(self.things[row], Landmark):
+                found.append((place[0], row))
+        return found
+
+    def _connected(self, lane: int) -> list[tuple[int, float]]:
+        """The lane, those that follow and those that lead to it, each with the offset of its coordinates."""
+        graph, network = self.road.network.graph, self.network
+        start, end, number = network.keys[lane]
+        found = [(lane, 0.0)]
+        for after, lanes in graph.get(end, {}).items():
+            if lanes:
+                chosen = number if number < len(lanes) else 0
+                found.append((network.index[end, after, chosen], network.lanes[lane].length))
+        for before, ends in graph.items():
+            lanes = ends.get(start, [])
+            if lanes:
+                chosen = network.index[before, start, number if number < len(lanes) else 0]
+                found.append((chosen, -network.lanes[chosen].length))
+        return found
+
+
+def are_plain(things: list[RoadObject]) -> bool:
+    """Whether all have a place of the usual kind, which nobody else has; nobody is on the road twice."""
+    if not all(kind.plain for kind in kinds_of(things)):
+        return False
+    positions = [thing.position for thing in things]
+    return (
+        len(set(map(id, things))) == len(set(map(id, positions))) == len(things)
+        and all(type(position) is np.ndarray and position.dtype is _FLOAT for position in positions)
+        and all(position.shape == (2,) for position in positions)
+    )
+
+
+_FLOAT = np.dtype(np.float64)

@@ -1,0 +1,239 @@
+"""What the accelerator knows: versions of highway-env by their source, and classes by their methods."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import logging
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import highway_env
+import numpy as np
+from highway_env.envs.common import observation
+from highway_env.vehicle import behavior, controller, kinematics, objects
+
+from crashhunt.simulators.accelerator._versions import ACCELERATED
+from crashhunt.simulators.accelerator._watch import MODULES, is_plain
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+__all__ = ["Kind", "Own", "are_numbers", "kind_of", "kinds_of", "left_alone", "originals", "reason_against"]
+
+_MODULES = (*MODULES[:1], observation, *MODULES[1:])  # in this order they are digested
+
+_COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
+_MOVES = ("step", "clip_actions", "on_state_update")
+_DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
+_DRIVES += ("change_lane_policy", "mobil")
+_PREDICTS = ("predict_trajectory_constant_speed",)
+_DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
+_SPECIAL = (
+    "__bool__", "__len__", "__eq__", "__ne__", "__lt__", "__hash__", "__getattribute__", "__getattr__", "__setattr__",
+    "__delattr__", "__copy__", "__deepcopy__", "__reduce__", "__reduce_ex__", "__getstate__", "__setstate__",
+    "__class__", "__array__", "__float__", "__iter__", "__getitem__", "__contains__", "__add__", "__radd__",
+)  # fmt: skip
+"""A class with one of these of its own may do anything wherever highway-env touches it."""
+_VALUES = (
+    "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
+    "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
+    "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log",
+)  # fmt: skip
+"""What vehicles have, each its own: values, and read as often as is convenient."""
+_BASES = {
+    behavior.IDMVehicle: "idm",
+    controller.MDPVehicle: "controlled",
+    controller.ControlledVehicle: "controlled",
+    kinematics.Vehicle: "nothing",
+    objects.Obstacle: "",
+    objects.Landmark: "",
+    objects.RoadObject: "",
+}
+_METHODS = frozenset((*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
+_ORIGINALS = {
+    (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
+}
+_OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
+
+originals: dict[str, Any] = {}
+"""The methods of highway-env that are replaced, by name, as they were; nothing before the first time."""
+
+
+class Own:
+    """What a class of somebody's has instead of what its base in highway-env has.
+
+    Args:
+        kind: the class.
+        base: in highway-env.
+        values: names that have to be mere values.
+    """
+
+    def __init__(self, kind: type, base: type, values: Iterable[str]) -> None:
+        self._kind, self._base = kind, base
+        self._mro = kind.__mro__
+        # Everything that a user can have changed since: highway-env's own classes are watched elsewhere.
+        self._members = [(vars(part), tuple(vars(part).items())) for part in self._mro if part.__module__ not in _OWN]
+        values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
+        self.names = [name for name in _SPECIAL if self.has(name)]
+        self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._of(name))]
+        self.plain = type(kind) is type(base) and not self.names
+
+    def has(self, name: str) -> bool:
+        """Whether it has another member of that name than its base."""
+        return self._of(name) is not inspect.getattr_static(self._base, name, None)
+
+    def _of(self, name: str) -> Any:
+        return inspect.getattr_static(self._kind, name, None)
+
+    @property
+    def current(self) -> bool:
+        """Whether the class is still what it was."""
+        return self._kind.__mro__ is self._mro and all(
+            len(space) == len(seen)
+            and all(a is b and v is w for (a, v), (b, w) in zip(space.items(), seen, strict=True))
+            for space, seen in self._members
+        )
+
+
+class Kind:
+    """What is known about a class of vehicles or objects: what it leaves as its base in highway-env has it.
+
+    Args:
+        kind: the class.
+
+    Attributes:
+        plain: whether what it is made of is mere values, wherever they are read.
+        collides: whether it collides as that does.
+        moves: whether it moves so.
+        times: whether it counts the time since it last thought of changing lanes.
+        drives: how it decides: ``idm``, ``controlled``, ``nothing``; empty where that is not known.
+        predicts: whether where it will be is foreseen so.
+        describes: whether it describes itself so.
+        methods: all names that an object must not have of its own.
+    """
+
+    def __init__(self, kind: type) -> None:
+        base = next((base for base in kind.__mro__ if base in _BASES), None)
+        self.own = Own(kind, base or kind, _VALUES)
+        self.plain = base is not None and self.own.plain
+
+        def leaves(names: tuple[str, ...]) -> bool:
+            return self.plain and all(
+                inspect.getattr_static(kind, name, None) is _ORIGINALS[base, name] for name in names
+            )
+
+        moving = issubclass(kind, kinematics.Vehicle)
+        self.collides = leaves(_COLLIDES)
+        self.moves = moving and self.collides and leaves(_MOVES)
+        self.times = base is behavior.IDMVehicle
+        self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
+        self.predicts = moving and self.collides and leaves((*_PREDICTS, *_MOVES, *_DRIVES))
+        self.describes = self.collides and leaves(_DESCRIBES)
+        self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
+        if moving and not (self.moves and self.drives):
+            own = self.own.names + [
+                name for name in sorted(_METHODS)
+                if base is not None and inspect.getattr_static(kind, name, None) is not _ORIGINALS[base, name]
+            ]  # fmt: skip
+            name = f"{kind.__module__}.{kind.__qualname__}"
+            if left_alone.get(name) != own:
+                left_alone[name] = own
+                logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
+
+    def is_of(self, thing: Any) -> bool:
+        """Whether an object has no method of its own instead of its class's."""
+        return self.methods.isdisjoint(vars(thing))
+
+
+left_alone: dict[str, list[str]] = {}
+"""The classes that have been met and are not sped up, or not wholly, with what they have of their own."""
+
+
+def kind_of(kind: type) -> Kind:
+    """Return what is known about a class, as it is now."""
+    found = _kinds.get(kind)
+    if found is None or not found.own.current:
+        found = _kinds[kind] = Kind(kind)
+    return found
+
+
+def kinds_of(things: Iterable[Any]) -> list[Kind]:
+    """Return what is known about the class of each object."""
+    types = list(map(type, things))
+    known = {kind: kind_of(kind) for kind in set(types)}
+    return [known[kind] for kind in types]
+
+
+_kinds: dict[type, Kind] = {}
+
+
+def are_numbers(values: Iterable[Any]) -> bool:
+    """Whether arithmetic on all of these is that of Python's and NumPy's usual numbers."""
+    return _NUMBERS.issuperset(map(type, values))
+
+
+_NUMBERS = frozenset((float, int, np.float64))
+
+
+def reason_against() -> str:
+    """Say why the accelerator must not be used in this process; empty where it may."""
+    version = highway_env.__version__
+    if version not in ACCELERATED:
+        return f"highway-env {version} is not known to it; it knows {', '.join(ACCELERATED)}"
+    digest = hashlib.blake2b(digest_size=8)
+    for module in _MODULES:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    if digest.hexdigest() != ACCELERATED[version]:
+        return f"the installed highway-env {version} is not the published one"
+    for name, function in _functions():
+        place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
+        if place not in _FILES:
+            return f"{name} has been replaced by {place}"
+        if function.__qualname__ != name:  # such as another method of its own
+            return f"{name} has been replaced by {function.__qualname__}"
+    if not hasattr(np, "vecdot"):
+        return f"it needs NumPy 2.0, and {np.__version__} is installed"
+    if not _arrays_equal_scalars():
+        return "NumPy's functions give other results for arrays than for single numbers on this processor"
+    return ""
+
+
+_FILES = {str(module.__file__) for module in _MODULES}
+
+
+def _functions() -> Iterator[tuple[str, Any]]:
+    """All functions and methods that the sources of the modules define, by name, as they are now."""
+    for module in _MODULES:
+        source = Path(str(module.__file__)).read_text(encoding="utf-8")
+        for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE):
+            owner = getattr(module, name)
+            members = vars(owner).items() if kind == "class" else [("", owner)]
+            for member, found in members:
+                function = getattr(found, "fget", None) or getattr(found, "__func__", found)
+                if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
+                    yield f"{name}.{member}".rstrip("."), inspect.unwrap(function)
+
+
+def _arrays_equal_scalars() -> bool:
+    """Whether the functions that are used on arrays give the very numbers that highway-env gets one at a time."""
+    rng = np.random.default_rng(0)
+    values, others = rng.normal(size=203) * 10.0 ** rng.integers(-6, 3, 203).astype(float), rng.uniform(3.5, 4.5, 203)
+    inside = np.clip(values, -1.0, 1.0)
+    for function in (np.cos, np.sin, np.tan, np.arctan, np.arcsin):
+        if function(inside).tolist() != [function(value) for value in inside.tolist()]:
+            return False
+        if function is not np.arcsin and function(values).tolist() != [function(value) for value in values.tolist()]:
+            return False
+    if ((values + np.pi) % (2 * np.pi)).tolist() != [float((value + np.pi) % (2 * np.pi)) for value in values.tolist()]:
+        return False
+    bases = np.abs(values)
+    powers = [np.power(base, exponent) for base, exponent in zip(bases.tolist(), others.tolist(), strict=True)]
+    if np.power(bases, others).tolist() != powers:
+        return False
+    if np.power(values, 2).tolist() != [np.power(value, 2) for value in values.tolist()]:
+        return False
+    pairs, against = rng.normal(size=(203, 2)), rng.normal(size=(203, 2))
+    products = [float(np.dot(one, two)) for one, two in zip(pairs, against, strict=True)]
+    return bool(np.vecdot(pairs, against).tolist() == products)

@@ -1,0 +1,101 @@
+"""What an environment of highway-env is told, and what it must not leave behind."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any
+
+from highway_env.vehicle.objects import RoadObject
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.base.names import did_you_mean
+from crashhunt.simulators._options import as_tables, merge
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.scenario import Scenario
+
+__all__ = ["configured", "mistake", "restore_classes"]
+
+_pristine: dict[type, dict[str, Any]] = {}
+
+
+def configured(default: Mapping[str, Any], scenario: Scenario, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the configuration of an environment for one trial.
+
+    Args:
+        default: the environment's own.
+        scenario: with what differs from it, and how many vehicles are controlled.
+        arguments: of the scenario.
+
+    Raises:
+        ScenarioError: an entry does not exist, or values do not go together.
+    """
+    assert scenario.highway is not None
+    config = deepcopy(dict(default))
+    tables = [deepcopy(scenario.highway.config), *as_tables(scenario, arguments)]
+    for table in tables:
+        _check_keys(scenario, config, table)
+        merge(config, table)
+    if "duration" in config and not any("duration" in table for table in tables):
+        config["duration"] = math.inf
+    policy, simulation = config["policy_frequency"], config["simulation_frequency"]
+    if not 0 < policy <= simulation:
+        message = f"is not above 0 and at most simulation_frequency, {simulation}"
+        raise mistake(scenario, "config.policy_frequency", policy, message, "change one of the two")
+    _let_in(scenario, config)
+    _use_tuples(config["observation"])
+    return config
+
+
+def mistake(scenario: Scenario, key: str, value: object, message: str, fix: str) -> ScenarioError:
+    """Return the error that says what is wrong in the table ``[highway]``."""
+    return ScenarioError(f"highway.{key} = {value!r} {message}", fix=fix, where=scenario.origin)
+
+
+def restore_classes() -> None:
+    """Undo what environments change in classes, such as the jam distance of all drivers, for the next episode."""
+    waiting: list[type] = [RoadObject]
+    while waiting:
+        kind = waiting.pop()
+        waiting += kind.__subclasses__()
+        plain = {name: value for name, value in vars(kind).items() if isinstance(value, int | float | str)}
+        was = _pristine.setdefault(kind, plain)
+        if plain != was:
+            for name in plain.keys() - was.keys():
+                delattr(kind, name)
+            for name, value in was.items():
+                setattr(kind, name, value)
+
+
+def _let_in(scenario: Scenario, config: dict[str, Any]) -> None:
+    """As many controlled vehicles as the scenario has agents."""
+    count = len(scenario.agents)
+    if "controlled_vehicles" in config:
+        config["controlled_vehicles"] = count
+    elif count > 1:
+        assert scenario.highway is not None
+        message = f"has one controlled vehicle, not {count}"
+        raise mistake(scenario, "id", scenario.highway.id, message, "name one agent")
+    if count > 1:
+        for key in ("action", "observation"):
+            if not config[key]["type"].startswith("MultiAgent"):
+                config[key] = {"type": f"MultiAgent{key.capitalize()}", f"{key}_config": config[key]}
+
+
+def _check_keys(scenario: Scenario, config: Mapping[str, Any], table: Mapping[str, Any]) -> None:
+    for key in table:
+        if key not in config and not key.endswith("_reward"):  # which is 0 where it is not there
+            fix = did_you_mean(key, config) or f"it has {', '.join(config)}"
+            raise mistake(scenario, "config", key, "is no entry of the environment's configuration", fix)
+
+
+def _use_tuples(table: Any) -> None:
+    """Make the shapes in the configuration of an observation tuples, which TOML does not have."""
+    for inner in table.values() if isinstance(table, dict) else table:
+        if isinstance(inner, dict | list):
+            _use_tuples(inner)
+    if isinstance(table, dict) and "observation_shape" in table:
+        table["observation_shape"] = tuple(table["observation_shape"])

@@ -1,0 +1,370 @@
+"""highway-env as a simulator: any of its environments, with any configuration and any number of controlled vehicles.
+
+Its y axis points down and its headings grow clockwise; a scene has both mirrored, and is what its viewer shows.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import warnings
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # an observation may be a picture; nobody wants a window
+os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+
+import gymnasium
+import highway_env
+import numpy as np
+from gymnasium.spaces import Discrete
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
+from highway_env.envs.common.observation import MultiAgentObservation
+from highway_env.envs.parking_env import ParkingEnv
+from highway_env.vehicle.objects import Obstacle, RoadObject
+
+from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
+from crashhunt.scenario import argument_values
+from crashhunt.simulators._actions import MetaAction
+from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators._spaces import ObservationForm, action_form, native
+from crashhunt.simulators._standstill import Standstill
+from crashhunt.simulators.accelerator import switch_off, switch_on
+from crashhunt.simulators.highway._config import configured, mistake, restore_classes
+from crashhunt.world import TOLD_BY, Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import Scenario
+    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+
+__all__ = ["HighwaySimulator"]
+
+_LANE_STEP_M = 2.0  # between the points of a bend
+_LANES_EVERY = 10  # steps; how often a scene says the lane of each vehicle
+
+assert highway_env  # importing it registers its environments
+
+
+class HighwaySimulator:
+    """Runs the episodes of a scenario on highway-env, each in an environment of its own.
+
+    A control step is one of the policy's; an episode has no end in time but ``max_steps``, unless the configuration
+    gives a ``duration``. An agent that is gone while others go on idles.
+
+    Args:
+        scenario: what to run.
+        stage: not used.
+
+    Raises:
+        ScenarioError: there is no such environment, or it has no such entry or not so many vehicles.
+    """
+
+    def __init__(self, scenario: Scenario, stage: Path) -> None:
+        if scenario.highway is None:
+            raise ScenarioError("the scenario has no [highway] table", fix="add it", where=scenario.origin)
+        self._scenario = scenario
+        self._setup = scenario.highway
+        self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
+        self._possible = tuple(scenario.agents)
+        if not self._setup.accelerate:
+            switch_off()
+        elif reason := switch_on():
+            logging.getLogger(__name__).warning("the accelerator steps aside: %s", reason)
+        self.agents: list[str] = []
+        self._lane_names: dict[tuple[str, str, int], str] = {}
+        try:
+            self.reset(seed=0, options={"arguments": argument_values(scenario)})  # which says what the spaces are
+        except InvalidEpisodeError as error:
+            raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
+
+    told_events = TOLD_BY["highway"]
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Make the environment, and let everybody in."""
+        try:
+            env = self._make((options or {}).get("arguments", {}))
+            shown, _ = env.reset(seed=seed, options={"config": env.config})
+        except ScenarioError:
+            raise
+        except Exception as error:
+            message = f"highway-env could not set up the episode: {type(error).__name__}: {error}"
+            raise InvalidEpisodeError(message) from error
+        self._adopt(env)
+        self._lane_names.clear()
+        self.agents = list(self._possible)
+        self._known: dict[int, tuple[RoadObject, Actor]] = {}
+        self._counts: Counter[str] = Counter()
+        self._seen: tuple[int, ...] = ()
+        self._crashed: set[str] = set()
+        self._contacts: list[Contact] = []
+        self._steps = 0
+        self._driven = dict.fromkeys(self.agents, 0.0)
+        self._places = {agent: vehicle.position.tolist() for agent, vehicle in self._controlled.items()}
+        self._on_road = {agent: bool(vehicle.on_road) for agent, vehicle in self._controlled.items()}
+        self._watch()
+        self._standstill = Standstill(self.step_length_s, self._scenario.events)
+        self._wrong: set[str] = set()
+        self._look(())
+        return self._show(self.agents, shown), {}
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Let everybody act; the rewards are the environment's."""
+        given = [
+            native(self.actions[agent], actions[agent]) if agent in actions else self._idle(agent)
+            for agent in self._possible
+        ]
+        self._contacts = []
+        shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
+        self._steps += 1
+        off_road: list[str] = []
+        arrived: list[str] = []
+        for agent, vehicle in self._controlled.items():
+            (x, y), (was_x, was_y) = vehicle.position.tolist(), self._places[agent]
+            self._driven[agent] += math.hypot(x - was_x, y - was_y)
+            self._places[agent] = [x, y]
+            was, self._on_road[agent] = self._on_road[agent], bool(vehicle.on_road)
+            if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
+                (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
+        self._look(tuple(off_road))
+        self._scene.events = tuple([event for agent in actions for event in self._events(agent)])
+        ended = bool(terminated or truncated)
+        rewards = info.get("agents_rewards", (reward,) * len(self._possible))
+        arrived += [
+            agent for agent, over in zip(self._possible, info.get("agents_terminated", ()), strict=False) if over
+        ]
+        terminations = {agent: ended or agent in self._crashed or agent in arrived for agent in actions}
+        self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
+        return (
+            self._show(actions, shown),
+            {agent: float(rewards[self._possible.index(agent)]) for agent in actions},
+            terminations,
+            dict.fromkeys(actions, False),
+            dict.fromkeys(actions, info),
+        )
+
+    def scene(self) -> Scene:
+        """Return the state of all vehicles and obstacles."""
+        return self._scene
+
+    def lanes(self) -> list[Lane]:
+        """Return all lanes; those that bend as points 2 m apart."""
+        found = []
+        for (start, end, number), lane in self._env.road.network.lanes_dict().items():
+            count = 2 if type(lane).__name__ == "StraightLane" else max(2, math.ceil(lane.length / _LANE_STEP_M) + 1)
+            points = [lane.position(lane.length * index / (count - 1), 0.0).tolist() for index in range(count)]
+            shape = tuple((float(x), -float(y)) for x, y in points)
+            found.append(Lane(self._lane_name((start, end, number)), float(lane.width_at(lane.length / 2)), shape))
+        return found
+
+    def full_braking(self, agent: str) -> FullBraking | None:
+        """Return how a vehicle brakes as hard as its actions allow; None where they do not keep it in its lane."""
+        kind = self._kinds[agent]
+        if isinstance(kind, DiscreteMetaAction) and "SLOWER" in kind.actions_indexes:
+            return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
+        return None
+
+    def tidy(self) -> None:
+        """Undo what the environment has changed in classes."""
+        restore_classes()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
+
+    def _make(self, arguments: Mapping[str, Any]) -> AbstractEnv:
+        """Make the environment with its configuration, which the next reset applies."""
+        restore_classes()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of older versions of an id, which are asked for
+                made = gymnasium.make(self._setup.id, disable_env_checker=True)
+        except (gymnasium.error.Error, ImportError) as error:
+            message = " ".join(str(error).split())
+            raise mistake(
+                self._scenario, "id", self._setup.id, message, "give an id such as 'highway-fast-v0'"
+            ) from None
+        env = made.unwrapped
+        if not isinstance(env, AbstractEnv):
+            fix = 'write simulator = "gym"'
+            raise mistake(self._scenario, "id", self._setup.id, "is no environment of highway-env", fix)
+        env.config = configured(env.config, self._scenario, arguments)
+        return env
+
+    def _adopt(self, env: AbstractEnv) -> None:
+        """Take an environment over: its vehicles, and how its observations and actions are written."""
+        self._env = env
+        rate = env.config["simulation_frequency"]
+        self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # as long as it simulates
+        chosen = self._setup.off_road
+        self._lanes_are_road = chosen if chosen is not None else not isinstance(env, ParkingEnv)
+        self._many_act = isinstance(env.action_type, MultiAgentAction)
+        self._many_see = isinstance(env.observation_type, MultiAgentObservation)
+        kinds = env.action_type.agents_action_types if self._many_act else [env.action_type]
+        seen = env.observation_space.spaces if self._many_see else [env.observation_space]
+        self._controlled = dict(zip(self._possible, env.controlled_vehicles, strict=True))
+        self._kinds = dict(zip(self._possible, kinds, strict=True))
+        self.actions: dict[str, ActionForm] = {agent: _form(kind) for agent, kind in self._kinds.items()}
+        self._forms = dict(zip(self._possible, map(ObservationForm, seen), strict=True))
+        self.observation_spaces: dict[str, Space[Any]]
+        self.shown_spaces: dict[str, Space[Any]] = {}
+        if self._kinematics is not None:
+            self.observation_spaces = dict.fromkeys(self._possible, self._kinematics.space)
+            self.observation_names = self._kinematics.features
+        else:
+            self.observation_spaces = {agent: form.space for agent, form in self._forms.items()}
+            self.shown_spaces = {agent: form.original for agent, form in self._forms.items() if form.flattened}
+            kind = env.observation_type.agents_observation_types[0] if self._many_see else env.observation_type
+            self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
+
+    def _is_at_an_end(self, vehicle: RoadObject) -> bool:
+        """Whether it has driven straight off the end of a lane that nothing follows."""
+        along, lateral = vehicle.lane.local_coordinates(vehicle.position)
+        inside = abs(lateral) <= vehicle.lane.width_at(along) / 2
+        return inside and along > vehicle.lane.length and vehicle.lane_index[1] not in self._env.road.network.graph
+
+    def _idle(self, agent: str) -> Any:
+        kind, space = self._kinds[agent], self.actions[agent].space
+        if isinstance(kind, DiscreteMetaAction):
+            return kind.actions_indexes["IDLE"]
+        return space.n // 2 if isinstance(space, Discrete) else np.zeros(space.shape, space.dtype)
+
+    def _show(self, agents: Mapping[str, Any] | list[str], shown: Any) -> Observations:
+        if self._kinematics is not None:
+            return {agent: self._observe(agent) for agent in agents}
+        each = shown if self._many_see else (shown,)
+        return {agent: self._forms[agent].encode(each[self._possible.index(agent)]) for agent in agents}
+
+    def _observe(self, agent: str) -> NDArray[np.float32]:
+        """What the agent sees, in the layout that it has on SUMO too."""
+        assert self._kinematics is not None
+        vehicle = self._controlled[agent]
+        along, right = vehicle.lane.local_coordinates(vehicle.position)
+        start, end, number = vehicle.lane_index
+        turn = math.remainder(float(vehicle.heading) - float(vehicle.lane.heading_at(along)), math.tau)
+        return self._kinematics.observe(
+            self._scene,
+            self._scene.roster.index[agent],
+            distance=self._driven[agent],
+            from_left=float(right) + number * float(vehicle.lane.width_at(along)),
+            lateral_speed=float(vehicle.speed) * math.sin(turn),
+            lanes=len(self._env.road.network.graph[start][end]),
+        )
+
+    def _watch(self) -> None:
+        """Note who hit whom in the very sub-step in which it happens: what moves on is pushed apart, and brakes."""
+        road = self._env.road
+        advance = road.step
+
+        def step(dt: float) -> None:
+            advance(dt)
+            for agent, vehicle in self._controlled.items():
+                if vehicle.crashed and agent not in self._crashed:
+                    self._crashed.add(agent)
+                    self._contacts.append(self._contact(agent, vehicle))
+
+        road.step = step
+
+    def _contact(self, agent: str, vehicle: RoadObject) -> Contact:
+        # An obstacle that something is pushed away from does not itself say so.
+        others = [
+            other
+            for other in self._objects()
+            if other is not vehicle and (other.crashed or isinstance(other, Obstacle))
+        ]
+        hit = min(others, key=lambda other: _gap(vehicle, other), default=None)
+        lane = self._lane_name(vehicle.lane_index)
+        if hit is None:
+            return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
+        x, y = (hit.position - vehicle.position).tolist()
+        first, second = (agent, vehicle), (self._actor(hit).id, hit)
+        ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
+        if not ahead and not isinstance(hit, Obstacle):
+            first, second = second, first
+        return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))
+
+    def _objects(self) -> list[RoadObject]:
+        """Everybody and everything that can be hit."""
+        road = self._env.road
+        return [*road.vehicles, *(thing for thing in road.objects if thing.solid and thing.collidable)]
+
+    def _actor(self, thing: RoadObject) -> Actor:
+        found = self._known.get(id(thing))
+        if found is None:
+            name = next((agent for agent, vehicle in self._controlled.items() if vehicle is thing), "")
+            if not name:
+                what = "obstacle" if isinstance(thing, Obstacle) else "vehicle"
+                self._counts[what] += 1
+                name = f"{what}.{self._counts[what]}"
+            # Together with the object itself, so that no later one can have its identity.
+            found = thing, Actor(name, type(thing).__name__, float(thing.LENGTH), float(thing.WIDTH))
+            self._known[id(thing)] = found
+        return found[1]
+
+    def _look(self, off_road: tuple[str, ...]) -> None:
+        things = self._objects()
+        seen = tuple(map(id, things))
+        if seen != self._seen:
+            self._seen = seen
+            self._roster = Roster(tuple(map(self._actor, things)))
+        points, headings, speeds = [], [], []
+        for thing, actor in zip(things, self._roster.actors, strict=True):
+            (x, y), heading, half = thing.position.tolist(), float(thing.heading), actor.length / 2
+            points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # no minus zero
+            headings.append(0.0 - heading)
+            speeds.append(float(thing.speed))
+        contacts = tuple(self._contacts)
+        lanes: tuple[str, ...] = ()
+        if self._steps % _LANES_EVERY == 0 or contacts or off_road:
+            lanes = tuple([self._lane_name(thing.lane_index) for thing in things])
+        time_s = self._steps * self.step_length_s
+        self._scene = Scene(time_s, self._roster, points, headings, speeds, contacts, off_road, lanes)
+        for agent, vehicle in self._controlled.items():
+            self._scene.agent_lanes[agent] = self._lane_name(vehicle.lane_index)
+
+    def _events(self, agent: str) -> Iterator[Event]:
+        """What is told of a controlled vehicle: that it stands, or drives against its lane."""
+        vehicle = self._controlled[agent]
+        speed = float(vehicle.speed)
+        point = self._scene.points[self._scene.roster.index[agent]]
+        lane = self._lane_name(vehicle.lane_index)
+        if stood := self._standstill.look(agent, speed):
+            yield Event("not_moving", agent, f"{agent} had stood still for {stood:g} s", (), lane, *point, speed)
+        along, _ = vehicle.lane.local_coordinates(vehicle.position)
+        turn = float(vehicle.heading) - float(vehicle.lane.heading_at(along))
+        # Of lanes above each other, highway-env takes the one that runs as the vehicle does.
+        if not self._lanes_are_road or abs(speed) < Standstill.SPEED or math.cos(turn) * speed >= -0.5 * abs(speed):
+            self._wrong.discard(agent)
+        elif agent not in self._wrong:
+            self._wrong.add(agent)
+            how = "backwards" if speed < 0 else "the wrong way"
+            yield Event("wrong_way", agent, f"{agent} drove {how} on lane {lane}", (), lane, *point, speed)
+
+    def _lane_name(self, index: tuple[str, str, int]) -> str:
+        found = self._lane_names.get(index)
+        if found is None:
+            found = self._lane_names[index] = "_".join(map(str, index))
+        return found
+
+
+def _form(kind: Any) -> ActionForm:
+    if isinstance(kind, DiscreteMetaAction):
+        return MetaAction(tuple(kind.actions[number] for number in range(len(kind.actions))))
+    return action_form(kind.space())
+
+
+def _gap(one: RoadObject, two: RoadObject) -> float:
+    """The distance between two outlines, in m."""
+    x, y = (two.position - one.position).tolist()
+    c, s = math.cos(one.heading), math.sin(one.heading)
+    halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
+    turn = np.array([two.heading - one.heading])
+    return float(rectangle_gap(np.array([[x * c + y * s, y * c - x * s]]), turn, *halves)[0])

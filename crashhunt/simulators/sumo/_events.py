@@ -1,0 +1,216 @@
+"""What SUMO knows about the traffic around the controlled vehicles, told as events.
+
+It costs a few microseconds a step: what happens seldom is looked into only once something cheap has changed, such as
+the lane of a controlled vehicle or the least of all accelerations.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from libsumo import _libsumo as sumo
+
+from crashhunt.simulators._standstill import Standstill
+from crashhunt.simulators.sumo._braking import HardBraking
+from crashhunt.world import Event, outlines, rectangle_gap
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.world import Scene
+
+__all__ = ["SumoEvents"]
+
+_RED = ("r", "u")  # red, and red with yellow; after a stop, "s" may be passed
+_LINKS_AT_ONCE = 6  # that a vehicle crosses in one long step
+_DIRECTION_EVERY = 10  # steps; how often a vehicle that stays on its lane is asked which way it drives
+_AGAINST = -0.5  # cosine of the angle between a course and a lane
+_SIGHT_M = 150.0
+_CONSEQUENCE_S = 5.0
+
+
+class SumoEvents:
+    """Looks at one episode after another.
+
+    Args:
+        step_length_s: of the simulation.
+        limits: what counts as a standstill (in s) and as hard braking (in m/s²) where it is not the default.
+    """
+
+    def __init__(self, step_length_s: float, limits: Mapping[str, float]) -> None:
+        self._dt = step_length_s
+        self._braking = HardBraking(step_length_s, limits.get("hard_braking"))
+        self._standstill = Standstill(step_length_s, limits)
+
+    def begin(self, scene: Scene, agents: Sequence[str], controlled: Mapping[str, object]) -> None:
+        """Forget the last episode.
+
+        Args:
+            scene: before the first step.
+            agents: those that act.
+            controlled: all vehicles that are driven from outside.
+        """
+        self._controlled = controlled
+        self._last = scene
+        self._lanes = dict(scene.agent_lanes)
+        self._steps = 0
+        self._braking.begin(agents, controlled)
+        self._wrong: set[str] = set()
+        self._stuck: set[tuple[str, str]] = set()
+        self._standstill.begin()
+
+    def look(self, scene: Scene, agents: Sequence[str]) -> tuple[Event, ...]:
+        """Return what happened in the step to this scene.
+
+        Args:
+            scene: with the lanes of the controlled vehicles that are on the road.
+            agents: those that acted in it.
+        """
+        self._steps += 1
+        last, found = self._last, list[Event]()
+        for agent in agents:
+            lane = scene.agent_lanes.get(agent)
+            if lane is None:
+                continue
+            before = self._lanes.get(agent, lane)
+            if lane != before:
+                self._lanes[agent] = lane
+                self._entered(agent, before, lane, scene, found)
+            if lane != before or self._steps % _DIRECTION_EVERY == 0:
+                self._ask_direction(agent, lane, last, scene, found)
+            row = scene.roster.index[agent]
+            if scene.speeds[row] < Standstill.SPEED and sumo.vehicle_getStopState(agent) & 1:
+                self._standstill.move(agent)  # at a stop of its schedule
+            elif stood := self._standstill.look(agent, scene.speeds[row]):
+                found.append(self._of(scene, agent, "not_moving", f"{agent} had stood still for {stood:g} s"))
+        if sumo.simulation_getEmergencyStoppingVehiclesNumber():
+            self._at_dead_ends(scene, agents, found)
+        if scene.contacts:
+            self._others_collided(scene, agents, found)
+        if sumo.simulation_getStartingTeleportNumber():
+            self._teleports(last, scene, agents, found)
+        for agent, vehicle, what in self._braking.look(last, scene, agents, self._lanes):
+            found.append(self._of(scene, agent, "hard_braking", what, (vehicle,)))
+        self._last = scene
+        return tuple(found)
+
+    def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:
+        row = scene.roster.index.get(agent)
+        if row is None:
+            return Event(kind, agent, what, others)
+        x, y = scene.points[row]
+        return Event(kind, agent, what, others, self._lanes.get(agent, ""), x, y, scene.speeds[row])
+
+    def _entered(self, agent: str, before: str, lane: str, scene: Scene, found: list[Event]) -> None:
+        """A controlled vehicle is on another lane than a step before."""
+        left, edge = before.rpartition("_")[0], lane.rpartition("_")[0]
+        if left == edge or left.startswith(":"):
+            return  # it has changed lanes, or passed the signal before
+        states = _states(before, edge)
+        if states and states.issubset(_RED):
+            speed = scene.speeds[scene.roster.index[agent]]
+            what = f"{agent} ran a red light at {speed:.1f} m/s, coming from lane {before}"
+            found.append(self._of(scene, agent, "red_light", what))
+
+    def _ask_direction(self, agent: str, lane: str, last: Scene, scene: Scene, found: list[Event]) -> None:
+        """Whether it drives with its lane."""
+        row, earlier = scene.roster.index[agent], last.roster.index.get(agent)
+        if earlier is None or lane.startswith(":"):
+            return
+        (x, y), (was_x, was_y) = scene.points[row], last.points[earlier]
+        driven = math.hypot(x - was_x, y - was_y)
+        if driven < Standstill.SPEED * self._dt:
+            return
+        # The course, not the heading: that of a long vehicle turns late. SUMO's angles are clockwise from north.
+        angle = math.radians(sumo.lane_getAngle(lane, sumo.vehicle_getLanePosition(agent)))
+        along = ((x - was_x) * math.sin(angle) + (y - was_y) * math.cos(angle)) / driven
+        if along >= _AGAINST:
+            self._wrong.discard(agent)
+        elif agent not in self._wrong:
+            self._wrong.add(agent)
+            found.append(self._of(scene, agent, "wrong_way", f"{agent} drove the wrong way on lane {lane}"))
+
+    def _at_dead_ends(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
+        """SUMO stops a vehicle by force at the end of a lane from which its route does not go on."""
+        for agent in set(sumo.simulation_getEmergencyStoppingVehiclesIDList()).intersection(agents):
+            lane = scene.agent_lanes.get(agent, "")
+            if not lane or lane.startswith(":") or (agent, lane) in self._stuck:
+                continue
+            route, place = sumo.vehicle_getRoute(agent), sumo.vehicle_getRouteIndex(agent)
+            ahead = {link[0].rpartition("_")[0] for link in sumo.lane_getLinks(lane)}
+            if 0 <= place < len(route) - 1 and route[place + 1] not in ahead:
+                self._stuck.add((agent, lane))
+                what = f"{agent} missed its route: it is at the end of lane {lane}, which does not lead there"
+                found.append(self._of(scene, agent, "off_route", what))
+
+    def _others_collided(self, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
+        index = scene.roster.index
+        for contact in scene.contacts:
+            pair = (contact.collider, contact.victim)
+            if not contact.victim or not self._controlled.keys().isdisjoint(pair) or not index.keys() >= set(pair):
+                continue
+            near = min(
+                ((_gap(scene, agent, other), agent) for agent in agents if agent in index for other in pair),
+                default=None,
+            )
+            if near is None or near[0] > _SIGHT_M:
+                continue
+            distance, agent = near
+            what = f"{pair[0]} drove into {pair[1]}, {distance:.0f} m from {agent}"
+            for other in pair:
+                whom, when = self._braking.lately.get(other, ("", -math.inf))
+                if scene.time_s - when <= _CONSEQUENCE_S:
+                    what += f"; {other} had braked hard {scene.time_s - when:.1f} s before, with {whom} ahead"
+            found.append(self._of(scene, agent, "others_collided", what, pair))
+
+    def _teleports(self, last: Scene, scene: Scene, agents: Sequence[str], found: list[Event]) -> None:
+        """A vehicle that SUMO has begun to teleport is not in the scene any more."""
+        for vehicle in sumo.simulation_getStartingTeleportIDList():
+            if vehicle in agents:
+                found.append(self._of(last, vehicle, "teleport", f"SUMO teleported {vehicle}"))
+                continue
+            near = min(
+                (
+                    (_gap(last, agent, vehicle), agent)
+                    for agent in agents
+                    if agent in last.roster.index and vehicle in last.roster.index
+                ),
+                default=None,
+            )
+            if near is not None and near[0] <= _SIGHT_M:
+                what = f"SUMO teleported {vehicle}, {near[0]:.0f} m from {near[1]}"
+                found.append(self._of(scene, near[1], "teleport", what, (vehicle,)))
+
+
+def _states(lane: str, edge: str) -> set[str]:
+    """What the signals of the links from a lane show by which a vehicle came to an edge in one step."""
+    links = sumo.lane_getLinks(lane)
+    for reach in range(_LINKS_AT_ONCE):  # the shortest way: it has not driven around the block
+        states = {link[5] for link in links if _leads_to(link[4] or link[0], edge, reach)}
+        if states:
+            return states
+    return set()
+
+
+def _leads_to(lane: str, edge: str, links: int) -> bool:
+    """Whether a lane is of an edge, or leads to it over so many links."""
+    if lane.rpartition("_")[0] == edge:
+        return True
+    return links > 0 and any(_leads_to(link[4] or link[0], edge, links - 1) for link in sumo.lane_getLinks(lane))
+
+
+def _gap(scene: Scene, one: str, two: str) -> float:
+    """The distance between two outlines, seen from above, in m."""
+    index = scene.roster.index
+    nearest = math.inf
+    for x, y, heading, length, width in outlines(scene, index[one]):
+        c, s = math.cos(heading), math.sin(heading)
+        for other_x, other_y, other_heading, other_length, other_width in outlines(scene, index[two]):
+            dx = other_x - other_length / 2 * math.cos(other_heading) - (x - length / 2 * c)
+            dy = other_y - other_length / 2 * math.sin(other_heading) - (y - length / 2 * s)
+            offset, turn = np.array([[dx * c + dy * s, dy * c - dx * s]]), np.array([other_heading - heading])
+            halves = np.array([[length / 2, width / 2]]), np.array([[other_length / 2, other_width / 2]])
+            nearest = min(nearest, float(rectangle_gap(offset, turn, *halves)[0]))
+    return nearest

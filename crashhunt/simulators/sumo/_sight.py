@@ -1,0 +1,213 @@
+"""What a scene of SUMO has: the vehicles and persons near the controlled ones, at which height, and how bent."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from libsumo import _libsumo as sumo
+
+from crashhunt.simulators.sumo._bends import Bends, height_at, is_articulated
+from crashhunt.world import PERSON, Actor, Contact, Roster, Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.world import Spine
+
+__all__ = ["LOOK_AROUND_EVERY", "SIGHT_M", "Sight"]
+
+SIGHT_M = 150.0
+"""A scene has the vehicles and persons that were within this distance of a controlled one when it last looked around.
+What is further away has no part in a crash, and a town has thousands of them."""
+
+LOOK_AROUND_EVERY = 10
+"""Steps from one look around to the next, and whenever a vehicle enters or leaves; with long steps once a second. Also
+how often a scene says the lane of each vehicle: a string each is too dear for every step."""
+
+_LOOK_AROUND_S = 1.0  # in which two that come towards each other do not get through half of what is in sight
+_SIGHT_SQUARED = SIGHT_M**2
+_RADIANS = math.pi / 180.0
+_HEIGHT_EVERY_M = 20.0  # along each lane, to see whether the map is flat
+_FLAT_M = 0.5
+_WITH_PERSONS = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
+"""SUMO's types of collision in which the victim is a person, who may have the id of a vehicle."""
+
+
+class Sight:
+    """Reads scenes from SUMO.
+
+    Persons are actors where they walk, ride a bicycle as persons do, or wait at the roadside; not inside of vehicles.
+    With SUMO's model ``nonInteracting`` they walk through vehicles and have no part in the traffic, nor in a scene.
+
+    Args:
+        controlled: the vehicles around which to look.
+        step_length_s: in s.
+        lateral: whether vehicles may be elsewhere than in the middle of a lane.
+    """
+
+    def __init__(self, controlled: Sequence[str], step_length_s: float, *, lateral: bool) -> None:
+        self._controlled = tuple(controlled)
+        self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
+        self._high: bool | None = None
+        self._bends = Bends(lateral=lateral)
+        self._known: dict[str, Actor] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the previous episode; the network is the same."""
+        self._known.clear()  # the same id may be another vehicle now
+        self._bends.reset()
+        self._touched: set[tuple[str, str]] = set()
+        self._ids: tuple[str, ...] = ()
+        self._persons: tuple[str, ...] = ()
+        self._all_persons: tuple[str, ...] = ()
+        self._roster = Roster(())
+        self._long: list[int] = []
+        self._persons_count: bool | None = None
+
+    def look(self, steps: int, off_road: Sequence[str]) -> Scene:
+        """Return the scene after so many steps."""
+        if self._persons_count is None:
+            self._persons_count = sumo.simulation_getOption("pedestrian.model") != "nonInteracting"
+            self._high = self._is_high() if self._high is None else self._high
+        if (
+            steps % self._every == 0
+            or sumo.simulation_getDepartedNumber()
+            or sumo.simulation_getArrivedNumber()
+            or sumo.simulation_getStartingTeleportNumber()
+            or sumo.simulation_getEndingTeleportNumber()
+            or (self._persons_count and self._persons_changed())
+        ):
+            self._look_around()
+        ids, persons = self._ids, self._persons
+        contacts = self._contacts()
+        lanes: tuple[str, ...] = ()
+        if steps % LOOK_AROUND_EVERY == 0 or contacts or off_road:
+            lanes = tuple(map(sumo.vehicle_getLaneID, ids))
+        points = list(map(sumo.vehicle_getPosition, ids))
+        # SUMO's angles are in degrees, clockwise from north.
+        headings = [(90.0 - angle) * _RADIANS for angle in map(sumo.vehicle_getAngle, ids)]
+        speeds = list(map(sumo.vehicle_getSpeed, ids))
+        if persons:
+            # As with vehicles, the position is that of the front.
+            points += map(sumo.person_getPosition, persons)
+            headings += [(90.0 - angle) * _RADIANS for angle in map(sumo.person_getAngle, persons)]
+            speeds += map(sumo.person_getSpeed, persons)
+            lanes = (*lanes, *map(sumo.person_getLaneID, persons)) if lanes else ()
+        heights: list[float] = []
+        grades: list[float] = []
+        if self._high:
+            heights = [sumo.vehicle_getPosition3D(vehicle)[2] for vehicle in ids]
+            heights += [sumo.person_getPosition3D(person)[2] for person in persons]
+            grades = [math.tan(sumo.vehicle_getSlope(vehicle) * _RADIANS) for vehicle in ids]
+            grades += [math.tan(sumo.person_getSlope(person) * _RADIANS) for person in persons]
+        return Scene(
+            sumo.simulation_getTime(), self._roster, points, headings, speeds, contacts, tuple(off_road), lanes,
+            heights, grades, self._spines(points, headings) if self._long else {}, swept=True,
+        )  # fmt: skip
+
+    def _spines(self, points: Sequence[tuple[float, float]], headings: Sequence[float]) -> dict[int, Spine]:
+        found = {}
+        for row in self._long:
+            place = points[row], headings[row]
+            spine = self._bends.spine(self._ids[row], self._roster.actors[row].length, *place, high=bool(self._high))
+            if spine is not None:
+                found[row] = spine
+        return found
+
+    def _persons_changed(self) -> bool:
+        """Whether a person came or left, or got into a vehicle."""
+        if not (sumo.person_getIDCount() or self._all_persons):
+            return False
+        if sumo.person_getIDList() != self._all_persons:
+            return True
+        return any(map(sumo.person_getVehicle, self._persons))
+
+    def _look_around(self) -> None:
+        """Choose who is in sight: those near a controlled vehicle, and the controlled ones themselves."""
+        everybody = sumo.vehicle_getIDList()
+        points = list(map(sumo.vehicle_getPosition, everybody))
+        eyes = [points[everybody.index(eye)] for eye in self._controlled if eye in everybody]
+        ids = _near(everybody, points, eyes)
+        persons: tuple[str, ...] = ()
+        if self._persons_count and (sumo.person_getIDCount() or self._all_persons):
+            self._all_persons = sumo.person_getIDList()
+            near = _near(self._all_persons, list(map(sumo.person_getPosition, self._all_persons)), eyes)
+            persons = tuple([person for person in near if not sumo.person_getVehicle(person)])
+        if ids != self._ids or persons != self._persons:
+            self._ids, self._persons = ids, persons
+            self._roster = Roster((*map(self._actor, ids), *map(self._person, persons)))
+            actors = self._roster.actors[: len(ids)]
+            self._long = [row for row, actor in enumerate(actors) if is_articulated(actor)]
+
+    def _actor(self, vehicle: str) -> Actor:
+        found = self._known.get(vehicle)
+        if found is None:
+            kind = sumo.vehicle_getVehicleClass(vehicle)
+            height = sumo.vehicle_getHeight(vehicle) if self._high else 0.0
+            size = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle), height
+            found = self._known[vehicle] = Actor(vehicle, kind, *size)
+        return found
+
+    def _person(self, person: str) -> Actor:
+        name = PERSON + person
+        found = self._known.get(name)
+        if found is None:
+            kind = sumo.person_getVehicleClass(person)
+            height = sumo.person_getHeight(person) if self._high else 0.0
+            size = sumo.person_getLength(person), sumo.person_getWidth(person), height
+            found = self._known[name] = Actor(name, kind, *size)
+        return found
+
+    def _contacts(self) -> tuple[Contact, ...]:
+        """The collisions that began in this step; SUMO repeats one as long as it lasts."""
+        found = []
+        for collision in sumo.simulation_getCollisions():
+            victim = collision.victim
+            if collision.type in _WITH_PERSONS:
+                if not self._persons_count:
+                    continue
+                victim = PERSON + victim
+            pair = (collision.collider, victim)
+            if pair not in self._touched:
+                self._touched.add(pair)
+                found.append(
+                    Contact(
+                        collision.collider,
+                        victim,
+                        collision.type,
+                        collision.lane,
+                        collision.colliderSpeed,
+                        collision.victimSpeed,
+                    )
+                )
+        return tuple(found)
+
+    def _is_high(self) -> bool:
+        """Whether the lanes of the network are not all on one plane."""
+        low = high = None
+        for lane in sumo.lane_getIDList():
+            length = sumo.lane_getLength(lane)
+            pieces = max(1, math.ceil(length / _HEIGHT_EVERY_M))
+            for piece in range(pieces + 1):
+                z = height_at(lane, length * piece / pieces)
+                low = z if low is None or z < low else low
+                high = z if high is None or z > high else high
+        return low is not None and high is not None and high - low > _FLAT_M
+
+
+def _near(
+    names: Sequence[str], points: Sequence[tuple[float, float]], eyes: Sequence[tuple[float, float]]
+) -> tuple[str, ...]:
+    """Those within sight of an eye, in their order."""
+    seen: set[str] = set()
+    for ex, ey in eyes:
+        seen.update(
+            [
+                name
+                for name, (x, y) in zip(names, points, strict=True)
+                if (x - ex) * (x - ex) + (y - ey) * (y - ey) < _SIGHT_SQUARED
+            ]
+        )
+    return tuple([name for name in names if name in seen])

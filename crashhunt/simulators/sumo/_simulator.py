@@ -1,0 +1,317 @@
+"""SUMO as a simulator, through libsumo. Import this in a worker only: libsumo is one simulation per process."""
+
+from __future__ import annotations
+
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import libsumo
+
+# The package's own functions each wrap one of these in a Python call, which doubles the cost of a getter; a step reads
+# some two hundred values.
+from libsumo import _libsumo as sumo
+
+from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.scenario import ObservationSetup
+from crashhunt.scenario.backends.sumo import StagedFiles
+from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
+from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators.sumo._events import SumoEvents
+from crashhunt.simulators.sumo._sight import Sight
+from crashhunt.world import PERSON, TOLD_BY, Lane, is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+    from crashhunt.world import Scene
+
+__all__ = ["SumoSimulator"]
+
+_FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
+_SEEN_M = 150.0  # of the network, in a window that follows a vehicle
+_KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
+_TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
+_current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
+
+
+class SumoSimulator:
+    """Runs the episodes of a scenario on SUMO, one after another in one warm process.
+
+    Args:
+        scenario: what to run.
+        stage: a folder for the files of this process; it must exist.
+    """
+
+    def __init__(self, scenario: Scenario, stage: Path) -> None:
+        self.step_length_s = scenario.step_length_s
+        self._scenario = scenario
+        self._files = StagedFiles(scenario, stage)
+        self._kinematics = Kinematics(scenario.observation or ObservationSetup())
+        self.observation_names = self._kinematics.features
+        self.observation_spaces = dict.fromkeys(scenario.agents, self._kinematics.space)
+        self.actions: dict[str, ActionForm] = {
+            agent: MetaAction() if setup.action == "meta" else SpeedAndLaneChange()
+            for agent, setup in scenario.agents.items()
+        }
+        self.agents: list[str] = []
+        # Without these options of SUMO a vehicle is always in the middle of a lane.
+        options = scenario.sumo.options if scenario.sumo else {}
+        self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
+        self._sight = Sight(tuple(scenario.agents), scenario.step_length_s, lateral=self._lateral)
+        self._edges: dict[str, tuple[int, float]] = {}
+        self._closed_lanes: dict[tuple[str, str], bool] = {}
+        self._lanes: list[Lane] | None = None
+        self._program = ["sumo"]
+        self._events = SumoEvents(scenario.step_length_s, scenario.events)
+
+    told_events = TOLD_BY["sumo"]
+
+    def open_window(self) -> None:
+        """Show the episodes in sumo-gui, which libsumo brings along."""
+        self._program = ["sumo-gui", "--start", "--delay", "0", "--window-size", "1200,800"]
+
+    @property
+    def window_open(self) -> bool:
+        """Whether nobody has closed the window."""
+        return bool(libsumo.isLoaded())
+
+    def follow(self, agent: str, other: str) -> None:
+        """Mark two actors in the window, and keep the first in view."""
+        present = sumo.vehicle_getIDList()
+        for name, color in ((agent, _FOLLOWED), (other, _MARKED)):
+            if name in present:
+                libsumo.vehicle.setColor(name, color)
+            elif is_person(name) and name.removeprefix(PERSON) in sumo.person_getIDList():
+                libsumo.person.setColor(name.removeprefix(PERSON), color)
+        if agent in present:
+            (view, *_) = libsumo.gui.getIDList()
+            if libsumo.gui.getTrackedVehicle(view) != agent:
+                libsumo.gui.trackVehicle(view, agent)
+                libsumo.gui.setZoom(view, libsumo.gui.getZoom(view) * max(1.0, self._span_m() / _SEEN_M))
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+        """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
+        global _current
+        arguments = (options or {}).get("arguments", {})
+        command = self._files.arguments(seed, arguments)
+        try:
+            if libsumo.isLoaded():
+                libsumo.load(command)
+            else:
+                libsumo.start([*self._program, *command])
+            _current = weakref.ref(self)
+            self._enter()
+        except _TRACI_ERRORS as error:
+            raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
+        self.agents = list(self._scenario.agents)
+        self._targets = dict.fromkeys(self.agents, -1)
+        self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
+        self._steps = 0
+        self._sight.reset()
+        self._off_road: list[str] = []
+        self._look()
+        observations = {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
+        self._events.begin(self._scene, self.agents, self._scenario.agents)
+        return observations, {}
+
+    def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
+        self._off_road = []
+        if _current is None or _current() is not self:
+            raise SimulatorError(
+                "another simulator of this process has been reset since",
+                fix="run one simulation at a time, or each in a process of its own",
+            )
+        try:
+            for agent, action in actions.items():
+                self._apply(agent, action)
+            libsumo.simulationStep()
+            self._steps += 1
+            self._look()
+            scene, present = self._scene, self._scene.roster.index
+            observations: Observations = {}
+            rewards: dict[str, float] = {}
+            terminations: dict[str, bool] = {}
+            for agent in actions:
+                row = present.get(agent)
+                observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
+                rewards[agent] = 0.0 if row is None else scene.speeds[row] * self.step_length_s
+                terminations[agent] = row is None
+            scene.events = self._events.look(scene, tuple(actions))
+        except _TRACI_ERRORS as error:
+            raise SimulatorError(f"SUMO gave up: {_one_line(error)}") from error
+        if scene.contacts or self._off_road:
+            hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}
+            terminations |= dict.fromkeys(hit.union(self._off_road).intersection(actions), True)
+        if True in terminations.values():
+            self.agents = [agent for agent in self.agents if not terminations.get(agent, False)]
+        return observations, rewards, terminations, dict.fromkeys(actions, False), {agent: {} for agent in actions}
+
+    def scene(self) -> Scene:
+        """Return the state of the vehicles in sight."""
+        return self._scene
+
+    def lanes(self) -> list[Lane]:
+        """Return all lanes of the network, those inside junctions too."""
+        if self._lanes is None:
+            self._lanes = [
+                Lane(lane, sumo.lane_getWidth(lane), tuple(tuple(point) for point in sumo.lane_getShape(lane)))
+                for lane in sumo.lane_getIDList()
+            ]
+        return self._lanes
+
+    def full_braking(self, agent: str) -> FullBraking:
+        """Return how a vehicle brakes as hard as it can: as its speed mode allows."""
+        setup = self._scenario.agents[agent]
+        if setup.action == "meta":
+            return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
+        if setup.speed_mode & _KEEPS_DECELERATION:
+            return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
+        return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
+
+    def close(self) -> None:
+        """End the simulation, unless another simulator of this process has begun one since."""
+        if _current is not None and _current() is self and libsumo.isLoaded():
+            libsumo.close()
+
+    def _span_m(self) -> float:
+        """How wide the network is, which the window shows whole at first."""
+        (left, _), (right, _) = libsumo.simulation.getNetBoundary()
+        return float(right - left)
+
+    def _enter(self) -> None:
+        """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road."""
+        setups = self._scenario.agents
+        begin = libsumo.simulation.getTime()
+        if self._scenario.warmup_s > 0:
+            libsumo.simulationStep(begin + self._scenario.warmup_s)
+        for agent, setup in setups.items():
+            if not setup.existing:
+                self._add(agent, setup)
+        waiting = set(setups) - set(sumo.vehicle_getIDList())
+        latest = max((setup.depart_s or 0.0 for setup in setups.values()), default=0.0)
+        deadline = max(libsumo.simulation.getTime(), latest) + self._scenario.insertion_timeout_s
+        while waiting:
+            if libsumo.simulation.getTime() >= deadline:
+                raise InvalidEpisodeError(
+                    f"the vehicle {min(waiting)!r} was not on the road {self._scenario.insertion_timeout_s:g} s after "
+                    "it should have entered",
+                    fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
+                )
+            libsumo.simulationStep()
+            waiting -= set(libsumo.simulation.getDepartedIDList())
+        gone = set(setups) - set(sumo.vehicle_getIDList())
+        if gone:
+            raise InvalidEpisodeError(
+                f"the vehicle {min(gone)!r} had left again before all controlled vehicles were on the road",
+                fix="let them enter closer together",
+            )
+        for agent, setup in setups.items():
+            sumo.vehicle_setSpeedMode(agent, setup.speed_mode)
+            sumo.vehicle_setLaneChangeMode(agent, 0)
+
+    def _add(self, agent: str, setup: AgentSetup) -> None:
+        route = setup.route
+        if not route:
+            edges = list(setup.edges)
+            if len(edges) == 2:
+                edges = list(libsumo.simulation.findRoute(edges[0], edges[1], setup.type).edges)
+                if not edges:
+                    raise InvalidEpisodeError(f"there is no way from {setup.edges[0]!r} to {setup.edges[1]!r}")
+            route = f"crashhunt.{agent}"
+            libsumo.route.add(route, edges)
+        depart = "now" if setup.depart_s is None else str(max(setup.depart_s, libsumo.simulation.getTime()))
+        libsumo.vehicle.add(
+            agent,
+            route,
+            setup.type,
+            depart=depart,
+            departLane=setup.depart_lane,
+            departPos=setup.depart_pos,
+            departSpeed=setup.depart_speed,
+        )
+
+    def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
+        setup = self._scenario.agents[agent]
+        if setup.action == "meta":
+            self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
+            return
+        speed, change = action.tolist()
+        sumo.vehicle_setSpeed(agent, speed)
+        if change and not self._change_lane(agent, int(change)):
+            self._off_road.append(agent)
+
+    def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
+        """As highway-env does it: FASTER and SLOWER step from the nearest of the target speeds."""
+        targets = setup.target_speeds
+        if self._targets[agent] < 0:
+            speed = sumo.vehicle_getSpeed(agent)
+            self._targets[agent] = min(range(len(targets)), key=lambda index: abs(targets[index] - speed))
+        shift = {"FASTER": 1, "SLOWER": -1}.get(action, 0)
+        self._targets[agent] = max(0, min(len(targets) - 1, self._targets[agent] + shift))
+        sumo.vehicle_setSpeed(agent, targets[self._targets[agent]])
+        change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
+        if change:
+            self._change_lane(agent, change)  # into nothing is ignored, as in highway-env
+
+    def _change_lane(self, agent: str, change: int) -> bool:
+        """Change to a neighbouring lane at once; False where there is none that the vehicle may use."""
+        edge = sumo.vehicle_getRoadID(agent)
+        if edge.startswith(":"):
+            return True  # inside a junction there is nothing to change to, and nothing to leave either
+        lanes, _ = self._edge(edge)
+        target = sumo.vehicle_getLaneIndex(agent) + change
+        if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
+            return False
+        sumo.vehicle_changeLane(agent, target, self.step_length_s)
+        return True
+
+    def _edge(self, edge: str) -> tuple[int, float]:
+        """The number of lanes of an edge, and the width of its first."""
+        found = self._edges.get(edge)
+        if found is None:
+            found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
+        return found
+
+    def _is_closed(self, lane: str, vehicle_class: str) -> bool:
+        found = self._closed_lanes.get((lane, vehicle_class))
+        if found is None:
+            allowed = sumo.lane_getAllowed(lane)
+            found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
+            self._closed_lanes[lane, vehicle_class] = found
+        return found
+
+    def _look(self) -> None:
+        """Read the state of everybody in sight."""
+        self._scene = self._sight.look(self._steps, self._off_road)
+
+    def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
+        edge = sumo.vehicle_getRoadID(agent)
+        lanes, width = self._edge(edge)
+        # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
+        lane = sumo.vehicle_getLaneIndex(agent)
+        self._scene.agent_lanes[agent] = f"{edge}_{lane}"
+        from_left = (lanes - 1 - lane) * width
+        lateral_speed = 0.0
+        if self._lateral:
+            from_left -= sumo.vehicle_getLateralLanePosition(agent)
+            lateral_speed = -sumo.vehicle_getLateralSpeed(agent)
+        return self._kinematics.observe(
+            self._scene,
+            row,
+            distance=sumo.vehicle_getDistance(agent) - self._start[agent],
+            from_left=from_left,
+            lateral_speed=lateral_speed,
+            lanes=lanes,
+        )
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

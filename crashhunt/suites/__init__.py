@@ -1,0 +1,5 @@
+"""Suites: many hunts, each in a process of its own, and running them again."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,228 @@
+"""Hunts that run in processes of their own, several at a time; whatever becomes of one, the others go on."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import deque
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
+from crashhunt.base.files import whole_file
+from crashhunt.base.signals import stop_requests
+from crashhunt.hunts import HuntDirectory, Ledger
+from crashhunt.plans import Request, RunSettings, plan, read_settings, with_settings
+from crashhunt.scenario import load_scenario
+from crashhunt.snapshots import SnapshotOptions, latest_snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.plans import HuntSettings
+    from crashhunt.scenario import Scenario
+
+__all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "slots_of", "write_request"]
+
+REQUEST = layout.REQUEST
+_LOOK_EVERY_S = 0.1
+_WATCH_EVERY_S = 1.0
+_BUSY_S = 15.0  # for the process of an earlier run to leave the directory
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run of a suite will be: `request.json` in its folder.
+
+    Args:
+        request: of the hunt.
+        folder: from where agents are imported.
+        snapshot_roots: what the snapshot takes in besides the agents' own projects.
+    """
+
+    request: Request
+    folder: str
+    snapshot_roots: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, file: Path) -> RunRequest:
+        """Read one.
+
+        Raises:
+            HuntDirectoryError: it is missing or damaged.
+        """
+        try:
+            data = json.loads(file.read_text(encoding="utf-8"))
+            given = data["request"]
+            run = RunSettings(**given.pop("run"))
+            return cls(
+                Request(**{**given, "crash_on": tuple(given["crash_on"]), "run": run}),
+                data["folder"],
+                tuple(data["snapshot_roots"]),
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite anew", where=str(file)) from None
+
+
+def write_request(folder: Path, request: RunRequest) -> None:
+    """Write ``request.json``, all of it or nothing."""
+    with whole_file(folder / REQUEST) as temporary:
+        temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
+
+
+def slots_of(parallel: int) -> int:
+    """Return how many trials run at a time; 0 means one per core.
+
+    Raises:
+        UsageError: it is negative.
+    """
+    if parallel < 0:
+        raise UsageError(f"PARALLEL is {parallel}", fix="give at least 0 (0: one per core)")
+    return parallel or len(os.sched_getaffinity(0))
+
+
+def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], None] | None = None) -> None:
+    """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
+
+    Args:
+        folders: of the runs, each with its ``request.json``.
+        parallel: trials at a time, of all hunts together; 0 for one per core.
+        watch: called about once a second, and at the end.
+
+    Raises:
+        UsageError: ``parallel`` is negative.
+        KeyboardInterrupt: interrupted; what has finished is kept, and the hunts have stopped.
+    """
+    slots = slots_of(parallel)
+    waiting = deque(folders)
+    running: dict[subprocess.Popen[bytes], int] = {}
+    watched = 0.0
+    passed_on = False
+    with stop_requests() as asked:
+        try:
+            while waiting or running:
+                for process in [process for process in running if process.poll() is not None]:
+                    del running[process]
+                free = slots - sum(running.values())
+                while waiting and free > 0 and not asked:
+                    # Towards the end there are fewer hunts than slots: then each gets several.
+                    width = max(1, free // len(waiting))
+                    folder = waiting.popleft()
+                    try:
+                        running[_start(folder, width)] = width
+                        free -= width
+                    except (CrashhuntError, OSError) as error:
+                        _fail(folder, str(error), "")
+                if asked and not passed_on:
+                    passed_on = True
+                    waiting.clear()
+                    for process in running:
+                        process.send_signal(asked[0])
+                if watch is not None and time.monotonic() - watched > _WATCH_EVERY_S:
+                    watched = time.monotonic()
+                    watch()
+                time.sleep(_LOOK_EVERY_S)
+        finally:
+            for process in running:
+                process.kill()
+                process.wait()
+        if watch is not None:
+            watch()
+    if asked:
+        raise KeyboardInterrupt
+
+
+def set_aside(folder: Path) -> Path:
+    """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now."""
+    number = 0
+    while (aside := folder.with_name(f"{folder.name}.replaced-{number}")).exists():
+        number += 1
+    folder.rename(aside)
+    folder.mkdir()
+    if (aside / REQUEST).exists():
+        write_request(folder, RunRequest.read(aside / REQUEST))
+    return aside
+
+
+def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
+    request = RunRequest.read(folder / REQUEST)
+    with (folder / layout.RUN_LOG).open("ab") as log:
+        return subprocess.Popen(
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "crashhunt.suites._processes",
+                str(folder.resolve()),
+                str(width),
+                str(os.getpid()),
+            ],
+            cwd=request.folder if Path(request.folder).is_dir() else None,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is passed on by us, once
+        )
+
+
+def _main(folder: Path, parallel: int, parent: int) -> None:
+    if sys.platform == "linux":  # a suite that is killed takes its hunts along, and they keep what has finished
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:
+            return
+    from crashhunt.hunts import Hunt
+    from crashhunt.report import describe_hunt
+
+    try:
+        asked = RunRequest.read(folder / REQUEST)
+        scenario, settings = _planned(folder, asked.request, parallel)
+        snapshot = SnapshotOptions(roots=tuple(map(Path, asked.snapshot_roots)))
+        hunt = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"], snapshot=snapshot)
+        deadline = time.monotonic() + _BUSY_S
+        while True:
+            try:
+                report = hunt.run()
+                break
+            except BusyError as error:
+                if time.monotonic() > deadline:
+                    print(f"crashhunt: {error}", file=sys.stderr)  # whoever runs there writes down what comes of it
+                    return
+                time.sleep(0.5)
+        print(describe_hunt(report), flush=True)
+    except CrashhuntError as error:
+        _fail(folder, str(error), "")
+    except Exception as error:
+        _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, HuntSettings]:
+    """What to run: what is there already, or what was asked for."""
+    if not (folder / layout.HUNT).exists():
+        return plan(replace(request, run=replace(request.run, parallel=parallel)))
+    settings = read_settings(folder / layout.HUNT)
+    snapshot = latest_snapshot(folder)
+    scenario = load_scenario(request.scenario, ego=request.ego) if snapshot is None else snapshot.scenario()
+    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, parallel=parallel))
+
+
+def _fail(folder: Path, message: str, trace: str) -> None:
+    """Write down why a hunt could not run."""
+    with suppress(CrashhuntError, OSError), HuntDirectory(folder).locked():  # where another runs, that one has the word
+        (folder / layout.ERROR_LOG).write_text(f"{message}\n{trace}", encoding="utf-8", errors="replace")
+        with closing(Ledger(folder / layout.LEDGER, writable=True)) as ledger:
+            if ledger.facts().get("state") != "error":
+                ledger.enter("error", message)
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,182 @@
+"""Hunts that run again: what failed in place, or another version of one elsewhere."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.hunts import HuntState, Ledger, hunt_state
+from crashhunt.plans import HuntSettings, Request, read_settings
+from crashhunt.scenario import shipped_scenarios
+from crashhunt.snapshots import latest_snapshot
+from crashhunt.suites._processes import REQUEST, RunRequest, run_all, set_aside, slots_of, write_request
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+__all__ = ["rerun"]
+
+_NUMBERS = ("trials", "max_steps", "seed")  # what --set changes besides arguments
+
+
+def rerun(
+    hunts: Sequence[Path],
+    *,
+    everything: bool = False,
+    changes: Mapping[str, str] | None = None,
+    to: Path | None = None,
+    parallel: int = 0,
+    watch: Callable[[list[HuntState]], None] | None = None,
+) -> tuple[list[HuntState], list[Path]]:
+    """Run hunts again; return where they stand now, and where what they replace is kept.
+
+    A hunt that ended in an error runs anew; one that was interrupted or killed goes on, and so does one of which
+    trials could not be set up, with those again. What has finished stays as it is.
+
+    Args:
+        hunts: their directories.
+        everything: run all of them anew, whatever became of them.
+        changes: ``NAME`` or ``AGENT.NAME`` of an argument, ``trials``, ``max_steps`` or ``seed`` to what it shall be.
+        to: run one hunt in this directory instead, and leave its own as it is.
+        parallel: trials at a time, of all hunts together; 0 for one per core.
+        watch: called about once a second.
+
+    Raises:
+        UsageError: a change cannot be meant.
+        HuntDirectoryError: a directory cannot be used.
+    """
+    slots_of(parallel)
+    changes = changes or {}
+    if to is not None:
+        return _elsewhere(hunts, to, changes, parallel, watch), []
+    if changes and not everything:
+        raise UsageError(
+            f"--set {next(iter(changes))}: other settings make another hunt",
+            fix="give --to DIR, or --all to begin anew",
+        )
+    busy = [hunt for hunt in hunts if hunt_state(hunt).state == "running"]
+    if busy:
+        raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(busy[0]))
+    # First everything that may fail, so that nothing is moved away for nothing.
+    requests = {hunt: _changed(_request(hunt), changes) for hunt in hunts}
+    again, replaced = [], []
+    for hunt in hunts:
+        state = hunt_state(hunt)
+        if everything or state.state == "error":
+            aside = set_aside(hunt)
+            requests[hunt] = _moved(requests[hunt], hunt, aside)
+            replaced.append(aside)
+        elif not (state.failed or state.state == "queued" or _replace_invalid(hunt, state)):
+            continue
+        write_request(hunt, requests[hunt])
+        again.append(hunt)
+    run_all(again, parallel, watch=None if watch is None else lambda: watch([hunt_state(hunt) for hunt in hunts]))
+    return [hunt_state(hunt) for hunt in hunts], replaced
+
+
+def _request_of(settings: HuntSettings) -> Request:
+    """What has to be asked for to get these settings."""
+    arguments = {
+        f"{agent}.{name}": spec.spec
+        for agent, chosen in settings.agents.items()
+        for name, spec in chosen.arguments.items()
+    }
+    return Request(
+        trials=settings.trials,
+        max_steps=settings.max_steps,
+        scenario=settings.scenario,
+        agents={agent: chosen.agent for agent, chosen in settings.agents.items()},
+        arguments=arguments,
+        scenario_arguments={name: spec.spec for name, spec in settings.scenario_arguments.items()},
+        sampler=settings.sampler,
+        points=settings.points,
+        seed=settings.seed,
+        crash_on=settings.crash_on_words,
+        run=settings.run,
+    )
+
+
+def _request(hunt: Path) -> RunRequest:
+    if (hunt / REQUEST).exists():
+        return RunRequest.read(hunt / REQUEST)
+    settings = read_settings(hunt / layout.HUNT)
+    request = _request_of(settings)
+    if settings.scenario not in shipped_scenarios():
+        # Where the hunt was started from is not known; the scenario is in the snapshot.
+        snapshot = latest_snapshot(hunt)
+        scenario = Path(settings.scenario) if snapshot is None else snapshot.path / "scenario" / layout.SCENARIO
+        request = replace(request, scenario=str(scenario.resolve()))
+    return RunRequest(request, str(Path.cwd()))
+
+
+def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
+    """The same, where the scenario is that of the snapshot, which has been set aside with everything else."""
+    scenario = Path(asked.request.scenario)
+    if not scenario.is_relative_to(hunt.resolve()):
+        return asked
+    moved = aside.resolve() / scenario.relative_to(hunt.resolve())
+    return replace(asked, request=replace(asked.request, scenario=str(moved)))
+
+
+def _changed(asked: RunRequest, changes: Mapping[str, str]) -> RunRequest:
+    request = asked.request
+    numbers: dict[str, Any] = {}
+    arguments, scenario_arguments = dict(request.arguments), dict(request.scenario_arguments)
+    known = _scenario_arguments(request) if changes else ()
+    for name, spec in changes.items():
+        if name in _NUMBERS:
+            if not spec.isdecimal():
+                raise UsageError(f"--set {name}={spec}", fix="give a whole number")
+            numbers[name] = int(spec)
+        elif name in known:
+            scenario_arguments[name] = spec
+        else:
+            # The same argument may have been written with the agent's id, or without.
+            for other in [
+                other for other in arguments if other.rpartition(".")[2] == name or name.endswith(f".{other}")
+            ]:
+                del arguments[other]
+            arguments[name] = spec
+    request = replace(request, arguments=arguments, scenario_arguments=scenario_arguments, **numbers)
+    return replace(asked, request=request)
+
+
+def _scenario_arguments(request: Request) -> tuple[str, ...]:
+    from crashhunt.scenario import load_scenario
+
+    return tuple(load_scenario(request.scenario, ego=request.ego).scenario_arguments())
+
+
+def _replace_invalid(hunt: Path, state: HuntState) -> int:
+    """Have the trials that could not be set up run again, unless the hunt has found what it was after."""
+    settings = read_settings(hunt / layout.HUNT)
+    if not state.outcomes.get(Outcome.INVALID) or (state.crashes and not settings.run.keep_going):
+        return 0
+    with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
+        return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
+
+
+def _elsewhere(
+    hunts: Sequence[Path],
+    to: Path,
+    changes: Mapping[str, str],
+    parallel: int,
+    watch: Callable[[list[HuntState]], None] | None,
+) -> list[HuntState]:
+    if len(hunts) != 1:
+        raise UsageError(f"--to takes one hunt, and there are {len(hunts)}", fix="choose one with --run")
+    if to.exists():
+        raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
+    request = _changed(_request(hunts[0]), changes)
+    try:
+        to.mkdir()
+        write_request(to, request)
+    except OSError as error:
+        raise HuntDirectoryError(f"cannot be made: {error.strerror}", fix="choose another", where=str(to)) from error
+    run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]))
+    return [hunt_state(to)]

@@ -1,0 +1,290 @@
+"""Suites: many hunts from one file, each several times with a seed of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.names import near_path
+from crashhunt.base.validation import validate
+from crashhunt.hunts import HuntState, hunt_state, is_hunt
+from crashhunt.plans import Request, RunSettings
+from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.suites._processes import REQUEST, RunRequest, run_all, slots_of, write_request
+from crashhunt.trial import CRASHES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+__all__ = ["Suite", "SuiteEntry", "default_suite"]
+
+Plain = str | int | float | bool
+
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteEntry:
+    """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys.
+
+    Args:
+        id: names its folder; unique in the suite.
+        scenario: a shipped name, or a path from the folder of the file.
+        ego: which vehicle of a bare ``.sumocfg``.
+        action: how agents act on SUMO, ``continuous`` or ``meta``; by default as the scenario says.
+        agent: who drives, where the scenario has one controlled vehicle.
+        agents: vehicle to who drives it, where it has several.
+        arguments: ``NAME`` or ``AGENT.NAME`` to a value or a specification, as in ``--arg``.
+        scenario_arguments: likewise, as in ``--set``.
+        runs: how often, each with a seed of its own.
+        trials: of each run, at most.
+        max_steps: the bound on each trial, in steps.
+        seed: from which the seeds of the runs come; drawn where it is not given.
+        sampler: its name.
+        points: values that grid and sweep try of a range without a step.
+        crash_on: the outcomes that count.
+        keep_going: collect all crashes instead of stopping at the first.
+        deterministic: the same seed gives the same crash.
+        timeout_s: wall-clock limit of a trial, in s.
+        keep_trials: keep the logs of every trial.
+        audit: the share of trials without a crash that are run again in a fresh process.
+        snapshot_roots: files and folders, from the folder of the file, that the snapshot takes in as well.
+    """
+
+    id: str = ""
+    scenario: str = "loop"
+    ego: str = ""
+    action: str = ""
+    agent: str = ""
+    agents: dict[str, str] = field(default_factory=dict)
+    arguments: dict[str, Plain] = field(default_factory=dict)
+    scenario_arguments: dict[str, Plain] = field(default_factory=dict)
+    runs: int = 1
+    trials: int = 100
+    max_steps: int = 1500
+    seed: int | None = None
+    sampler: str = "random"
+    points: int = 10
+    crash_on: tuple[str, ...] = tuple(str(outcome) for outcome in CRASHES)
+    keep_going: bool = False
+    deterministic: bool = False
+    timeout_s: float = 60.0
+    keep_trials: bool = False
+    audit: float = 0.0
+    snapshot_roots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    hunts: tuple[dict[str, Any], ...]
+    defaults: dict[str, Any] = field(default_factory=dict)
+    schema: int = 1
+
+
+class Suite:
+    """Hunts to be run into one directory.
+
+    Args:
+        entries: the hunts.
+        folder: from which scenarios that are paths are looked for, and agents imported.
+
+    Raises:
+        UsageError: an id is missing, taken or no name for a folder.
+    """
+
+    def __init__(self, entries: Sequence[SuiteEntry], *, folder: Path | None = None) -> None:
+        self.entries = tuple(entries)
+        self.folder = (folder or Path.cwd()).resolve()
+        seen: set[str] = set()
+        for place, entry in enumerate(self.entries):
+            if not _ID.fullmatch(entry.id):
+                raise UsageError(
+                    f"hunts[{place}].id = {entry.id!r} is no name for a folder", fix="use letters, digits and ._+=-"
+                )
+            if entry.id.lower() in seen:
+                raise UsageError(f"the id {entry.id!r} is there twice", fix="give each hunt one of its own")
+            seen.add(entry.id.lower())
+            if entry.runs < 1:
+                raise UsageError(f"hunts.{entry.id}.runs = {entry.runs}", fix="give at least 1")
+            if entry.agent and entry.agents:
+                raise UsageError(f"hunts.{entry.id} has both agent and agents", fix="give one of them")
+
+    def __repr__(self) -> str:
+        runs = sum(entry.runs for entry in self.entries)
+        return f"<suite of {len(self.entries)} hunts, {runs} runs: {', '.join(entry.id for entry in self.entries)}>"
+
+    @classmethod
+    def read(cls, path: Path | str) -> Suite:
+        """Read a ``suite.toml``.
+
+        Raises:
+            UsageError: it is missing or not valid, with the key, its value and the fix.
+        """
+        file = Path(path)
+        try:
+            data = tomllib.loads(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            fix = f"{near_path(file, '.toml')}give a suite.toml"
+            raise UsageError(f"cannot be read: {error.strerror}", fix=fix, where=str(file)) from None
+        except (ValueError, RecursionError) as error:
+            raise UsageError(f"not valid TOML: {error}", fix="mend the file", where=str(file)) from None
+        whole = validate(_File, data, where=str(file), error=UsageError)
+        if whole.schema != 1:
+            raise UsageError(f"schema = {whole.schema}", fix="this crashhunt reads schema 1", where=str(file))
+        if not whole.hunts:
+            raise UsageError("there are no hunts", fix="add [[hunts]]", where=str(file))
+        entries = []
+        for place, given in enumerate(whole.hunts):
+            merged = _merged(whole.defaults, given)
+            where = f"{file}, hunts.{given.get('id', place)}"
+            entries.append(validate(SuiteEntry, merged, where=where, error=UsageError))
+        try:
+            return cls(entries, folder=file.resolve().parent)
+        except UsageError as error:
+            raise UsageError(error.message, fix=error.fix, where=str(file)) from None
+
+    def plan(self, directory: Path | str) -> list[Path]:
+        """Make a folder for every run, and say in it what it will be. Done twice, nothing changes.
+
+        Raises:
+            HuntDirectoryError: the directory has another suite in it, or cannot be written.
+        """
+        place = Path(directory)
+        if is_hunt(place):
+            raise HuntDirectoryError("a hunt is there, not a suite", fix="give another directory", where=str(place))
+        planned: dict[Path, RunRequest] = {}
+        for entry in self.entries:
+            for number in range(entry.runs):
+                folder = place / entry.id / str(number)
+                planned[folder] = self._planned(entry, number, folder)
+        try:
+            place.mkdir(exist_ok=True)
+            for folder, request in planned.items():
+                if not (folder / REQUEST).exists():
+                    folder.mkdir(parents=True, exist_ok=True)
+                    write_request(folder, request)
+            return list(planned)
+        except OSError as error:
+            raise HuntDirectoryError(
+                f"cannot be made: {error.strerror}", fix="choose another directory", where=str(error.filename or place)
+            ) from error
+
+    def run(
+        self,
+        directory: Path | str,
+        parallel: int = 0,
+        *,
+        watch: Callable[[list[HuntState]], None] | None = None,
+    ) -> list[HuntState]:
+        """Run what has not ended, whatever becomes of the others; return where each run stands.
+
+        Args:
+            directory: made where it does not exist; what has ended there stays as it is.
+            parallel: trials at a time, of all hunts together; 0 for one per core.
+            watch: called about once a second.
+
+        Raises:
+            HuntDirectoryError: the directory has another suite in it, or cannot be written.
+        """
+        slots_of(parallel)
+        folders = self.plan(directory)
+        waiting = [folder for folder in folders if hunt_state(folder).state in ("queued", "interrupted", "killed")]
+        run_all(waiting, parallel, watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]))
+        return [hunt_state(folder) for folder in folders]
+
+    def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
+        roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
+        wanted = RunRequest(self._request(entry, number), str(self.folder), roots)
+        if not (folder / REQUEST).exists():
+            return wanted
+        before = RunRequest.read(folder / REQUEST)
+        if entry.seed is None:
+            wanted = replace(wanted, request=replace(wanted.request, seed=before.request.seed))
+        if before != replace(wanted, folder=before.folder):
+            raise HuntDirectoryError(
+                f"the hunt {entry.id!r} was planned there with other settings",
+                fix="give another directory, or run it again with crashhunt rerun",
+                where=str(folder),
+            )
+        return before
+
+    def _request(self, entry: SuiteEntry, number: int) -> Request:
+        scenario = entry.scenario
+        if scenario not in shipped_scenarios():
+            scenario = str((self.folder / scenario).resolve())
+        seed = entry.seed if entry.seed is not None else secrets.randbits(32)
+        drawn = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]
+        return Request(
+            trials=entry.trials,
+            max_steps=entry.max_steps,
+            scenario=scenario,
+            ego=entry.ego,
+            action=entry.action,
+            agents=entry.agents or ({"": entry.agent} if entry.agent else {}),
+            arguments={name: _spec(value) for name, value in entry.arguments.items()},
+            scenario_arguments={name: _spec(value) for name, value in entry.scenario_arguments.items()},
+            sampler=entry.sampler,
+            points=entry.points,
+            seed=int(drawn),
+            crash_on=tuple(entry.crash_on),
+            run=RunSettings(
+                keep_going=entry.keep_going,
+                deterministic=entry.deterministic,
+                timeout_s=entry.timeout_s,
+                keep_trials=entry.keep_trials,
+                audit=entry.audit,
+            ),
+        )
+
+
+def default_suite() -> str:
+    """Return a ``suite.toml`` with every shipped scenario, ready to be edited."""
+    lines = [
+        "# Every scenario that comes with crashhunt. Run it with: crashhunt suite run FILE DIR",
+        "schema = 1",
+        "",
+        "[defaults]  # of every hunt; any of these may stand in a hunt as well",
+        "runs = 1            # each with a seed of its own",
+        "trials = 300",
+        "max_steps = 1500",
+        "keep_going = false  # true: collect all crashes instead of stopping at the first",
+    ]
+    for name in sorted(shipped_scenarios()):
+        scenario = load_scenario(name)
+        lines += ["", "[[hunts]]", f'id = "{name}"', f'scenario = "{name}"']
+        agents = {agent: setup.agent for agent, setup in scenario.agents.items()}
+        if len(agents) == 1:
+            lines.append(f'agent = "{next(iter(agents.values()))}"')
+        else:
+            lines.append(f"agents = {{ {', '.join(f'{agent} = {json.dumps(who)}' for agent, who in agents.items())} }}")
+        for agent in agents:
+            for argument, known in scenario.agent_arguments(agent).items():
+                key = argument if len(agents) == 1 else f'"{agent}.{argument}"'
+                lines.append(f'# arguments.{key} = "{known.distribution or known.default}"')
+        for argument, known in scenario.scenario_arguments().items():
+            lines.append(f'# scenario_arguments.{argument} = "{known.distribution or known.default}"')
+    return "\n".join(lines) + "\n"
+
+
+def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """A hunt over the defaults; tables are merged, and its own agent is instead of all default ones."""
+    found = dict(defaults)
+    if "agent" in given or "agents" in given:
+        found.pop("agent", None)
+        found.pop("agents", None)
+    for key, value in given.items():
+        both = isinstance(value, dict) and isinstance(found.get(key), dict) and key != "agents"
+        found[key] = {**found[key], **value} if both else value
+    return found
+
+
+def _spec(value: Plain) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,18 @@
+from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure, finite as finite
+from ._outcome import CRASHES as CRASHES, EVENTS as EVENTS, Outcome as Outcome
+from ._plain import check_parts as check_parts, check_plain as check_plain
+from ._result import TrialResult as TrialResult
+from ._signature import Signature as Signature, signature_of as signature_of
+from ._space import (
+    Argument as Argument,
+    Choice as Choice,
+    Constant as Constant,
+    Distribution as Distribution,
+    Kind as Kind,
+    Range as Range,
+    Value as Value,
+    kind_of as kind_of,
+    parse_spec as parse_spec,
+    without_folder as without_folder,
+)
+from ._specification import Overruled as Overruled, TrialSpec as TrialSpec

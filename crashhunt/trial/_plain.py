@@ -1,0 +1,82 @@
+"""The types that the plain data of a trial must have before anything is made of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.integrity import typed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["check_parts", "check_plain"]
+
+
+_TEXT_OR_NUMBER = bool | float | str | None
+
+
+_SPEC = {
+    "number": int,
+    "seed": int,
+    "max_steps": int,
+    "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
+    "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
+}
+
+
+_CLOSEST = dict.fromkeys(("time_to_collision_s", "gap_m", "required_deceleration"), float | None)
+
+
+_COLLISION: dict[str, Any] = {
+    **dict.fromkeys(("agent", "role", "collider", "victim", "kind", "lane"), str),
+    **dict.fromkeys(("x", "y", "collider_speed", "victim_speed"), float | None),
+    "seen_by": list[str],
+}
+
+
+_LATER = {"time_s": float | None}  # what earlier versions did not write
+
+
+_FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
+
+
+_ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
+
+
+_EVENT: dict[str, Any] = {
+    **dict.fromkeys(("kind", "agent", "what", "lane"), str),
+    **dict.fromkeys(("x", "y", "speed"), float | None),
+    "others": list[str],
+}
+
+
+def check_plain(data: Mapping[str, Any]) -> None:
+    """See that plain data has the types that `TrialResult.from_json` takes for granted.
+
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    typed(data, {"outcome": str, "steps": int, "sim_time_s": float, "digest": str, "wall_s": float, "spec": dict})
+    typed(data["spec"], _SPEC)
+    typed({"events": data.get("events")}, {"events": dict | None})  # which there was not always
+    typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
+    check_parts(data["closest"], data["collision"], data["failure"], data.get("escape"), data.get("event"))
+    if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
+        raise ValueError("a number is below 0")
+
+
+def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, event: Any = None) -> None:
+    """See the same of what a trial ended with, where anything is there.
+
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    for name, part, types in (
+        ("closest", closest, _CLOSEST), ("collision", collision, _COLLISION), ("failure", failure, _FAILURE),
+        ("escape", escape, _ESCAPE),
+        ("event", event, _EVENT),
+    ):  # fmt: skip
+        typed({name: part}, {name: dict if name == "closest" else dict | None})
+        if part is not None:
+            typed(part, types)
+            typed(part, {key: kind for key, kind in _LATER.items() if key in part})

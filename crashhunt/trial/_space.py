@@ -1,0 +1,300 @@
+"""Argument spaces: what an argument may be, how it is written, and how a value is drawn.
+
+A specification is a short text, as in ``--arg speed=5:40``:
+
+=================  =================================================================
+``20``             always this value
+``5:40``           uniform between both ends (whole numbers for an integer argument)
+``5:40:5``         only 5, 10, 15 … 40
+``log:1e-3:1``     uniform in the logarithm
+``a|b|c``          one of these
+=================  =================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.base.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+
+__all__ = [
+    "Argument",
+    "Choice",
+    "Constant",
+    "Distribution",
+    "Kind",
+    "Range",
+    "Value",
+    "describe",
+    "kind_of",
+    "parse_spec",
+    "without_folder",
+]
+
+Value = bool | int | float | str
+Kind = Literal["float", "int", "bool", "str"]
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """One value, always."""
+
+    value: Value
+
+    def sample(self, rng: np.random.Generator) -> Value:
+        """Return the value."""
+        return self.value
+
+    def grid(self, points: int) -> tuple[Value, ...]:
+        """Return the one value."""
+        return (self.value,)
+
+    def contains(self, value: Value) -> bool:
+        """Whether ``value`` is the value."""
+        return bool(value == self.value)
+
+    def __str__(self) -> str:
+        return _format(self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One of several values, all equally likely."""
+
+    options: tuple[Value, ...]
+
+    def sample(self, rng: np.random.Generator) -> Value:
+        """Draw one of the options."""
+        return self.options[int(rng.integers(len(self.options)))]
+
+    def grid(self, points: int) -> tuple[Value, ...]:
+        """Return the options."""
+        return self.options
+
+    def contains(self, value: Value) -> bool:
+        """Whether ``value`` is among the options."""
+        return value in self.options
+
+    def __str__(self) -> str:
+        return "|".join(_format(option) for option in self.options)
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A number between ``low`` and ``high``, both included.
+
+    Args:
+        low: the lower end.
+        high: the upper end.
+        step: only ``low``, ``low + step``, … where given.
+        log: uniform in the logarithm; needs ``low > 0``.
+        integer: whole numbers only.
+    """
+
+    low: float
+    high: float
+    step: float | None = None
+    log: bool = False
+    integer: bool = False
+
+    def __post_init__(self) -> None:
+        text = str(self)
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise ArgumentError(f"the range {text!r} has an end that is not finite", fix="give two finite numbers")
+        if self.low > self.high:
+            raise ArgumentError(
+                f"the range {text!r} begins above its end",
+                fix=f"write it as {_number(self.high)}:{_number(self.low)}",
+            )
+        if not math.isfinite(self.high - self.low):
+            raise ArgumentError(f"the range {text!r} is wider than a float can say", fix="give a narrower range")
+        if self.log and self.low <= 0:
+            raise ArgumentError(f"the log range {text!r} must begin above 0", fix="give a positive lower end")
+        if self.step is not None and not (math.isfinite(self.step) and self.step > 0):
+            raise ArgumentError(f"the range {text!r} has the step {self.step!r}", fix="give a step above 0")
+
+    @property
+    def steps(self) -> int:
+        """How many values a stepped or whole-number range has."""
+        step = self.step if self.step is not None else 1.0
+        return math.floor((self.high - self.low) / step * (1 + 1e-12) + 1e-9) + 1
+
+    def _at(self, index: int) -> Value:
+        value = min(self.low + index * (self.step if self.step is not None else 1.0), self.high)
+        return round(value) if self.integer else float(value)
+
+    def sample(self, rng: np.random.Generator) -> Value:
+        """Draw a value."""
+        if self.log:
+            low, high = (self.low - 0.5, self.high + 0.5) if self.integer else (self.low, self.high)
+            drawn = math.exp(rng.uniform(math.log(low), math.log(high)))
+            drawn = min(max(drawn, self.low), self.high)
+            return round(drawn) if self.integer else drawn
+        if self.step is not None or self.integer:
+            return self._at(int(rng.integers(self.steps)))
+        return min(float(rng.uniform(self.low, self.high)), float(self.high))
+
+    def grid(self, points: int) -> tuple[Value, ...]:
+        """Return all values of a stepped range, else at most ``points`` evenly spaced ones, ends included."""
+        if self.step is not None or (self.integer and not self.log and self.steps <= points):
+            return tuple(self._at(index) for index in range(self.steps))
+        if points == 1 or self.low == self.high:
+            return (round(self.low) if self.integer else float(self.low),)
+        ends = (math.log(self.low), math.log(self.high)) if self.log else (self.low, self.high)
+        inner = (ends[0] + (ends[1] - ends[0]) * index / (points - 1) for index in range(1, points - 1))
+        values = [self.low, *(math.exp(value) if self.log else value for value in inner), self.high]
+        clipped = (min(max(value, self.low), self.high) for value in values)
+        return tuple(dict.fromkeys(round(value) if self.integer else float(value) for value in clipped))
+
+    def contains(self, value: Value) -> bool:
+        """Whether ``value`` is a number within the range (steps are not checked)."""
+        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        step = "" if self.step is None else f":{_number(self.step)}"
+        return f"{'log:' if self.log else ''}{_number(self.low)}:{_number(self.high)}{step}"
+
+
+Distribution = Constant | Choice | Range
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """An argument that an agent or a scenario takes, and what is known about it.
+
+    Args:
+        name: its name, as in ``--arg NAME=SPEC``.
+        kind: the type of its values, where it is known.
+        default: the value it has when nobody asks for another; None where it has none.
+        distribution: what a hunt tries when nobody asks for anything else; None where it stays at the default.
+        unit: such as ``m/s``, for people.
+        help: one line, for people.
+    """
+
+    name: str
+    kind: Kind | None = None
+    default: Value | None = None
+    distribution: Distribution | None = None
+    unit: str = ""
+    help: str = ""
+
+
+def without_folder(value: object) -> str:
+    """Return a value for people, who know in which folder their weights are."""
+    text = str(value)
+    return f"…/{Path(text).name}" if Path(text).is_absolute() else text
+
+
+def kind_of(value: Value) -> Kind:
+    """Return the kind of a value."""
+    if isinstance(value, bool):
+        return "bool"
+    if isinstance(value, int):
+        return "int"
+    return "float" if isinstance(value, float) else "str"
+
+
+def parse_spec(text: str, kind: Kind | None = None, *, where: str = "") -> Distribution:
+    """Read a specification (see the module's text).
+
+    Args:
+        text: the specification.
+        kind: the type of the argument; guessed from the text where it is None.
+        where: what an error should point to, such as ``--arg speed``.
+
+    Raises:
+        ArgumentError: the text says nothing that can be sampled.
+    """
+    try:
+        return _parse(text, kind)
+    except ArgumentError as error:
+        raise ArgumentError(error.message, fix=error.fix, where=error.where or where) from None
+
+
+def _parse(text: str, kind: Kind | None) -> Distribution:
+    if "|" in text:
+        options = tuple(_scalar(part, kind) for part in text.split("|"))
+        if len({(type(option), option) for option in options}) != len(options):
+            raise ArgumentError(f"the choice {text!r} names a value twice", fix="name every value once")
+        return Choice(options)
+    if kind not in ("str", "bool"):
+        log, body = text.startswith("log:"), text.removeprefix("log:")
+        parts = body.split(":")
+        if len(parts) in (2, 3) and (kind is not None or all(_is_number(part) for part in parts)):
+            return _range(parts, kind, log=log, text=text)
+        if log:
+            raise ArgumentError(f"{text!r} is not a log range", fix="write it as log:LOW:HIGH, such as log:1e-3:1")
+    return Constant(_scalar(text, kind))
+
+
+def _range(parts: list[str], kind: Kind | None, *, log: bool, text: str) -> Range:
+    numbers = [_scalar(part, "int" if _is_integer(part) else "float") for part in parts]
+    integer = kind != "float" and all(isinstance(number, int) for number in numbers)
+    if kind == "int" and not integer:
+        raise ArgumentError(f"{text!r} has ends that are not whole numbers", fix="this argument takes whole numbers")
+    if log and len(parts) == 3:
+        raise ArgumentError(f"the log range {text!r} has a step", fix="write it as log:LOW:HIGH")
+    low, high, *step = (float(number) if not integer else int(number) for number in numbers)
+    return Range(low, high, step=step[0] if step else None, log=log, integer=integer)
+
+
+def _scalar(text: str, kind: Kind | None) -> Value:
+    if kind == "str":
+        return text
+    if kind == "bool" or (kind is None and text in ("true", "false")):
+        if text.lower() not in ("true", "false"):
+            raise ArgumentError(f"{text!r} is not true or false", fix="write true, false or true|false")
+        return text.lower() == "true"
+    if kind == "int" or (kind is None and _is_integer(text)):
+        try:
+            return int(text)
+        except ValueError:
+            raise ArgumentError(f"{text!r} is not a whole number", fix="write it as 20, 5:40 or 1|2|3") from None
+    if kind == "float" or _is_number(text):
+        try:
+            number = float(text)
+        except ValueError:
+            raise ArgumentError(f"{text!r} is not a number", fix="write it as 20, 5:40, log:1e-3:1 or 1|2|3") from None
+        if not math.isfinite(number):
+            raise ArgumentError(f"{text!r} is not a finite number", fix="give a finite number")
+        return number
+    return text
+
+
+def _is_integer(text: str) -> bool:
+    try:
+        int(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(value: float) -> str:
+    return repr(value)
+
+
+def _format(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else _number(value)
+
+
+def describe(space: Mapping[str, Distribution]) -> str:
+    """Return ``name=spec`` pairs in one line, for people."""
+    return " ".join(f"{name}={distribution}" for name, distribution in sorted(space.items())) or "(nothing)"

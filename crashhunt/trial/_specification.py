@@ -1,0 +1,71 @@
+"""What a trial is asked: everything that determines it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.trial._space import Value
+
+__all__ = ["Overruled", "TrialSpec"]
+
+
+@dataclass(frozen=True, slots=True)
+class Overruled:
+    """A trial in which the code of an agent is no longer asked: its vehicle brakes as hard as it can.
+
+    Args:
+        agent: whose.
+        after: the step after which it brakes; its first decision that is not its own is the one of the next step.
+    """
+
+    agent: str
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSpec:
+    """Everything that determines one trial.
+
+    Args:
+        number: its place in the hunt, from 0.
+        seed: for the simulator, the agents and the global generators; 0 to 2**31 - 1.
+        arguments: agent id to argument name to value.
+        scenario_arguments: name to value.
+        max_steps: the bound on its length, in steps.
+        overruled: which agent is not asked any more, and from when on; None where all drive to the end.
+    """
+
+    number: int
+    seed: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    max_steps: int
+    overruled: Overruled | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain dicts and numbers."""
+        return {
+            "number": self.number,
+            "seed": self.seed,
+            "arguments": {agent: dict(values) for agent, values in self.arguments.items()},
+            "scenario_arguments": dict(self.scenario_arguments),
+            "max_steps": self.max_steps,
+            **({"overruled": asdict(self.overruled)} if self.overruled else {}),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> TrialSpec:
+        """Rebuild what `to_json` returned."""
+        overruled = data.get("overruled")
+        return cls(
+            data["number"],
+            data["seed"],
+            data["arguments"],
+            data["scenario_arguments"],
+            max_steps=data["max_steps"],
+            overruled=Overruled(**overruled) if overruled else None,
+        )

@@ -1,0 +1,36 @@
+"""How near to a crash a trial came."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["ClosestApproach"]
+
+
+@dataclass(frozen=True, slots=True)
+class ClosestApproach:
+    """How near to a crash a trial came, each over all steps, controlled vehicles and other actors.
+
+    Args:
+        time_to_collision_s: the least, at constant velocities; infinite where no course ever crossed.
+        gap_m: the least distance to the outline of any other actor, the nearest gap; 0 where they touched.
+        required_deceleration: the greatest needed to avoid a collision, in m/s².
+    """
+
+    time_to_collision_s: float = math.inf
+    gap_m: float = math.inf
+    required_deceleration: float = 0.0
+
+    def to_json(self) -> dict[str, float | None]:
+        """Return plain numbers; JSON has no infinity, so an approach that never happened is null."""
+        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, float | None]) -> ClosestApproach:
+        """Rebuild what `to_json` returned."""
+        return cls(**{name: math.inf if value is None else value for name, value in data.items()})

@@ -1,0 +1,303 @@
+"""The state of the actors at one step, and what touched."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.world._events import Event
+
+__all__ = [
+    "PERSON",
+    "Actor",
+    "Contact",
+    "Frame",
+    "Lane",
+    "Roster",
+    "Scene",
+    "Spine",
+    "is_person",
+    "joined_frame",
+]
+
+PERSON = "person "
+"""What an id of a person begins with: vehicles and persons may have the same name, and no name has a blank."""
+
+Spine = tuple[tuple[float, float, float], ...]
+"""The centre line of a long vehicle in a bend, as (x, y, z) in m, from the front bumper to the back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """What does not change about an actor.
+
+    Args:
+        id: unique within the episode; that of a person is ``person`` and its name, with a blank between.
+        kind: the simulator's word for it, such as SUMO's class (``passenger``, ``truck``, ``pedestrian``).
+        length: in m.
+        width: in m.
+        height: in m; 0 where the map is flat and nobody needs it.
+    """
+
+    id: str
+    kind: str
+    length: float
+    width: float
+    height: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A collision that the simulator itself reports.
+
+    Args:
+        collider: the actor that drove into the other.
+        victim: the actor that was hit.
+        kind: the simulator's word for it.
+        lane: where.
+        collider_speed: in m/s.
+        victim_speed: in m/s.
+    """
+
+    collider: str
+    victim: str
+    kind: str
+    lane: str
+    collider_speed: float
+    victim_speed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """A lane of the map.
+
+    Args:
+        id: the simulator's name of it.
+        width: in m.
+        shape: its centre line, as (x, y) pairs in m.
+    """
+
+    id: str
+    width: float
+    shape: tuple[tuple[float, float], ...]
+
+
+class Roster:
+    """The actors of a scene, in the order of its rows. One roster serves every step until somebody enters or leaves.
+
+    Args:
+        actors: all actors.
+    """
+
+    def __init__(self, actors: tuple[Actor, ...]) -> None:
+        self.actors = actors
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Actor id to row."""
+        return {actor.id: row for row, actor in enumerate(self.actors)}
+
+    @cached_property
+    def half_sizes(self) -> NDArray[np.float64]:
+        """Half the length and half the width of each actor, shape (n, 2), in m."""
+        return np.array([(actor.length / 2, actor.width / 2) for actor in self.actors]).reshape(-1, 2)
+
+    @cached_property
+    def reaches(self) -> list[float]:
+        """How far the far corner of each outline is from the centre of its front bumper, in m."""
+        return [math.hypot(actor.length, actor.width / 2) for actor in self.actors]
+
+    @cached_property
+    def touch_distance(self) -> float:
+        """No two outlines touch whose front bumpers are further apart than this, in m."""
+        return 2 * max(self.reaches, default=0.0)
+
+    def __len__(self) -> int:
+        return len(self.actors)
+
+
+_NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
+
+
+class Frame(NamedTuple):
+    """Successive scenes of the same actors, as bare columns.
+
+    Args:
+        roster: the actors.
+        columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
+        heights: float64, shape (scenes, 2 n): all heights, then all grades; None where the map is flat.
+        spines: of each scene; None where no long vehicle is in a bend.
+    """
+
+    roster: Roster
+    columns: NDArray[np.float64]
+    heights: NDArray[np.float64] | None = None
+    spines: tuple[Mapping[int, Spine], ...] | None = None
+
+    def scene(self, number: int) -> Scene:
+        """Return one of the scenes, without its time."""
+        count, row = len(self.roster), self.columns[number].tolist()
+        points = list(zip(row[: 2 * count : 2], row[1 : 2 * count : 2], strict=True))
+        heights = self.heights[number].tolist() if self.heights is not None else []
+        spines = self.spines[number] if self.spines is not None else _NO_SPINES
+        return Scene(
+            0.0,
+            self.roster,
+            points,
+            row[2 * count : 3 * count],
+            row[3 * count :],
+            heights=heights[:count],
+            grades=heights[count:],
+            spines=spines,
+        )
+
+
+def joined_frame(roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None]) -> Frame:
+    """Return scenes of one roster as a frame.
+
+    Args:
+        roster: of all of them.
+        columns: as in `Frame`.
+        scenes: each one; None where nobody is high or bent.
+    """
+    heights = spines = None
+    if any(scene is not None and scene.heights for scene in scenes):
+        flat = [0.0] * (2 * len(roster))
+        rows = [[*scene.heights, *scene.grades] if scene is not None and scene.heights else flat for scene in scenes]
+        heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
+    if any(scene is not None and scene.spines for scene in scenes):
+        spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
+    return Frame(roster, columns, heights, spines)
+
+
+class Scene:
+    """The actors at one instant.
+
+    Args:
+        time_s: simulation time, in s.
+        roster: who the rows are.
+        points: x and y of the centre of each front bumper, in m.
+        headings: in rad, counter-clockwise from the x axis.
+        speeds: in m/s.
+        contacts: the collisions that the simulator reports for this step.
+        off_road: the controlled vehicles that left the road in this step.
+        lanes: the lane of each actor, or empty where this step did not look.
+        heights: z of each front bumper, in m; empty where the map is flat.
+        grades: how far the road rises a metre where each of them is, ahead of it; empty where the map is flat.
+        spines: row to centre line, of the long vehicles that are bent.
+        swept: whether everybody has driven here from the previous scene along the way that the headings say, so that
+            contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
+
+    Attributes:
+        events: what else happened in this step.
+        agent_lanes: the lane of each controlled vehicle, where the simulator says; not recorded.
+        previous: the scene one step before; None at the start. It has no previous one itself, so that nothing piles up.
+    """
+
+    __slots__ = (
+        "_neighbors",
+        "agent_lanes",
+        "contacts",
+        "events",
+        "grades",
+        "headings",
+        "heights",
+        "lanes",
+        "off_road",
+        "points",
+        "previous",
+        "roster",
+        "speeds",
+        "spines",
+        "swept",
+        "time_s",
+    )
+
+    def __init__(
+        self,
+        time_s: float,
+        roster: Roster,
+        points: Sequence[tuple[float, float]],
+        headings: Sequence[float],
+        speeds: Sequence[float],
+        contacts: tuple[Contact, ...] = (),
+        off_road: tuple[str, ...] = (),
+        lanes: tuple[str, ...] = (),
+        heights: Sequence[float] = (),
+        grades: Sequence[float] = (),
+        spines: Mapping[int, Spine] = _NO_SPINES,
+        *,
+        swept: bool = False,
+    ) -> None:
+        self.time_s = time_s
+        self.roster = roster
+        self.points = points
+        self.headings = headings
+        self.speeds = speeds
+        self.contacts = contacts
+        self.off_road = off_road
+        self.lanes = lanes
+        self.heights = heights
+        self.grades = grades
+        self.spines = spines
+        self.swept = swept
+        self.events: tuple[Event, ...] = ()
+        self.agent_lanes: dict[str, str] = {}
+        self.previous: Scene | None = None
+        self._neighbors: dict[int, list[tuple[float, int]]] = {}
+
+    def follow(self, previous: Scene | None) -> None:
+        """Say which scene was one step before."""
+        if previous is self:
+            return  # a simulator that hands out the same object again
+        if previous is not None:
+            previous.previous = None
+        self.previous = previous
+
+    @property
+    def frame(self) -> Frame:
+        """The scene as bare columns."""
+        flat = [value for point in self.points for value in point]
+        return joined_frame(self.roster, np.array([[*flat, *self.headings, *self.speeds]]), [self])
+
+    @property
+    def data(self) -> NDArray[np.float64]:
+        """Shape (n, 4): x, y, heading, speed of every actor."""
+        columns = np.empty((len(self.points), 4))
+        columns[:, :2] = np.reshape(self.points, (-1, 2))
+        columns[:, 2] = self.headings
+        columns[:, 3] = self.speeds
+        return columns
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """The centre of each outline, shape (n, 2), in m."""
+        columns = self.data
+        forward = np.stack((np.cos(columns[:, 2]), np.sin(columns[:, 2])), axis=1)
+        centers: NDArray[np.float64] = columns[:, :2] - self.roster.half_sizes[:, :1] * forward
+        return centers
+
+    def neighbors(self, row: int) -> list[tuple[float, int]]:
+        """Return (squared distance of front bumpers in m², row) of all other actors, nearest first."""
+        found = self._neighbors.get(row)
+        if found is None:
+            x, y = self.points[row]
+            found = [((px - x) * (px - x) + (py - y) * (py - y), other) for other, (px, py) in enumerate(self.points)]
+            del found[row]
+            found.sort()
+            self._neighbors[row] = found
+        return found
+
+
+def is_person(actor: str) -> bool:
+    """Whether an actor's id is that of a person."""
+    return actor.startswith(PERSON)

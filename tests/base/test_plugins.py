@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Annotated
+
+import pytest
+
+from crashhunt.base.plugins import locate, registered
+from crashhunt.errors import ArgumentError, PluginError
+from crashhunt.space import Argument, Range
+from crashhunt.trial import signature_of
+
+
+class Planner:
+    def __init__(
+        self,
+        headway_s: Annotated[float, Argument("headway_s", distribution=Range(0.3, 2.0), unit="s")] = 1.0,
+        mode: str = "calm",
+        count: int | None = None,
+        action_space=None,
+    ):
+        pass
+
+
+def anything(**arguments):
+    return arguments
+
+
+def test_a_signature_tells_names_types_ranges_and_spaces():
+    signature = signature_of(Planner)
+    assert list(signature.arguments) == ["headway_s", "mode", "count"]
+    headway = signature.arguments["headway_s"]
+    assert (headway.kind, headway.default, headway.unit, str(headway.distribution)) == ("float", 1.0, "s", "0.3:2.0")
+    assert signature.arguments["mode"].kind == "str"
+    assert (signature.arguments["count"].kind, signature.arguments["count"].default) == ("int", None)
+    assert signature.given == ("action_space",)
+    assert not signature.open
+
+
+def test_an_unknown_argument_lists_the_accepted_ones():
+    with pytest.raises(ArgumentError, match="headway_s, mode, count") as caught:
+        signature_of(Planner).check(["hedway_s"], where="x")
+    assert "did you mean 'headway_s'" in caught.value.fix
+    signature_of(anything).check(["whatever"], where="x")
+
+
+def test_everything_that_is_registered_can_be_imported():
+    for group in ("agents", "executors", "oracles", "samplers", "simulators"):
+        names = registered(group)
+        assert names, group
+        for name in names:
+            assert callable(locate(group, name))
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "says"),
+    [
+        ("raise RuntimeError('boom')", "broken:Agent", "boom"),
+        ("import not_there", "broken:Agent", "not_there"),
+        ("Agent = 3", "broken:Agent", "int"),
+        ("class Agent: pass", "broken:Agnet", "did you mean 'Agent'"),
+        ("", "broken", "not a registered name"),
+        ("", ":Agent", "not a registered name"),
+        ("def f(:", "broken:Agent", "SyntaxError"),
+    ],
+)
+def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says):
+    (tmp_path / "broken.py").write_text(content)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    sys.modules.pop("broken", None)
+    with pytest.raises(PluginError) as caught:
+        locate("agents", name)
+    sys.modules.pop("broken", None)
+    assert says in str(caught.value)
+    assert caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "where", "says"),
+    [
+        ("import os\nimport not_there", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
+        ("import os\nimport not_there.inner", "broken:Agent", "broken.py, line 2", "install 'not_there'"),
+        ("import json\n\njson.loads('x')", "broken:Agent", "broken.py, line 3", "JSONDecodeError"),
+        ("def f():\n  return (", "broken:Agent", "broken.py, line 2", "SyntaxError"),
+        ("import sys\nsys.exit(3)", "broken:Agent", "broken.py, line 2", "SystemExit: 3"),
+        ("from json import nothing", "broken:Agent", "broken.py, line 1", "cannot import name 'nothing'"),
+        ("", "brokn:Agent", "", "No module named 'brokn'; did you mean 'broken'?"),
+        ("", "broken.inner:Agent", "", "No module named 'broken.inner'"),
+        ("x\0y", "broken:Agent", "", "null bytes"),
+    ],
+)
+def test_an_import_that_fails_says_where(tmp_path, monkeypatch, content, name, where, says):
+    (tmp_path / "broken.py").write_text(content)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    sys.modules.pop("broken", None)
+    importlib.invalidate_caches()
+    with pytest.raises(PluginError) as caught:
+        locate("agents", name)
+    sys.modules.pop("broken", None)
+    assert caught.value.where == where
+    assert says in str(caught.value)

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from crashhunt.base import signals
+from crashhunt.base.signals import stop_requests
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_request_that_comes_twice_at_once_is_one(number):
+    with stop_requests() as asked:
+        assert asked == []
+        signal.raise_signal(number)
+        signal.raise_signal(number)
+        assert asked == [number]
+
+
+def test_a_second_request_a_while_later_ends_the_process_at_once(monkeypatch):
+    monkeypatch.setattr(signals, "_SAME_REQUEST_S", -1.0)
+    ended: list[int] = []
+    before = signal.getsignal(signal.SIGTERM)
+    with stop_requests() as asked:
+        signal.raise_signal(signal.SIGTERM)
+        with monkeypatch.context() as patch:  # instead of the end of this process
+            patch.setattr(os, "kill", lambda _, number: ended.append(number))
+            signal.raise_signal(signal.SIGTERM)
+            assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert (asked, ended) == ([signal.SIGTERM], [signal.SIGTERM])
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_whoever_ignores_hang_ups_goes_on_ignoring_them_and_threads_are_left_alone():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_requests() as asked:
+            signal.raise_signal(signal.SIGHUP)
+            assert asked == []
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+    def elsewhere() -> None:
+        with stop_requests() as asked:
+            assert asked == []
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()

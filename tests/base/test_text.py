@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import unicodedata
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.base.text import in_lines, one_line, visible
+
+SPOKEN = "\x1b[2J\x1b]0;title\x07 up\x1b[1A\r\x9b2K \u202eesrever\u2066 a\u0085b\u2028c [bold red]x[/] z"
+HOSTILE = f"{SPOKEN} \udc80"
+
+
+def obeyed(text: str, allowed: str = "\n") -> list[str]:
+    """What a terminal would not simply show."""
+    kinds = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return [c for c in text if c not in allowed and unicodedata.category(c) in kinds and c not in "\u200c\u200d"]
+
+
+@given(st.text(st.characters(exclude_categories=())))
+def test_nothing_is_obeyed(text):
+    assert not obeyed(visible(text), "\n\t")
+    assert not obeyed(one_line(text), "")
+    assert len(in_lines([text, text]).splitlines()) <= 2
+    assert visible(visible(text)) == visible(text)
+
+
+@given(st.text(st.characters(exclude_categories=("Cc", "Cf", "Cs", "Zl", "Zp"))))
+def test_what_is_visible_stays(text):
+    assert visible(text) == text
+
+
+def test_examples():
+    assert visible("a\x1b[1m\tb\r\nc\rd") == "a\\x1b[1m\tb\nc\\rd"
+    assert one_line("  a:\n    b\r\n\tc \n") == "  a: b c"
+    assert visible("ü 漢字 👩\u200d🚗") == "ü 漢字 👩\u200d🚗"
+
+
+AGENT = f"""
+class Rude:
+    def __init__(self, name: str = {SPOKEN!a}):
+        pass
+    def reset(self, seed):
+        print({SPOKEN!a})
+    def act(self, observation):
+        raise ValueError({SPOKEN!a} + "\\nlast line")
+"""
+
+
+def test_an_agent_cannot_speak_to_the_terminal(toy):
+    (toy.folder / "rude.py").write_text(AGENT)
+    done = [toy.crashhunt("run", "h", "1", "1", "9", "--scenario", "toy", "--agent", "rude:Rude", "--seed", "1")]
+    assert "ValueError" in done[0].out
+    done += [toy.crashhunt(command, "h", expect=None) for command in ("show", "logs", "status", "replay")]
+    for one in done:
+        assert not obeyed(one.out + one.err), one
+        assert "\\x1b[2J" in one.out or one is done[3]
+    # Files keep what was said.
+    assert "\x1b[2J" in next((toy.folder / "h" / "crashes").glob("*/run.log")).read_text(errors="replace")
+
+
+def test_the_screen_shows_what_is_there():
+    from io import StringIO
+
+    from rich.console import Console
+
+    from crashhunt.cli._status import show_states
+    from crashhunt.hunts import HuntState
+    from crashhunt.report import Watcher
+
+    shown = StringIO()
+    console = Console(file=shown, force_terminal=True, color_system=None, width=200)
+    state = HuntState(dir=HOSTILE, state="error", detail=HOSTILE)
+    show_states([state], console)
+    assert "[bold red]" in shown.getvalue()
+    assert not obeyed(shown.getvalue())
+    assert Watcher(console, HOSTILE)
+
+
+def test_who_made_it_is_asked_in_one_line(tmp_path, capsys, monkeypatch):
+    from crashhunt.cli import _replay, main
+    from crashhunt.crashes import Archive
+
+    archive = Archive(tmp_path, HOSTILE, f"{HOSTILE}\nTrust it: yes", made_here=False)
+
+    def refuse(*_: object) -> None:
+        raise _replay._refuse(archive, bundle, tmp_path / HOSTILE)
+
+    bundle = SimpleNamespace(hunt=tmp_path)
+    monkeypatch.setattr("crashhunt.plans.read_settings", lambda _: SimpleNamespace(agents={}))
+    monkeypatch.setattr(_replay, "opened_crash", refuse)
+    with pytest.raises(SystemExit):
+        main(["replay", "x.zip"])
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert not obeyed(said)

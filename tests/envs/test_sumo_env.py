@@ -1,0 +1,153 @@
+"""Several Gymnasium environments of ours in one process, each with its own SUMO."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import crashhunt
+from crashhunt.envs import SumoEnv
+from crashhunt.errors import ActionError, InvalidEpisodeError, ScenarioError, SimulatorError, UsageError
+
+SEVERAL = """
+import json, warnings
+import gymnasium
+import numpy as np
+warnings.simplefilter("ignore")
+
+def make():
+    return gymnasium.make("crashhunt:crashhunt/SUMO-v0", action="meta", max_steps=40)
+
+if __name__ == "__main__":
+    one, two = make(), make()
+    found = {"kinds": [type(env.unwrapped._episodes).__name__ for env in (one, two)]}
+    first, second = (env.reset(seed=3)[0] for env in (one, two))
+    same = np.array_equal(first, second)
+    for _ in range(20):
+        a, b = one.step(3), two.step(3)
+        same = same and np.array_equal(a[0], b[0]) and a[1:] == b[1:]
+    found["same"] = bool(same)
+    one.close()
+    found["again"] = type(make().unwrapped._episodes).__name__
+    two.close()
+    found["vector"] = []
+    for kind in (gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv):
+        vector = kind([make] * 2)
+        vector.reset(seed=[5, 5])
+        rewards = [vector.step(np.array([3, 3]))[1] for _ in range(5)]
+        found["vector"].append(float(np.sum(rewards)))
+        found["equal"] = all(reward[0] == reward[1] for reward in rewards)
+        vector.close()
+    print(json.dumps(found))
+"""
+
+
+def test_several_in_one_process_and_in_gymnasiums_vectors(tmp_path):
+    (tmp_path / "several.py").write_text(SEVERAL)
+    done = subprocess.run(
+        [sys.executable, "several.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["kinds"] == ["Episodes", "RemoteEpisodes"]
+    assert found["again"] == "Episodes"  # the first has been closed
+    assert found["same"] and found["equal"]  # noqa: PT018 - one fact
+    assert found["vector"][0] == found["vector"][1] > 0
+
+
+@pytest.fixture(scope="module")
+def own():
+    env = SumoEnv("intersection", process=True, render_mode="rgb_array")
+    yield env
+    env.close()
+
+
+def test_a_picture_of_the_scene(own):
+    own.reset(seed=1)
+    first = own.render()
+    assert (first.shape, first.dtype) == ((540, 960, 3), np.uint8)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
+    for _ in range(10):
+        own.step((8.0, 0))
+    assert not np.array_equal(own.render(), first)
+    assert own.metadata["render_fps"] == 10
+
+
+def test_errors_come_through(own):
+    own.reset(seed=1)
+    with pytest.raises(ActionError, match="is not") as caught:
+        own.step(np.array([[1.0], [0.0]]))
+    assert caught.value.fix
+    own.step((8.0, 0))  # and it goes on
+    with pytest.raises((ScenarioError, InvalidEpisodeError, UsageError)):
+        SumoEnv("no-such-scenario", process=True)
+    with pytest.raises(UsageError, match="render_mode is 'human'"):
+        SumoEnv(render_mode="human")
+
+
+def ended(pid):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            with open(f"/proc/{pid}/stat") as file:
+                if file.read().rpartition(")")[2].split()[0] == "Z":
+                    return True
+        except OSError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_process_that_dies_is_told():
+    env = SumoEnv(process=True)
+    with pytest.raises(UsageError, match="nothing to render"):
+        SumoEnv.render(_with_mode(env))
+    env.reset(seed=1)
+    os.kill(env._episodes._process.pid, signal.SIGKILL)
+    with pytest.raises(SimulatorError, match="ended by signal 9; make a new one"):
+        env.step((8.0, 0))
+    with pytest.raises(SimulatorError, match="has been closed"):
+        env.step((8.0, 0))
+    env.close()
+    env.close()
+
+
+def _with_mode(env):
+    env.render_mode = "rgb_array"
+    return env
+
+
+ORPHAN = """
+import os, sys, time
+from crashhunt.envs import SumoEnv
+env = SumoEnv(process=True)
+env.reset(seed=1)
+if os.fork() == 0:  # a copy holds the connection open
+    time.sleep(300)
+print(env._episodes._process.pid, flush=True)
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_it_ends_with_its_parent_whatever_becomes_of_that():
+    with subprocess.Popen(
+        [sys.executable, "-c", ORPHAN], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        pid = int(process.stdout.readline())
+        process.wait()
+        try:
+            assert ended(pid)
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)  # the copy
+
+
+def test_accelerate_is_offered_in_public():
+    assert "accelerate" in dir(crashhunt)
+    assert callable(crashhunt.accelerate)

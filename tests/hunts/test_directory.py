@@ -1,0 +1,60 @@
+"""The directory of a hunt, where several want it at once."""
+
+from __future__ import annotations
+
+from multiprocessing import get_context
+
+import pytest
+
+from crashhunt.errors import BusyError, CrashhuntError, HuntDirectoryError
+from crashhunt.hunts import HuntDirectory
+from crashhunt.plans import HuntSettings
+
+SETTINGS = HuntSettings(scenario="loop", scenario_digest="x", trials=1, max_steps=1, seed=1)
+
+
+def _claim(path, said):
+    had = busy = 0
+    while had < 50:
+        place = HuntDirectory(path)
+        try:
+            with place.locked():
+                place.claim(SETTINGS, ["crashhunt"], overwrite=had % 5 == 4, seed_given=True)
+                (path / "snapshots").mkdir(exist_ok=True)
+            had += 1
+        except BusyError:
+            busy += 1
+        except CrashhuntError as error:
+            said.put(str(error))
+            return
+    said.put(busy)
+
+
+def test_of_several_at_once_one_has_it_and_the_others_are_told_that_it_is_busy(tmp_path):
+    context = get_context("spawn")  # forking a process with threads is asking for it
+    said = context.Queue()
+    processes = [context.Process(target=_claim, args=(tmp_path / "hunt", said)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    answers = [said.get(timeout=60) for _ in processes]
+    assert all(isinstance(answer, int) for answer in answers), answers
+    assert sum(answers) > 0
+
+
+def test_a_folder_of_somebody_else_stays_as_it_is(tmp_path):
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(HuntDirectoryError, match=r"not a hunt: it has 'thesis\.tex'"), HuntDirectory(tmp_path).locked():
+        pass
+    (tmp_path / ".lock").write_text("theirs")
+    with pytest.raises(HuntDirectoryError, match=r"not a hunt: it has 'thesis\.tex'"), HuntDirectory(tmp_path).locked():
+        pass
+    assert (tmp_path / ".lock").read_text() == "theirs"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_what_a_hunt_left_that_could_not_begin_is_in_nobodys_way(tmp_path):
+    for name in (".lock", ".hunt.4711.toml"):
+        (tmp_path / name).touch()
+    (tmp_path / ".scratch").mkdir()
+    with HuntDirectory(tmp_path).locked():
+        pass

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import Ledger, has_begun
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
+
+
+def result(number: int, outcome: Outcome = Outcome.SURVIVED, *, ttc: float = 3.0, steps: int = 10) -> TrialResult:
+    spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5}}, {"vehicles": 3}, max_steps=20)
+    return TrialResult(spec, outcome, steps=steps, wall_s=0.1, closest=ClosestApproach(ttc, 1.0, 2.0))
+
+
+def test_what_was_recorded_is_read_while_it_is_written(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    writer = Ledger(path, writable=True)
+    reader = Ledger(path)
+    writer.record(result(2, Outcome.COLLISION), snapshot="abc")
+    assert reader.finished() == {2}
+    writer.record(result(1), snapshot="abc")
+    assert list(reader.results()) == [result(1), result(2, Outcome.COLLISION)]
+    assert list(reader.results(outcomes=("collision",))) == [result(2, Outcome.COLLISION)]
+    assert reader.outcomes() == {"collision": 1, "survived": 1}
+    assert reader.steps_total() == 20
+    assert reader.result(2) == result(2, Outcome.COLLISION)
+    assert reader.result(3) is None
+    assert reader.snapshot_of(2) == "abc"
+    writer.close()
+    reader.close()
+
+
+def test_what_is_replaced_is_kept(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    for number in range(4):
+        ledger.record(result(number, Outcome.INVALID if number % 2 else Outcome.SURVIVED), snapshot="")
+    assert ledger.replace([1, 3, 99]) == 2
+    assert ledger.finished() == {0, 2}
+    assert ledger.replaced() == [result(1, Outcome.INVALID), result(3, Outcome.INVALID)]
+    ledger.record(result(1), snapshot="")
+    assert ledger.outcomes() == {"survived": 3}
+    ledger.close()
+
+
+def test_every_state_is_written_down(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    ledger.enter("running", owner={"pid": 1})
+    ledger.enter("error", "no disk")
+    assert [event[1:] for event in ledger.events()] == [("running", ""), ("error", "no disk")]
+    assert ledger.facts() == {"state": "error", "detail": "no disk", "owner": {"pid": 1}}
+    ledger.enter("running")
+    assert "detail" not in ledger.facts()
+    ledger.close()
+
+
+def test_an_empty_file_is_no_ledger_yet(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    with closing(sqlite3.connect(path)) as database:  # as whoever looks too early does
+        database.execute("PRAGMA schema_version")
+    assert path.exists()
+    assert not has_begun(path)
+    Ledger(path, writable=True).close()
+    assert has_begun(path)
+    with closing(Ledger(path)) as ledger:
+        assert ledger.outcomes() == {}
+
+
+def _read_when_there(folder, said):
+    said.put("ready")
+    wrong = []
+    for number in range(300):
+        path = folder / f"{number}.sqlite"
+        while not path.exists():
+            pass
+        try:
+            Ledger(path).close()
+        except HuntDirectoryError as error:
+            wrong.append(str(error))
+    said.put(wrong)
+
+
+def test_whoever_sees_a_ledger_can_read_it(tmp_path):
+    context = get_context("spawn")  # forking a process with threads is asking for it
+    said = context.Queue()
+    reader = context.Process(target=_read_when_there, args=(tmp_path, said))
+    reader.start()
+    assert said.get(timeout=60) == "ready"
+    for number in range(300):
+        Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
+    assert said.get(timeout=60) == []
+    reader.join()
+
+
+def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    ledger = Ledger(path, writable=True)
+    for number in range(300):
+        ledger.record(result(number), snapshot="")
+    ledger.close()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 :] = b"\x55" * (len(data) - len(data) // 2)
+    path.write_bytes(data)
+    found = Ledger(path)
+    for read in (found.outcomes, found.finished, found.nearest_miss, lambda: list(found.results()), found.table):
+        with pytest.raises(HuntDirectoryError, match=r"malformed|not a ledger"):
+            list(read() or [])
+    found.close()
+
+
+def test_a_ledger_of_another_version_is_refused(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    Ledger(path, writable=True).close()
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    for writable in (False, True):
+        with pytest.raises(HuntDirectoryError, match="a ledger of version 99"):
+            Ledger(path, writable=writable)
+
+
+def test_a_trial_that_ran_again_counts_once(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    ledger.record(result(1, Outcome.HANG), snapshot="")
+    ledger.record(result(1), snapshot="")
+    assert ledger.outcomes() == {"survived": 1}
+    ledger.close()
+
+
+def test_the_nearest_miss_is_no_crash_and_no_void(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    assert ledger.nearest_miss() is None
+    for number, (outcome, ttc) in enumerate(
+        [(Outcome.COLLISION, 0.0), (Outcome.SURVIVED, 2.0), (Outcome.FINISHED, 1.5), (Outcome.SURVIVED, float("inf"))]
+    ):
+        ledger.record(result(number, outcome, ttc=ttc), snapshot="")
+    nearest = ledger.nearest_miss()
+    assert nearest is not None
+    assert nearest.spec.number == 2
+    ledger.close()
+
+
+@given(st.dictionaries(st.text(), st.none() | st.integers() | st.text() | st.lists(st.floats(allow_nan=False))))
+def test_facts_are_kept_and_none_removes_one(tmp_path_factory, facts):
+    ledger = Ledger(tmp_path_factory.mktemp("ledger") / "ledger.sqlite", writable=True)
+    ledger.note(**dict.fromkeys(facts, "before"))
+    ledger.note(**facts)
+    assert ledger.facts() == {key: value for key, value in facts.items() if value is not None}
+    ledger.close()
+
+
+def test_what_a_killed_writer_recorded_is_there(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    script = (
+        "import sys, time; sys.path.insert(0, sys.argv[2]); from test_ledger import result\n"
+        "from pathlib import Path; from crashhunt.hunts import Ledger\n"
+        "ledger = Ledger(Path(sys.argv[1]), writable=True)\n"
+        "for number in range(100): ledger.record(result(number), snapshot='')\n"
+        "print('written', flush=True); time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(path), Path(__file__).parent], stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"written\n"
+        process.send_signal(signal.SIGKILL)
+    ledger = Ledger(path, writable=True)
+    assert ledger.finished() == set(range(100))
+    ledger.close()
+
+
+def test_what_is_no_ledger_is_refused(tmp_path):
+    with pytest.raises(HuntDirectoryError, match="not the directory of a hunt"):
+        Ledger(tmp_path / "ledger.sqlite")
+    (tmp_path / "text.sqlite").write_text("no database at all, but long enough to be taken for a header " * 3)
+    with pytest.raises(HuntDirectoryError, match="not a ledger"):
+        Ledger(tmp_path / "text.sqlite")
+    other = sqlite3.connect(tmp_path / "other.sqlite")
+    other.execute("CREATE TABLE pets (name)")
+    other.close()
+    with pytest.raises(HuntDirectoryError, match="not a ledger"):
+        Ledger(tmp_path / "other.sqlite")
+    with pytest.raises(HuntDirectoryError, match="does not exist"):
+        Ledger(tmp_path / "missing" / "ledger.sqlite", writable=True)

@@ -1,0 +1,60 @@
+"""Agents that do not start are refused in one line, and only where no trial could make them start."""
+
+from __future__ import annotations
+
+import pytest
+
+from crashhunt.errors import ArgumentError
+from crashhunt.hunts import Preflight
+from crashhunt.plans import Request, plan
+from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+
+
+def settings_of(**arguments):
+    _, settings = plan(Request(trials=20, max_steps=5, scenario="loop", arguments=arguments, seed=1))
+    return settings
+
+
+def result(number, message="there is no file 'x'", *, outcome=Outcome.INVALID, agent="ego", kind="ValueError"):
+    failure = Failure(kind, message, f'Traceback:\n  File "/s/code/my.py", line {7}, in x\n', agent)
+    spec = TrialSpec(number, 1, {"ego": {"speed": 15.0}}, {}, max_steps=5)
+    return TrialResult(spec, outcome, failure=failure if outcome is Outcome.INVALID else None)
+
+
+def test_what_fails_in_every_trial_in_the_same_way_is_refused():
+    preflight = Preflight(settings_of(speed="15"), 20, code=("/s/code",))
+    assert [preflight.sift(result(number, kind="KeyError")) for number in range(3)] == [[], [], []]
+    with pytest.raises(
+        ArgumentError, match="KeepLaneWithSpeed does not start: KeyError: there is no file 'x'"
+    ) as caught:
+        preflight.sift(result(3, kind="KeyError"))
+    assert caught.value.where == "my.py:7"
+    assert caught.value.exit_code == 2
+
+
+def test_a_hunt_of_one_trial_is_refused_after_one():
+    with pytest.raises(ArgumentError, match="there is no file 'x'; mend the agent"):
+        Preflight(settings_of(speed="15"), 1).sift(result(0))
+
+
+def test_files_are_named_as_they_were_given():
+    preflight = Preflight(settings_of(speed="15"), 1, files={"w.onnx": "/s/files/0-w.onnx"})
+    with pytest.raises(ArgumentError, match=r"'w.onnx' has nine outputs"):
+        preflight.sift(result(0, "'/s/files/0-w.onnx' has nine outputs"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [result(9, outcome=Outcome.SURVIVED), result(9, "another reason"), result(9, agent=""), result(9, kind="KeyError")],
+)
+def test_as_soon_as_one_is_otherwise_all_are_accounted_for(other):
+    preflight = Preflight(settings_of(speed="15"), 20)
+    held = [result(number) for number in range(3)]
+    assert [preflight.sift(one) for one in held] == [[], [], []]
+    assert preflight.sift(other) == [*held, other]
+    assert preflight.sift(held[0]) == [held[0]]
+
+
+def test_where_an_argument_varies_another_value_may_do():
+    preflight = Preflight(settings_of(speed="5:15"), 20)
+    assert preflight.sift(result(0)) == [result(0)]

@@ -1,0 +1,271 @@
+from __future__ import annotations
+
+import gzip
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+import tomli_w
+from hypothesis import given, strategies as st
+
+from crashhunt.errors import ScenarioError
+from crashhunt.scenario import load_scenario, scenario_from_dict, shipped_folder, shipped_scenarios
+
+LOOP = shipped_folder() / "loop"
+
+
+@pytest.fixture
+def loop(tmp_path):
+    shutil.copytree(LOOP, tmp_path / "own")
+    return tmp_path / "own"
+
+
+def change(folder: Path, *keys: str, value: object) -> None:
+    data = tomllib.loads((folder / "scenario.toml").read_text())
+    place = data
+    for key in keys[:-1]:
+        place = place[key]
+    if value is None:
+        del place[keys[-1]]
+    else:
+        place[keys[-1]] = value
+    (folder / "scenario.toml").write_text(tomli_w.dumps(data))
+
+
+@pytest.mark.parametrize("name", shipped_scenarios())
+def test_every_shipped_scenario_is_valid_and_complete(name):
+    scenario = load_scenario(name)
+    assert scenario.name == name
+    assert scenario.title
+    assert all((scenario.folder / file).is_file() for file in scenario.files())
+    for arguments in (scenario.scenario_arguments(), *(scenario.agent_arguments(agent) for agent in scenario.agents)):
+        for argument in arguments.values():
+            assert argument.default is not None
+            assert argument.help
+            if argument.kind == "str":  # a file beside it
+                assert Path(argument.default).is_file()
+                continue
+            assert argument.distribution is not None
+            assert argument.distribution.contains(argument.default), argument
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "says"),
+    [
+        (("step_length_s",), "fast", ["step_length_s", "'fast'"]),
+        (("step_length_s",), 0.0, ["step_length_s", "0.0"]),
+        (("step_length",), 0.1, ["step_length", "did you mean 'step_length_s'"]),
+        (("sumo", "nett"), "x", ["sumo.nett", "did you mean 'net'"]),
+        (("sumo", "net"), "gone.net.xml", ["gone.net.xml", "does not exist"]),
+        (("sumo", "net"), "../own/../loop.net.xml", ["loop.net.xml"]),
+        (("sumo", "net"), None, ["sumo.net", "missing"]),
+        (("sumo",), None, ["sumo", "missing"]),
+        (("agents", "ego", "rout"), "x", ["agents.ego.rout", "did you mean 'route'"]),
+        (("agents", "ego", "route"), None, ["agents.ego", "existing, route, edges"]),
+        (("agents", "ego", "edges"), ["south"], ["agents.ego", "exactly one"]),
+        (("agents", "ego", "action"), "telepathic", ["agents.ego.action", "'telepathic'"]),
+        (("agents", "ego", "arguments", "speed", "range"), "30:5", ["speed", "5.0:30.0"]),
+        (("agents",), {}, ["agents", "[agents.ego]"]),
+        (("observation",), {"vehicles": 0}, ["observation.vehicles", "0"]),
+        (("observation",), {"features": ["smell"]}, ["observation.features", "'smell'"]),
+        (("arguments", "vehicles"), None, ["'vehicles'", "traffic.rou.xml"]),
+        (("schema",), 2, ["schema", "2"]),
+        (("simulator",), "smuo", ["simulator = 'smuo'", "did you mean 'sumo'?"]),
+        (("schema",), None, ["'schema' is missing", "add schema = 1"]),
+        (("arguments", "vehicles", "default"), 40, ["arguments.vehicles.default = 40", "'10:35'"]),
+        (
+            ("agents", "ego", "arguments", "speed", "default"),
+            4.0,
+            ["speed.default = 4.0", "'5:25'"],
+        ),
+        (("sumo", "options"), {"seed": 3}, ["seed", "sets itself"]),
+    ],
+)
+def test_a_mistake_is_named_with_file_key_value_and_fix(loop, keys, value, says):
+    change(loop, *keys, value=value)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(loop)
+    text = str(caught.value)
+    for part in says:
+        assert part in text, text
+    assert str(loop) in text
+    assert caught.value.fix
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("file", ["bad.toml", "scenario.toml"])
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("simulater",), "sumo"),
+        (("agents", "ego", "arguments", "speed", "range"), "5:x"),
+        (("agents", "ego", "arguments", "speed", "default"), 4.0),
+        (("sumo", "net"), "gone.net.xml"),
+    ],
+)
+def test_an_error_names_the_file_that_was_read(loop, keys, value, file):
+    change(loop, *keys, value=value)
+    (loop / "scenario.toml").rename(loop / file)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(loop / file)
+    assert caught.value.where.startswith(str(loop / file))
+
+
+def test_what_ran_before_is_not_refused_in_a_snapshot(loop):
+    change(loop, "arguments", "vehicles", "default", value=40)
+    change(loop, "schema", value=None)
+    assert load_scenario(loop / "scenario.toml", kept=True).arguments["vehicles"].default == 40
+
+
+def test_a_path_that_is_not_there_has_a_neighbour(loop, monkeypatch):
+    monkeypatch.chdir(loop.parent)
+    for name, says in (
+        ("owm", "did you mean 'own'?"),
+        ("own/scenari.toml", "did you mean 'own/scenario.toml'?"),
+        ("Loop", "did you mean 'loop'?"),
+        (".", "give the folder that has one"),
+    ):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(name)
+        assert says in caught.value.fix
+    (loop / "scenario.toml").rename(loop / "mine.toml")
+    with pytest.raises(ScenarioError, match=r"own: the folder has no scenario\.toml; give own/mine\.toml"):
+        load_scenario("own")
+
+
+@pytest.mark.parametrize("content", ["", "title = ", "\x00", "a = 1\na = 2"])
+def test_what_is_not_toml_is_refused(tmp_path, content):
+    (tmp_path / "scenario.toml").write_text(content)
+    with pytest.raises(ScenarioError):
+        load_scenario(tmp_path)
+
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+TABLES = [(), ("sumo",), ("agents",), ("agents", "ego"), ("arguments",), ("observation",)]
+
+
+@given(st.data())
+def test_no_content_raises_anything_else(data):
+    content = tomllib.loads((LOOP / "scenario.toml").read_text())
+    content.setdefault("observation", {})
+    place = content
+    for key in data.draw(st.sampled_from(TABLES)):
+        place = place[key]
+    keys = st.sampled_from(sorted(place)) if place else st.text(max_size=5)
+    place[data.draw(keys | st.text(max_size=5))] = data.draw(plain)
+    try:
+        scenario_from_dict(content, where="here", folder=LOOP)
+    except ScenarioError as error:
+        assert error.where == "here"
+
+
+def sumocfg(folder: Path, text: str, name: str = "town.sumocfg") -> Path:
+    path = folder / name
+    path.write_text(f"<configuration>{text}</configuration>")
+    return path
+
+
+@pytest.fixture
+def town(tmp_path):
+    """What people have: a network, routes, and a configuration with outputs."""
+    shutil.copy(LOOP / "loop.net.xml", tmp_path / "net.net.xml")
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><vType id="t"/><route id="way" edges="south east"/>'
+        '<flow id="late" type="t" route="way" begin="50" end="60" number="3"/>'
+        '<vehicle id="odd name #1" type="t" route="way" depart="7.5"/></routes>'
+    )
+    return tmp_path
+
+
+def test_a_bare_sumocfg_is_a_scenario(town):
+    path = sumocfg(
+        town,
+        '<input><net-file value="net.net.xml"/><route-files value="r.rou.xml"/></input>'
+        '<time><begin value="5"/><end value="100"/><step-length value="0.5"/></time>'
+        '<processing><lateral-resolution value="0.8"/><time-to-teleport value="300"/></processing>'
+        '<output><summary-output value="s.xml"/></output><tripinfo-output value="t.xml"/>'
+        '<random_number><seed value="7"/></random_number><gui_only><start value="true"/></gui_only>',
+    )
+    scenario = load_scenario(path)
+    assert list(scenario.agents) == ["odd name #1"]  # departs first
+    assert scenario.agents["odd name #1"].existing
+    assert scenario.step_length_s == 0.5
+    assert scenario.sumo is not None
+    assert scenario.sumo.options == {
+        "begin": 5.0,
+        "end": "100",
+        "lateral-resolution": "0.8",
+        "time-to-teleport": "300",
+    }
+    assert scenario.arguments["scale"].option == "scale"
+    assert "odd name #1" in scenario.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("ego", "agent", "attribute", "value"),
+    [
+        ("late.0", "late.0", "existing", True),
+        ("vehicle=odd name #1", "odd name #1", "existing", True),
+        ("route=way", "ego", "route", "way"),
+        ("edges=south,east", "ego", "edges", ("south", "east")),
+    ],
+)
+def test_the_controlled_vehicle_can_be_named(town, ego, agent, attribute, value):
+    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
+    scenario = load_scenario(path, ego=ego)
+    assert getattr(scenario.agents[agent], attribute) == value
+
+
+@pytest.mark.parametrize(
+    ("rate", "depart_s"),
+    [
+        ('period="4"', 46.0),
+        ('vehsPerHour="1800"', 28.0),
+        ('perHour="1800"', 28.0),
+        ('probability="0.5"', 28.0),
+        ('period="exp(0.25)"', 46.0),
+        ('end="1:50" number="10"', 100.0),
+        ('period="whenever"', 0.0),
+        ("", 0.0),
+    ],
+)
+def test_a_vehicle_of_a_flow_is_waited_for(town, rate, depart_s):
+    (town / "r.rou.xml").write_text(f'<routes><flow id="a.b" from="south" to="east" begin="10" {rate}/></routes>')
+    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
+    assert load_scenario(path, ego="a.b.9").agents["a.b.9"].depart_s == depart_s
+
+
+def test_files_beside_and_above_and_compressed(town):
+    (town / "cfg").mkdir()
+    with gzip.open(town / "r.rou.xml.gz", "wb") as file:
+        file.write((town / "r.rou.xml").read_bytes())
+    path = sumocfg(town / "cfg", '<net-file value="../net.net.xml"/><route-files value="../r.rou.xml.gz"/>')
+    scenario = load_scenario(path)
+    assert scenario.origin == str(path)
+    assert scenario.folder == town
+    assert sorted(scenario.files()) == ["net.net.xml", "r.rou.xml.gz"]
+    assert list(scenario.agents) == ["odd name #1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "ego", "says"),
+    [
+        ("<input>", "", "not valid XML"),
+        ("", "", "net-file"),
+        ('<net-file value="gone.net.xml"/>', "", "gone.net.xml"),
+        ('<net-file value="net.net.xml"/>', "", "--ego edges=FROM,TO"),
+        ('<net-file value="net.net.xml"/>', "colour=red", "route=ID"),
+        ('<net-file value="net.net.xml"/><step-length value="x"/>', "route=a", "'x'"),
+        ('<net-file value="net.net.xml"/><scale value="x"/>', "route=a", "'x'"),
+        ('<net-file value="net.net.xml"/><weight-files value="w.xml"/>', "route=a", "weight-files"),
+    ],
+)
+def test_a_sumocfg_that_cannot_be_used_says_why(town, text, ego, says):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(sumocfg(town, text), ego=ego)
+    assert says in str(caught.value)

@@ -1,0 +1,184 @@
+"""Mistakes in a scenario of SUMO: refused before the hunt where its files tell, else SUMO's words with file and key."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+
+import pytest
+
+from crashhunt.errors import ScenarioError
+from crashhunt.scenario import load_scenario, shipped_folder
+from crashhunt.scenario.backends.sumo import explained
+
+ROUTES = """<routes>
+  <vType id="car"/><vType id="ego"/>
+  <route id="way" edges="south east"/>
+  <flow id="left" type="car" route="way" begin="0" end="60" number="3"/>
+  <vehicle id="van &amp; co" type="car" route="way" depart="7.5"/>
+  <vehicle type="car"
+           id='odd.one' route="way" depart="8"/>
+  <person id="0" depart="0"><personTrip from="south" to="east" modes="car"/></person>
+  {more}
+</routes>"""
+
+
+@pytest.fixture
+def town(tmp_path):
+    shutil.copy(shipped_folder() / "loop" / "loop.net.xml", tmp_path / "net.net.xml")
+    (tmp_path / "town.sumocfg").write_text(
+        '<configuration><net-file value="net.net.xml"/><route-files value="r.rou.xml"/></configuration>'
+    )
+    (tmp_path / "r.rou.xml").write_text(ROUTES.format(more=""))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("ego", "says"),
+    [
+        ("nobody", "--ego 'nobody': there is no vehicle 'nobody' in its files; there are left.0, van & co, odd.one"),
+        ("od.one", "did you mean 'odd.one'?"),
+        ("left", "'left' is a flow; name one of its vehicles: left.0, left.1"),
+        ("ego", "there is no vehicle 'ego'"),  # which is a type
+        ("lft.2", "did you mean 'left.0'?"),
+        ("route=wya", "--ego 'route=wya': there is no route 'wya' in its files; did you mean 'way'?"),
+        ("edges=south,eest", "there is no edge 'eest'"),
+    ],
+)
+def test_who_is_not_there_is_refused_at_once(town, ego, says):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(town / "town.sumocfg", ego=ego)
+    assert says in str(caught.value)
+    assert caught.value.where == str(town / "town.sumocfg")
+
+
+@pytest.mark.parametrize("ego", ["left.2", "van & co", "odd.one", "0_0", "route=way", "edges=south,east"])
+def test_who_may_be_there_is_not(town, ego):
+    load_scenario(town / "town.sumocfg", ego=ego)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        '<vehicle id="${name}" route="way" depart="9"/>',
+        '<trip id="&#110;o" depart="9"/>',
+    ],
+)
+def test_where_the_files_do_not_tell_nothing_is_refused(town, more):
+    (town / "r.rou.xml").write_text(ROUTES.format(more=more))
+    path = town / "town.sumocfg"
+    path.write_text(path.read_text().replace("r.rou.xml", "r.rou.xml.gz"))
+    (town / "r.rou.xml.gz").write_bytes(gzip.compress((town / "r.rou.xml").read_bytes()))
+    try:
+        load_scenario(path, ego="nobody")
+    except ScenarioError as error:  # for another reason
+        assert "no vehicle" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong", "says"),
+    [
+        ('type = "ego"', 'type = "egoo"', "agents.ego.type: there is no type 'egoo' in its files; did you mean 'ego'?"),
+        ('route = "counterclockwise"', 'route = "clockwize"', "agents.ego.route: there is no route 'clockwize'"),
+        ('route = "counterclockwise"', 'edges = ["south", "eats"]', "agents.ego.edges: there is no edge 'eats'"),
+        ('route = "counterclockwise"', "existing = true", "agents.ego: there is no vehicle 'ego' in its files"),
+    ],
+)
+def test_names_in_a_scenario_are_looked_up(tmp_path, line, wrong, says):
+    shutil.copytree(shipped_folder() / "loop", tmp_path / "own")
+    file = tmp_path / "own" / "scenario.toml"
+    file.write_text(file.read_text().replace(line, wrong))
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(file)
+    assert says in str(caught.value)
+    load_scenario(file, kept=True)  # a snapshot's has been run
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A scenario whose mistakes only SUMO finds."""
+    shutil.copytree(shipped_folder() / "loop", tmp_path / "own")
+    file = tmp_path / "own" / "scenario.toml"
+    text = file.read_text().replace("depart_lane = ", 'depart_speed = "fast"\ndepart_lane = ')
+    text = text.replace("[sumo]", '[sumo]\noptions = { lateral-resolutoin = 0.8, max-depart-delay = "wide" }')
+    file.write_text(text.replace('help = "in each direction"', 'option = "scael"'))
+    return load_scenario(file)
+
+
+STAGED = "/some/where/.scratch/stage-17"
+
+
+@pytest.mark.parametrize(
+    ("message", "output", "where", "says"),
+    [
+        (
+            "Could not parse commandline options.",
+            "Warning: x\nError: On processing option '--lateral-resolutoin':\n No option 'x'.\nError: y\n",
+            "scenario.toml",
+            "sumo.options.lateral-resolutoin: SUMO says: On processing option '--lateral-resolutoin': No",
+        ),
+        (
+            "Could not parse commandline options.",
+            "Error: On processing option '--scael':\n No option with the name 'scael' exists.\n",
+            "scenario.toml",
+            "arguments.vehicles.option: SUMO says",
+        ),
+        ("Invalid Number Format (double) wide", "", "scenario.toml", "sumo.options.max-depart-delay = 'wide': SUMO"),
+        (
+            "Invalid departSpeed definition 'fast' for vehicle 'ego'; must be one of …",
+            "",
+            "scenario.toml",
+            "agents.ego.depart_speed = 'fast': SUMO says: Invalid departSpeed",
+        ),
+        (
+            f"expected end of tag 'routs' In file '{STAGED}/traffic.rou.xml' At line/column 14/3.",
+            "",
+            "traffic.rou.xml, line 14",
+            "SUMO says: expected end of tag 'routs'; mend it there",
+        ),
+        (
+            "Process Error",
+            f"Error: expected end of tag 'nt'\n In file '{STAGED}/loop.net.xml'\n At line/column 133/3.\n",
+            "loop.net.xml, line 133",
+            "SUMO says: expected end of tag 'nt'",
+        ),
+        (
+            "'number' is needed in flow 'left'.",
+            "",
+            "traffic.rou.xml, line 11",
+            "is needed in flow 'left'; mend it there",
+        ),
+        ("something new", "", "scenario.toml", "SUMO says: something new; see [sumo]"),
+    ],
+)
+def test_sumos_words_get_file_key_and_fix(own, message, output, where, says):
+    error = explained(f"SUMO could not set up the episode: {message}", output, own)
+    assert error is not None
+    assert error.where == str(own.folder / where)
+    assert says in str(error)
+    assert error.fix
+    assert "stage-" not in str(error)
+
+
+def test_a_process_that_died_at_set_up_says_what_it_said(own):
+    error = explained("the process died of SIGSEGV", "Error: Attribute 'shape' is missing of lane 'south_0'.\n", own)
+    assert str(own.folder / "loop.net.xml, line ") in error.where
+    assert "the process died of SIGSEGV" in error.message
+    assert explained("the vehicle 'ego' was not on the road", "", own) is None
+
+
+def test_a_hunt_tells_it(shell):
+    shutil.copytree(shipped_folder() / "loop", shell.folder / "own")
+    file = shell.folder / "own" / "traffic.rou.xml"
+    file.write_text(file.read_text().replace('<vType id="ego"', '<vType id="ego" carFollowModel="nope"'))
+    told = shell.crashhunt("run", "h", "1", "1", "5", "--scenario", "own", expect=3).out
+    assert f"{file}, line 8: SUMO says: Unknown car following model 'nope'" in told
+    assert str(file) in shell.crashhunt("logs", "h").out
+
+
+def test_included_files_are_looked_into(town):
+    (town / "r.rou.xml").write_text(ROUTES.format(more='<include href="more.rou.xml"/>'))
+    (town / "more.rou.xml").write_text('<routes><trip id="late" from="south" to="east" depart="9"/></routes>')
+    load_scenario(town / "town.sumocfg", ego="late")
+    with pytest.raises(ScenarioError, match="did you mean 'late'"):
+        load_scenario(town / "town.sumocfg", ego="lte")

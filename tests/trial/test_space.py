@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.errors import ArgumentError
+from crashhunt.space import Choice, Constant, Range, parse_spec
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(lambda x: abs(x) < 1e300)
+
+
+@st.composite
+def ranges(draw):
+    integer = draw(st.booleans())
+    number = st.integers(-(10**6), 10**6) if integer else finite
+    low, high = sorted((draw(number), draw(number)))
+    log = draw(st.booleans())
+    if log:
+        low, high = abs(low) + 1, abs(low) + 1 + abs(high - low)
+    if not np.isfinite(high - low):
+        low, high = 0.0, 1.0
+    step = None
+    if not log and draw(st.booleans()):
+        step = draw(st.integers(1, 1000)) if integer else max((high - low) / draw(st.integers(1, 50)), 1e-9)
+        if not integer and (high - low) / step > 10**6:
+            step = None
+    return Range(low, high, step=step, log=log, integer=integer)
+
+
+def kind_of_range(distribution):
+    return "int" if distribution.integer else "float"
+
+
+@given(ranges())
+def test_a_range_is_read_back_as_it_is_written(distribution):
+    assert parse_spec(str(distribution), kind_of_range(distribution)) == distribution
+
+
+@given(ranges(), st.integers(0, 2**32 - 1))
+def test_draws_lie_inside_and_have_the_right_type(distribution, seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(5):
+        value = distribution.sample(rng)
+        assert distribution.contains(value)
+        assert isinstance(value, int if distribution.integer else float)
+
+
+@given(ranges(), st.integers(1, 20))
+def test_a_grid_begins_at_the_lower_end_and_stays_inside(distribution, points):
+    if distribution.step is not None and distribution.steps > 10_000:
+        return
+    values = distribution.grid(points)
+    assert values[0] == distribution.low
+    assert all(distribution.contains(value) for value in values)
+    assert len(set(values)) == len(values)
+    if distribution.step is None:
+        assert len(values) <= points
+        if points > 1:
+            assert values[-1] == distribution.high
+
+
+@given(st.text(max_size=40), st.sampled_from([None, "float", "int", "bool", "str"]))
+def test_any_text_is_read_or_refused_with_a_fix(text, kind):
+    try:
+        distribution = parse_spec(text, kind, where="--arg x")
+    except ArgumentError as error:
+        assert error.fix
+        assert error.where == "--arg x"
+    else:
+        distribution.sample(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "expected"),
+    [
+        ("20", "float", Constant(20.0)),
+        ("20", "int", Constant(20)),
+        ("20", "str", Constant("20")),
+        ("20", None, Constant(20)),
+        ("5:40", "int", Range(5, 40, integer=True)),
+        ("5:40", "float", Range(5.0, 40.0)),
+        ("5:40", None, Range(5, 40, integer=True)),
+        ("5:40.0", None, Range(5.0, 40.0)),
+        ("5:40:5", "int", Range(5, 40, step=5, integer=True)),
+        ("log:1e-3:1", "float", Range(1e-3, 1.0, log=True)),
+        ("a|b|c", "str", Choice(("a", "b", "c"))),
+        ("1|2", "int", Choice((1, 2))),
+        ("true|false", "bool", Choice((True, False))),
+        ("true", None, Constant(True)),
+        ("module:attribute", None, Constant("module:attribute")),
+        ("-3:-1", "int", Range(-3, -1, integer=True)),
+    ],
+)
+def test_specifications(text, kind, expected):
+    found = parse_spec(text, kind)
+    assert found == expected
+    assert type(found) is type(expected)
+    assert parse_spec(str(found), kind) == found
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "fix"),
+    [
+        ("40:5", "int", "5:40"),
+        ("nan", "float", "finite"),
+        ("1:inf", "float", "finite"),
+        ("log:0:1", "float", "positive"),
+        ("log:1:2:3", "float", "log:LOW:HIGH"),
+        ("1:5:0", "int", "above 0"),
+        ("1:5:-1", "int", "above 0"),
+        ("0.5:3", "int", "whole numbers"),
+        ("maybe", "bool", "true"),
+        ("a|a", "str", "once"),
+        ("fast", "float", "5:40"),
+    ],
+)
+def test_mistakes_name_the_fix(text, kind, fix):
+    with pytest.raises(ArgumentError) as caught:
+        parse_spec(text, kind)
+    assert fix in caught.value.fix
+
+
+def test_every_whole_number_of_a_range_is_drawn():
+    rng = np.random.default_rng(1)
+    assert {Range(1, 6, integer=True).sample(rng) for _ in range(200)} == {1, 2, 3, 4, 5, 6}
+    assert {Range(1, 6, step=2, integer=True).sample(rng) for _ in range(200)} == {1, 3, 5}
+    assert {Choice(("a", "b")).sample(rng) for _ in range(50)} == {"a", "b"}
