@@ -26,7 +26,14 @@ if TYPE_CHECKING:
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 # What `run` and `replay` import; the rest of a command's modules is imported by its fork.
-IMPORTED = ("crashhunt.cli", "crashhunt.api", "crashhunt.report", "crashhunt.snapshot", "rich.console")
+IMPORTED = (
+    "crashhunt.cli",
+    "crashhunt.api",
+    "crashhunt.hunts._hunt",
+    "crashhunt.report._summary",
+    "crashhunt.snapshots._snapshot",
+    "rich.console",
+)
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _MESSAGE = 1 << 20

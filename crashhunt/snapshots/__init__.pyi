@@ -1,4 +1,9 @@
-from ._environment import environment_changes as environment_changes, processor as processor, versions as versions
+from ._environment import (
+    environment as environment,
+    environment_changes as environment_changes,
+    processor as processor,
+    versions as versions,
+)
 from ._snapshot import (
     Snapshot as Snapshot,
     SnapshotOptions as SnapshotOptions,
