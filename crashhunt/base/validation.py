@@ -1,13 +1,22 @@
-"""Validated dataclasses: pydantic does the work, and its finding becomes one line of ours."""
+"""Validated dataclasses: pydantic does the work, and its finding becomes one line of ours.
+
+What fits to the letter is built without pydantic, whose import and schemas are a third of a worker's start.
+"""
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+from dataclasses import MISSING, fields, is_dataclass
+from enum import EnumType
+from functools import cache
+from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from crashhunt.base.names import did_you_mean
 
 if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
     from crashhunt.base.errors import CrashhuntError
 
 __all__ = ["validate"]
@@ -24,11 +33,71 @@ def validate(kind: type[T], data: object, *, where: str, error: type[CrashhuntEr
         where: the file, for the error.
         error: the error to raise; its message has key and value, its fix says what would do.
     """
-    from pydantic import ConfigDict, TypeAdapter, ValidationError
-
-    _forbid_unknown(kind, ConfigDict(extra="forbid"), set())
     try:
-        return TypeAdapter(kind).validate_python(data)
+        return cast(T, _built(kind, data))
+    except _NotToTheLetterError:
+        return _validated(kind, data, where, error)
+
+
+class _NotToTheLetterError(Exception):
+    """It may be wrong, or something that pydantic converts."""
+
+
+def _built(kind: Any, data: Any) -> Any:
+    """Build what pydantic would build, for the types that our tables have; anything doubtful is left to it."""
+    if is_dataclass(kind):
+        return _dataclass_built(cast(type, kind), data)
+    if kind is Any or type(data) is kind:
+        return data
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return _member_built(inner, data)
+    if origin is Literal and any(type(data) is type(choice) and data == choice for choice in inner):
+        return data
+    if origin is tuple and type(data) in (list, tuple) and inner[1:] == (...,):
+        return tuple(_built(inner[0], item) for item in data)
+    if origin is dict and type(data) is dict:
+        return {_built(inner[0], key): _built(inner[1], value) for key, value in data.items()}
+    if kind is float and type(data) is int and abs(data) < 2**53:
+        return float(data)
+    if kind is Path and type(data) is str:
+        return Path(data)
+    if isinstance(kind, EnumType) and type(data) is str and data in kind._value2member_map_:
+        return kind(data)
+    raise _NotToTheLetterError
+
+
+def _dataclass_built(kind: type, data: Any) -> Any:
+    hints, needed = _hints_of(kind)
+    if type(data) is not dict or not needed <= data.keys() <= hints.keys():
+        raise _NotToTheLetterError
+    return kind(**{name: _built(hints[name], value) for name, value in data.items()})
+
+
+def _member_built(kinds: tuple[Any, ...], data: Any) -> Any:
+    """Of a union, the member whose type it is; of an optional type, that type."""
+    if type(data) in kinds:
+        return _built(type(data), data)
+    others = [kind for kind in kinds if kind is not type(None)]
+    if len(others) == 1:
+        return _built(others[0], data)
+    raise _NotToTheLetterError
+
+
+@cache
+def _hints_of(kind: type) -> tuple[dict[str, Any], frozenset[str]]:
+    """The types of a dataclass's fields, and which of them have no default."""
+    items = fields(kind)
+    hints = get_type_hints(kind)
+    needed = (item.name for item in items if item.default is MISSING and item.default_factory is MISSING)
+    return {item.name: hints[item.name] for item in items}, frozenset(needed)
+
+
+def _validated(kind: type[T], data: object, where: str, error: type[CrashhuntError]) -> T:
+    from pydantic import ValidationError
+
+    try:
+        return cast(T, _adapter(cast(Any, kind)).validate_python(data))
     except ValidationError as problem:
         first = problem.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -40,6 +109,14 @@ def validate(kind: type[T], data: object, *, where: str, error: type[CrashhuntEr
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None
         message = first["msg"][0].lower() + first["msg"][1:]
         raise error(f"{key} = {first['input']!r}: {message}", fix="change the value", where=where) from None
+
+
+@cache
+def _adapter(kind: type) -> TypeAdapter[Any]:
+    from pydantic import ConfigDict, TypeAdapter
+
+    _forbid_unknown(kind, ConfigDict(extra="forbid"), set())
+    return TypeAdapter(kind)
 
 
 def _forbid_unknown(kind: Any, config: Any, seen: set[Any]) -> None:

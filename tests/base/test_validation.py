@@ -1,0 +1,98 @@
+"""Tables that fit to the letter are built without pydantic, and are what it would have built."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import json
+import subprocess
+import sys
+import tomllib
+from dataclasses import asdict
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.base.validation import validate
+from crashhunt.plans import HuntSettings, Request, plan
+from crashhunt.scenario import Scenario, shipped_folder
+
+
+def as_read(settings) -> dict:
+    """As it is read from a file: plain lists, words and numbers."""
+    return json.loads(json.dumps(asdict(settings)))
+
+
+TABLES = [
+    *((Scenario, tomllib.loads(file.read_text())) for file in sorted(shipped_folder().glob("*/scenario.toml"))),
+    (HuntSettings, as_read(plan(Request(trials=1, max_steps=2, scenario="loop", seed=1))[1])),
+]
+JUNK = (
+    None, True, 0, 1, -1, 2.0, 2**60, float("nan"), "", "1", "ä", "\ud800", "sumo", "hang", [], [1], ["a"], {},
+    {"a": 1}, {"\ud800": "a"}, (), ("hang",), b"1",
+)  # fmt: skip
+GONE, NAMES = object(), ("seed", "title", "new", 3)
+
+
+def places(data: object, path: tuple = ()):
+    """Where something is, in tables and lists."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ():
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+@functools.cache
+def adapter(kind) -> TypeAdapter:
+    with pytest.raises(ScenarioError):  # of unknown keys, pydantic has been told by then
+        validate(kind, {"made-up": 1}, where="here", error=ScenarioError)
+    return TypeAdapter(kind)
+
+
+def same_as_pydantic(kind, data) -> bool:
+    """Whether a table is accepted, which pydantic has to see in the same way."""
+    try:
+        expected = adapter(kind).validate_python(data)
+    except ValidationError:
+        with pytest.raises(ScenarioError):
+            validate(kind, data, where="here", error=ScenarioError)
+        return False
+    assert repr(validate(kind, data, where="here", error=ScenarioError)) == repr(expected)
+    return True
+
+
+def test_every_table_of_ours_is_what_pydantic_would_have_built():
+    assert all(same_as_pydantic(kind, data) for kind, data in TABLES)
+
+
+@pytest.mark.parametrize("kind", [Scenario, HuntSettings])
+def test_whatever_is_in_a_table_is_seen_as_pydantic_sees_it(kind):
+    accepted = refused = 0
+    for data in [data for known, data in TABLES if known is kind][:2]:
+        for *path, last in list(places(data)):
+            for change in (*JUNK, GONE, *NAMES):
+                changed = copy.deepcopy(data)
+                table = changed
+                for key in path:
+                    table = table[key]
+                if change is GONE:
+                    del table[last]
+                elif change not in NAMES:
+                    table[last] = copy.deepcopy(change)
+                elif isinstance(table, dict):
+                    table[change] = table.pop(last)
+                if same_as_pydantic(kind, changed):
+                    accepted += 1
+                else:
+                    refused += 1
+    assert min(accepted, refused) > 200
+
+
+def test_a_scenario_that_is_right_needs_no_pydantic():
+    program = """
+import sys
+from crashhunt.scenario import load_scenario
+load_scenario("loop"), load_scenario("highway")
+assert "pydantic" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
