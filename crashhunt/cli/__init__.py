@@ -20,6 +20,7 @@ from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._export import add_export
+from crashhunt.cli._guide import add_guide
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._logs import add_logs
 from crashhunt.cli._replay import add_replay
@@ -33,7 +34,7 @@ from crashhunt.cli._trials import add_trials
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["main"]
+__all__ = ["main", "make_parser"]
 
 _DESCRIPTION = "Hunts for the crashes of a driving agent, and hands them over so that they can be fixed."
 _EPILOG = """\
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def _run(words: Sequence[str]) -> int:
     try:
         _check_names(words)
-        parser = _parser()
+        parser = make_parser()
         complete(parser)
         options = parser.parse_args(words)
         code: int = options.command(options, words)
@@ -131,7 +132,8 @@ def _check_names(words: Sequence[str]) -> None:
             raise UsageError(f"{word!a} is not valid UTF-8", fix="rename it") from None
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
     parser = Parser(
         "crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -139,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_check, add_compare, add_lists, add_completion,
+        add_check, add_compare, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

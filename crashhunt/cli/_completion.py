@@ -70,6 +70,7 @@ def _attach(parser: argparse.ArgumentParser) -> None:
         "--arg": lambda parsed_args, **_: [f"{name}=" for name in _arguments(parsed_args, of_agents=True)],
         "--set": lambda parsed_args, **_: [f"{name}=" for name in _arguments(parsed_args, of_agents=False)],
         "DIR": _paths(".zip"),
+        "TOPIC": lambda **_: _topics(),
     }
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -89,6 +90,12 @@ def _scenarios() -> list[str]:
     from crashhunt.scenario import shipped_scenarios
 
     return list(shipped_scenarios())
+
+
+def _topics() -> list[str]:
+    from crashhunt.guide import list_pages
+
+    return [page.topic for page in list_pages()]
 
 
 def _registered(group: Any) -> list[str]:

@@ -68,6 +68,8 @@ def find_sources(
         names.add(module.partition(".")[0])
     names |= {name for name in _top_level_modules() if not _is_installed(_place_of(name))}
     _take_module("crashhunt", found)
+    # The pages of the guide are read by people and never by a replay.
+    found.files = {place: file for place, file in found.files.items() if not _is_page(place)}
     for name in sorted(names - {"crashhunt"}):
         place = _place_of(name)
         if place is None:
@@ -124,6 +126,10 @@ def _take_module(name: str, found: Sources) -> None:
         return
     if file is not None:
         found.files[f"code/{Path(file).name}"] = Path(file)
+
+
+def _is_page(place: str) -> bool:
+    return place.startswith("code/crashhunt/guide/") and place.endswith(".md")
 
 
 def _walk(folder: Path) -> Iterator[Path]:

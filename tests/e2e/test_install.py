@@ -38,6 +38,8 @@ def test_a_wheel_brings_its_scenarios_along(tmp_path):
 
     shipped = {path.parent.name for path in (ROOT / "scenarios").glob("*/scenario.toml")}
     assert {entry["name"] for entry in crashhunt("scenarios")["scenarios"]} == shipped
+    pages = {path.stem for path in (ROOT / "crashhunt" / "guide").rglob("*.md")} - {"index"}
+    assert {entry["topic"] for entry in crashhunt("guide")["topics"]} == pages
     found = crashhunt("run", "out", "2", "50", "600", "--arg", "speed=20:25", "--seed", "1")
     assert found["stopped_because"] == "crash"
     shutil.rmtree(site / "crashhunt" / "scenarios")  # the bundle has its own

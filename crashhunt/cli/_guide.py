@@ -1,0 +1,76 @@
+"""``crashhunt guide``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import add_json
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.guide import Page
+
+__all__ = ["add_guide"]
+
+
+def add_guide(commands: Any) -> None:
+    """Add the command."""
+    guide = commands.add_parser(
+        "guide",
+        help="read the guide: tutorials, how to, reference, troubleshooting",
+        description="Read the guide in the terminal: tutorials, how to do what, reference, troubleshooting. Without a "
+        "TOPIC, list what there is.",
+    )
+    guide.add_argument("topic", metavar="TOPIC", nargs="?", default="", help="a page; without it, they are listed")
+    add_json(guide)
+    guide.set_defaults(command=_guide)
+
+
+def _guide(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.cli import make_parser
+    from crashhunt.guide import find_page, for_terminal, list_pages
+
+    if not options.topic:
+        pages = list_pages()
+        if options.json:
+            said = [{"topic": page.topic, "section": page.section, "title": page.title} for page in pages]
+            print(json.dumps({"topics": said}))
+        else:
+            print(_listing(pages))
+        return 0
+    page = find_page(options.topic)
+    text = page.text(make_parser())
+    if options.json:
+        print(json.dumps({"topic": page.topic, "section": page.section, "title": page.title, "text": text}))
+    elif sys.stdout.isatty():
+        _show(for_terminal(text))
+    else:
+        print(for_terminal(text))
+    return 0
+
+
+def _listing(pages: list[Page]) -> str:
+    from crashhunt.guide import SECTIONS
+
+    width = max(len(page.topic) for page in pages)
+    lines = ["crashhunt guide TOPIC shows one of these:"]
+    for section, members in groupby(pages, key=lambda page: page.section):
+        lines += ["", f"{SECTIONS[section]}:", *(f"  {page.topic:{width}}  {page.title}" for page in members)]
+    return "\n".join(lines)
+
+
+def _show(text: str) -> None:
+    """Draw Markdown, in lines of a length that can be read."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    console = Console()
+    console.width = min(console.width, _WIDEST)
+    console.print(Markdown(text, code_theme="ansi_dark", hyperlinks=True))
+
+
+_WIDEST = 120

@@ -1,0 +1,201 @@
+"""The reference of the Python interface, made from signatures and docstrings.
+
+The sources are read and not imported: a page is there at once, and no package has to be installed that only some need.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["describe_api"]
+
+_OFFERED = {
+    "crashhunt": "",
+    "crashhunt.hunts": "HuntReport HuntResults SuiteResults",
+    "crashhunt.crashes": "Bundle",
+    "crashhunt.recording": "Recording Divergence",
+    "crashhunt.replays": "ReplayReport",
+    "crashhunt.estimation": "Comparison HuntFigures",
+    "crashhunt.snapshots": "SnapshotOptions",
+    "crashhunt.trial": "Outcome TrialSpec TrialResult Collision Escape Failure",
+    "crashhunt.space": "",
+    "crashhunt.agents": "",
+    "crashhunt.world": "Scene Roster Actor Contact Lane Event ClosestApproach outlines_overlap rectangle_gap "
+    "time_to_contact closest_approach",
+    "crashhunt.simulators": "Simulator ActionForm FullBraking SpeedAndLaneChange MetaAction SpaceAction Kinematics",
+    "crashhunt.oracles": "Oracle Finding ReportedCollision Overlap OffRoad TrafficEvents",
+    "crashhunt.samplers": "",
+    "crashhunt.executors": "Executor PoolExecutor FreshProcessExecutor",
+    "crashhunt.render": "Action ActionDistribution Bar Contour Curve Curve3D Heatmap Picture Text scope",
+    "crashhunt.errors": "",
+    "crashhunt.testing": "",
+}
+"""The modules that users import, and what of each is for them; empty for everything."""
+
+_SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):$")
+_WORDS = {"Args": "Arguments", "Attributes": "Attributes", "Returns": "Returns", "Yields": "Yields", "Raises": "Raises"}
+_Definition = ast.ClassDef | ast.FunctionDef
+
+
+def describe_api() -> str:
+    """Return what users import, with signatures and docstrings, as Markdown."""
+    return "\n".join(line for module, names in _OFFERED.items() for line in _module(module, names.split()))
+
+
+def _module(name: str, names: list[str]) -> Iterator[str]:
+    yield f"## {name}\n"
+    yield from _docstring(ast.get_docstring(_parsed(name)))
+    for public in names or sorted(_door(name), key=str.lower):
+        found = _definition(name, public)
+        if found is not None:
+            yield from _described(f"{name}.{public}", found)
+        elif names:
+            raise LookupError(f"{name} has no class or function {public}; mend the list in {__file__}")
+
+
+def _described(name: str, found: _Definition) -> Iterator[str]:
+    yield f"### {name}\n"
+    if isinstance(found, ast.FunctionDef):
+        yield f"```python\n{found.name}{_signature(found, bound=False)}\n```\n"
+        yield from _docstring(ast.get_docstring(found))
+        return
+    made = _made_with(found)
+    if made:
+        yield f"```python\n{found.name}{made}\n```\n"
+    yield from _docstring(ast.get_docstring(found))
+    for method in found.body:
+        if isinstance(method, ast.FunctionDef) and not method.name.startswith("_"):
+            decorators = {ast.unparse(decorator) for decorator in method.decorator_list}
+            bound = "staticmethod" not in decorators
+            is_value = bool({"property", "cached_property"} & decorators)
+            shown = f": {ast.unparse(method.returns)}" if is_value and method.returns else _signature(method, bound)
+            yield f"**`{method.name}{'' if is_value and not method.returns else shown}`**\n"
+            yield from _docstring(ast.get_docstring(method))
+
+
+def _made_with(found: ast.ClassDef) -> str:
+    """How an instance is made; empty for protocols, errors and enumerations."""
+    for method in found.body:
+        if isinstance(method, ast.FunctionDef) and method.name == "__init__":
+            return _signature(method, bound=True).removesuffix(" -> None")
+    if not any("dataclass" in ast.unparse(decorator) for decorator in found.decorator_list):
+        return ""
+    fields = [item for item in found.body if isinstance(item, ast.AnnAssign)]
+    return _call([f"{ast.unparse(item.target)}: {ast.unparse(item.annotation)}{_default(item)}" for item in fields])
+
+
+def _default(field: ast.AnnAssign) -> str:
+    if field.value is None:
+        return ""
+    said = ast.unparse(field.value)
+    made = re.fullmatch(r"field\(default_factory=(\w+)\)", said)
+    return f" = {made[1]}()" if made else f" = {said}"
+
+
+def _signature(function: ast.FunctionDef, bound: bool = False) -> str:
+    given = function.args
+    if bound:
+        given = ast.arguments(**{name: getattr(given, name) for name in given._fields} | {"args": given.args[1:]})
+    parts = _parts(given)
+    answer = f" -> {ast.unparse(function.returns)}" if function.returns else ""
+    return _call(parts) + answer
+
+
+def _parts(given: ast.arguments) -> list[str]:
+    """The parameters, as they are written."""
+    plain = [*given.posonlyargs, *given.args]
+    defaults = [None] * (len(plain) - len(given.defaults)) + list(given.defaults)
+    parts = [_parameter(name, default) for name, default in zip(plain, defaults, strict=True)]
+    if given.vararg:
+        parts.append(f"*{_parameter(given.vararg, None)}")
+    elif given.kwonlyargs:
+        parts.append("*")
+    parts += [_parameter(*pair) for pair in zip(given.kwonlyargs, given.kw_defaults, strict=True)]
+    return [*parts, f"**{_parameter(given.kwarg, None)}"] if given.kwarg else parts
+
+
+def _parameter(name: ast.arg, default: ast.expr | None) -> str:
+    said = f"{name.arg}: {ast.unparse(name.annotation)}" if name.annotation else name.arg
+    equals = " = " if name.annotation else "="
+    return said if default is None else f"{said}{equals}{ast.unparse(default)}"
+
+
+def _call(parts: list[str]) -> str:
+    line = f"({', '.join(parts)})"
+    return line if len(line) <= 88 else "(\n" + "".join(f"    {part},\n" for part in parts) + ")"
+
+
+def _docstring(text: str | None) -> Iterator[str]:
+    """A docstring in Google's style as Markdown: prose stays, its sections become lists."""
+    in_section = False
+    for line in inspect.cleandoc(text or "").splitlines():
+        section = _SECTION.match(line)
+        if section:
+            in_section = True
+            yield f"*{_WORDS[section[1]]}*:\n"
+        elif in_section and line.startswith("    "):
+            named = re.match(r" {4}(\*{0,2}\w+): (.*)", line)
+            if named:
+                yield f"- `{named[1]}`: {_prose(named[2])}"
+            else:
+                yield f"  {_prose(line.strip())}"
+        else:
+            in_section = in_section and not line
+            yield _prose(line) if not line.startswith("    ") else line
+    yield ""
+
+
+def _prose(line: str) -> str:
+    return re.sub(r"``([^`]+)``", r"`\1`", line)
+
+
+def _door(module: str) -> dict[str, tuple[str, str]]:
+    """What a module offers, and where each is defined: the module and the name there."""
+    stub = _file(module).with_suffix(".pyi")
+    tree = ast.parse(stub.read_text(encoding="utf-8")) if stub.is_file() else _parsed(module)
+    found: dict[str, tuple[str, str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            origin = f"{module}.{node.module}" if node.level else str(node.module)
+            for alias in node.names:
+                if alias.name == "*":
+                    found |= _door(origin)
+                elif origin.startswith("crashhunt"):
+                    found[alias.asname or alias.name] = origin, alias.name
+    found |= {node.name: (module, node.name) for node in tree.body if isinstance(node, _Definition)}
+    listed = _listed(tree)
+    return {name: place for name, place in found.items() if name[0] != "_" and (listed is None or name in listed)}
+
+
+def _listed(tree: ast.Module) -> list[str] | None:
+    """The names in ``__all__``; None where it is made when the module is imported."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return ast.literal_eval(node.value) if isinstance(node.value, ast.List) else None
+    return None
+
+
+def _definition(module: str, name: str) -> _Definition | None:
+    """The class or function behind a name, wherever it is defined; None for anything else."""
+    origin, known = _door(module).get(name, (module, name))
+    if (origin, known) != (module, name):
+        return _definition(origin, known)
+    return next((node for node in _parsed(module).body if isinstance(node, _Definition) and node.name == name), None)
+
+
+@functools.cache
+def _parsed(module: str) -> ast.Module:
+    return ast.parse(_file(module).read_text(encoding="utf-8"))
+
+
+def _file(module: str) -> Path:
+    place = Path(__file__).parents[1].joinpath(*module.split(".")[1:])
+    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")

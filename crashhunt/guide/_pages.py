@@ -1,0 +1,121 @@
+"""Pages: where they are, what they are called, and how they are read in a terminal."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.names import one_of
+from crashhunt.guide._api import describe_api
+from crashhunt.guide._commands import describe_commands
+
+if TYPE_CHECKING:
+    import argparse
+
+__all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
+
+SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference", "": "More"}
+"""The folders of the guide, in the order in which somebody needs them, and what they are called."""
+
+_ORDER = [
+    "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
+    "agent", "scenario", "look-into-a-crash", "film", "hand-over", "suites", "compare", "train",
+    "commands", "api", "outcomes", "files", "json", "determinism", "security",
+    "troubleshooting", "glossary", "architecture", "contributing", "changelog",
+]  # fmt: skip
+"""What somebody needs first; what is not named here comes after it."""
+
+_MADE = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
+_COMMENT = re.compile(r"<!--.*?-->\n*", re.DOTALL)
+_PICTURE = re.compile(r"!\[([^\]]*)\]\([^)]*\)")
+_LINK = re.compile(r"\[([^\]]+)\]\((?!\w+:)([^)#]*)(?:#[^)]*)?\)")
+_FENCED = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page of the guide.
+
+    Args:
+        topic: the word by which somebody asks for it; no two pages have the same.
+        section: the folder that it is in; empty for the top one.
+        title: its heading.
+        file: the Markdown, in which some comments stand for what is made from the code.
+    """
+
+    topic: str
+    section: str
+    title: str
+    file: Path
+
+    def text(self, parser: argparse.ArgumentParser) -> str:
+        """Return the whole page as Markdown.
+
+        Args:
+            parser: of the command line, which is described on one of the pages.
+        """
+        return completed(self.file.read_text(encoding="utf-8"), parser)
+
+
+def pages_folder() -> Path:
+    """Return the folder of the pages."""
+    return Path(__file__).parent
+
+
+def list_pages() -> list[Page]:
+    """Return all pages, section by section; the index, which is a list of them, is none."""
+    found = []
+    for section in SECTIONS:
+        files = [file for file in (pages_folder() / section).glob("*.md") if file.stem != "index"]
+        found += [Page(file.stem, section, _title(file), file) for file in sorted(files, key=_place)]
+    return found
+
+
+def find_page(topic: str) -> Page:
+    """Return the page of a topic.
+
+    Raises:
+        UsageError: there is none.
+    """
+    pages = {page.topic: page for page in list_pages()}
+    if topic not in pages:
+        raise UsageError(f"the guide has no topic {topic!r}", fix=one_of(topic, pages))
+    return pages[topic]
+
+
+def completed(text: str, parser: argparse.ArgumentParser) -> str:
+    """Return the text of a page with what is made from the code in its place.
+
+    Args:
+        text: Markdown, in which ``<!-- made from the code: commands -->`` or ``api`` stands for it.
+        parser: of the command line.
+    """
+    makers = {"commands": lambda: describe_commands(parser), "api": describe_api}
+    # What stands there for whoever reads the file as it is, up to the next blank line, goes.
+    return re.sub(_MADE.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
+
+
+def for_terminal(text: str) -> str:
+    """Return Markdown without what a terminal cannot show: a link to a page becomes the command that shows it."""
+    parts = _FENCED.split(text)
+    for number in range(0, len(parts), 2):  # what is between the fences is shown as it is
+        prose = _PICTURE.sub(lambda found: f"(picture: {' '.join(found[1].split())})", parts[number])
+        parts[number] = _LINK.sub(_said, _COMMENT.sub("", prose))
+    return "".join(parts)
+
+
+def _said(found: re.Match[str]) -> str:
+    file = Path(found[2])
+    return f"{found[1]} (`crashhunt guide {file.stem}`)" if file.suffix == ".md" else found[1]
+
+
+def _place(file: Path) -> tuple[int, str]:
+    return (_ORDER.index(file.stem) if file.stem in _ORDER else len(_ORDER)), file.stem
+
+
+def _title(file: Path) -> str:
+    with file.open(encoding="utf-8") as lines:
+        return next(line.removeprefix("# ").strip() for line in lines if line.startswith("# "))

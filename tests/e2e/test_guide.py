@@ -1,0 +1,125 @@
+"""``crashhunt guide``: the pages in the terminal, and what of them is made from the code."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pty
+import re
+import subprocess
+
+import pytest
+from conftest import CRASHHUNT
+from pages import GUIDE
+
+from crashhunt.cli import make_parser
+from crashhunt.errors import UsageError
+from crashhunt.guide import describe_api, describe_commands, find_page, for_terminal, list_pages
+
+TOPICS = [page.topic for page in list_pages()]
+
+
+def test_topics_are_listed(shell):
+    out = shell.crashhunt("guide").out
+    assert all(re.search(rf"^  {topic} +\S", out, re.MULTILINE) for topic in TOPICS)
+    assert out.index("first-hunt") < out.index("your-town") < out.index("troubleshooting")
+    found = shell.crashhunt("guide", "--json").json["topics"]
+    assert [entry["topic"] for entry in found] == TOPICS
+    assert found[0] == {"topic": "first-hunt", "section": "tutorials", "title": "Your first hunt"}
+
+
+def test_every_page_has_a_topic_of_its_own():
+    files = {file.stem for file in GUIDE.rglob("*.md")} - {"index"}
+    assert set(TOPICS) == files
+    assert len(set(TOPICS)) == len(TOPICS)
+
+
+def test_a_page_in_a_pipe_is_plain_text(shell):
+    out = shell.crashhunt("guide", "files").out
+    assert out.startswith("# What is on disk\n")
+    assert "<!--" not in out
+    assert "\x1b" not in out
+    (said,) = [shell.crashhunt("guide", "files", "--json").json]
+    assert said["topic"] == "files"
+    assert said["text"].startswith("# What is on disk\n")
+
+
+def test_a_page_on_a_terminal_is_drawn(shell):
+    screen, terminal = pty.openpty()
+    done = subprocess.Popen(
+        [CRASHHUNT, "guide", "glossary"], cwd=shell.folder, stdout=terminal, stderr=terminal,
+        env={**shell.environment, "TERM": "xterm-256color", "COLUMNS": "90"},
+    )  # fmt: skip
+    os.close(terminal)
+    drawn = b""
+    with open(screen, "rb", buffering=0) as reader:
+        while True:
+            try:
+                drawn += reader.read(4096) or b""
+            except OSError:  # the other end is closed
+                break
+    assert done.wait(30) == 0
+    text = drawn.decode()
+    assert "\x1b[" in text
+    assert "| --- |" not in text  # the table is one
+    assert re.search(r"nearest miss.*of the trials without a crash", re.sub(r"\x1b\[[\d;]*m", "", text))
+
+
+def test_an_unknown_topic_is_one_line(shell):
+    done = shell.crashhunt("guide", "determinsm", expect=2)
+    assert done.err.startswith("crashhunt: the guide has no topic 'determinsm'; did you mean 'determinism'?")
+    assert len(done.err.splitlines()) == 1
+    assert shell.crashhunt("guide", "nothing", "--json", expect=2).json["error"]["fix"]
+
+
+@pytest.mark.parametrize(
+    ("markdown", "shown"),
+    [
+        ("see [files](../reference/files.md).", "see files (`crashhunt guide files`)."),
+        ("see [files](files.md#the-log).", "see files (`crashhunt guide files`)."),
+        ("see [below](#here)", "see below"),
+        ("[SUMO](https://eclipse.dev/sumo/)", "[SUMO](https://eclipse.dev/sumo/)"),
+        ("[code](../../scenarios/x.py)", "code"),
+        ("a ![two\nwords](x.png)", "a (picture: two words)"),
+        ("<!-- not run: why -->\n```toml\n<!-- [a](b.md) -->\n```\n", "```toml\n<!-- [a](b.md) -->\n```\n"),
+    ],
+)
+def test_what_a_terminal_cannot_show_is_said_in_words(markdown, shown):
+    assert for_terminal(markdown) == shown
+
+
+def test_the_commands_are_those_of_the_parser():
+    text = describe_commands(make_parser())
+    for command in ("run", "replay", "suite run", "suite defaults", "guide", "completion"):
+        assert f"## crashhunt {command}\n" in text
+    assert "- `--scenario NAME|PATH`: " in text
+    assert "`crashhunt status DIR [DIR ...]`" in text
+    assert "`crashhunt suite run FILE DIR [PARALLEL]`" in text
+    assert text in find_page("commands").text(make_parser())
+
+
+def test_the_python_reference_has_what_users_import():
+    text = describe_api()
+    described = re.findall(r"^### (\S+)\.(\w+)$", text, re.MULTILINE)
+    for name, public in described:
+        assert getattr(importlib.import_module(name), public).__doc__, f"{name}.{public}"
+    for name in ("crashhunt", "crashhunt.agents", "crashhunt.errors", "crashhunt.testing"):
+        offered = [public for public in importlib.import_module(name).__all__ if not public.startswith("_")]
+        assert {public for module, public in described if module == name} == set(offered)
+    assert ("crashhunt.hunts", "HuntResults") in described
+    assert "run(\n    directory: Path | str," in text
+    assert "- `parallel`: trials at a time; 0 for one per core." in text
+    assert "**`act(observation: Any) -> Any`**" in text
+    assert "(observation: Any, self" not in text
+
+
+def test_a_topic_that_is_none_is_refused_from_python_too():
+    with pytest.raises(UsageError, match="no topic 'x'"):
+        find_page("x")
+
+
+def test_what_stands_for_the_reference_in_the_file_is_not_shown():
+    for topic in ("commands", "api"):
+        page = find_page(topic)
+        assert "shows them" in page.file.read_text()
+        assert "shows them" not in page.text(make_parser())
