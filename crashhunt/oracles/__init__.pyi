@@ -1,3 +1,24 @@
+from ._choice import (
+    DEFAULT_ORACLES as DEFAULT_ORACLES,
+    OracleChoice as OracleChoice,
+    chosen_oracles as chosen_oracles,
+    oracle_name as oracle_name,
+    outcomes_brought as outcomes_brought,
+    parse_oracle as parse_oracle,
+)
 from ._crashes import OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
-from ._events import TrafficEvents as TrafficEvents
-from ._protocol import Finding as Finding, Oracle as Oracle, merge_findings as merge_findings
+from ._events import (
+    OffRoute as OffRoute,
+    RedLight as RedLight,
+    Teleport as Teleport,
+    TrafficEvents as TrafficEvents,
+    WrongWay as WrongWay,
+)
+from ._protocol import (
+    BringsOutcomes as BringsOutcomes,
+    Finding as Finding,
+    Oracle as Oracle,
+    SeesMap as SeesMap,
+    merge_findings as merge_findings,
+)
+from ._too_close import TooClose as TooClose

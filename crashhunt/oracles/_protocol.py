@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from crashhunt.trial import Collision, Outcome
-    from crashhunt.world import Event, Scene
+    from crashhunt.trial import Category, Collision, Outcome
+    from crashhunt.world import Event, Lane, Scene
 
-__all__ = ["Finding", "Oracle", "merge_findings"]
+__all__ = ["BringsOutcomes", "Finding", "Oracle", "SeesMap", "merge_findings"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,9 +19,9 @@ class Finding:
     """A traffic crash or a traffic event that an oracle saw.
 
     Args:
-        outcome: ``collision``, ``off_road``, or the kind of an event.
+        outcome: ``collision``, ``off_road``, the kind of an event, or an outcome of the oracle's own.
         collision: the evidence of a crash.
-        event: the evidence of an event.
+        event: the evidence of anything else; its ``what`` says in words what happened.
     """
 
     outcome: Outcome
@@ -30,13 +30,36 @@ class Finding:
 
 
 class Oracle(Protocol):
-    """Looks at scenes and says when one is a crash. It draws no random numbers and keeps no clock."""
+    """Looks at scenes and says when one is a crash. It draws no random numbers and keeps no clock.
+
+    Contract: it is made anew for every trial, with the arguments that ``--oracle NAME:key=value`` gives, so what it
+    remembers is of this trial only. `check` is called once a step, in order, with the scene before the first step too;
+    ``scene.previous`` is the scene one step before, None at the start. What it finds ends the trial where
+    ``--crash-on`` has the outcome, and is forgotten otherwise. What it raises is a fault of the oracle.
+    """
 
     name: str
     """As it appears in ``seen_by``."""
 
     def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
         """Return the crashes of these controlled vehicles in this scene; usually none."""
+
+
+@runtime_checkable
+class SeesMap(Protocol):
+    """Offered by an oracle that wants to know the roads."""
+
+    def see_map(self, lanes: Sequence[Lane]) -> None:
+        """Take the map of the trial, before the first `Oracle.check`; empty where the simulator has none."""
+
+
+@runtime_checkable
+class BringsOutcomes(Protocol):
+    """Offered by an oracle whose findings have outcomes of its own, or are no crash unless somebody asks for them."""
+
+    outcomes: Mapping[str, Category]
+    """Name to ``traffic crash`` or ``traffic event``. A hunt that chooses the oracle stops on them, unless
+    ``--crash-on`` says otherwise."""
 
 
 def merge_findings(findings: Sequence[Finding]) -> Finding | None:

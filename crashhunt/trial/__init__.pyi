@@ -1,5 +1,11 @@
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure, finite as finite
-from ._outcome import CRASHES as CRASHES, EVENTS as EVENTS, Outcome as Outcome
+from ._outcome import (
+    CRASHES as CRASHES,
+    EVENTS as EVENTS,
+    Category as Category,
+    Outcome as Outcome,
+    in_order as in_order,
+)
 from ._plain import check_parts as check_parts, check_plain as check_plain
 from ._result import TrialResult as TrialResult
 from ._signature import Signature as Signature, signature_of as signature_of

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from crashhunt.world import EVENT_WORDS
 
-__all__ = ["CRASHES", "EVENTS", "Outcome"]
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+__all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order"]
+
+Category = Literal["traffic crash", "traffic event", "software fault", "no crash"]
+"""What a report calls an outcome."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
 class Outcome(StrEnum):
-    """How a trial ended."""
+    """How a trial ended.
+
+    Oracles may bring outcomes of their own (`Outcome.own`). Iterating over the class gives those that every hunt has.
+    """
 
     SURVIVED = "survived"
     FINISHED = "finished"
@@ -29,29 +42,80 @@ class Outcome(StrEnum):
     HANG = "hang"
     INVALID = "invalid"
 
+    @classmethod
+    def own(cls, name: str, category: Category) -> Self:
+        """Return an outcome that an oracle brings, or one that every hunt has.
+
+        Args:
+            name: lower-case letters, digits and underscores, such as ``too_close``.
+            category: what reports call it, ``traffic crash`` or ``traffic event``.
+
+        Raises:
+            ValueError: the name is not valid, or stands for an outcome of another category.
+        """
+        if category not in get_args(Category):
+            raise ValueError(f"{category!r} is no category")
+        outcome = cls(name)
+        if outcome.is_own:
+            _CATEGORIES[name] = category
+        elif outcome.category != category:
+            raise ValueError(f"{name!r} is a {outcome.category}, not a {category}")
+        return outcome
+
+    @classmethod
+    def _missing_(cls, value: object) -> Self | None:
+        # An enum cannot be extended, but it may hand out members that it does not list, as `enum.Flag` does. What is
+        # no name at all is refused as ever, and whoever takes names from people asks which oracles bring them.
+        if not isinstance(value, str) or _NAME.fullmatch(value) is None:
+            return None
+        member = str.__new__(cls, value)
+        member._name_ = value.upper()
+        member._value_ = value
+        return cls._value2member_map_.setdefault(value, member)  # type: ignore[return-value]
+
+    def __reduce_ex__(self, protocol: object) -> tuple[object, ...]:
+        """Take the category of an oracle's own along to another process."""
+        return (Outcome.own, (self.value, self.category)) if self.is_own else (Outcome, (self.value,))
+
+    @property
+    def is_own(self) -> bool:
+        """Whether an oracle has brought it."""
+        return self.name not in Outcome.__members__
+
     @property
     def is_traffic_crash(self) -> bool:
         """Whether the vehicle did harm on the road."""
-        return self in (Outcome.COLLISION, Outcome.OFF_ROAD)
+        return self.category == "traffic crash"
 
     @property
     def is_traffic_event(self) -> bool:
         """Whether it is something of the traffic that ends a trial only where somebody asked for it."""
-        return str(self) in EVENT_WORDS
+        return self.category == "traffic event"
 
     @property
     def is_software_fault(self) -> bool:
         """Whether a program failed, not the driving."""
-        return self in (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.PROCESS_DIED, Outcome.HANG)
+        return self.category == "software fault"
 
     @property
-    def category(self) -> str:
-        """What a report calls it: ``traffic crash``, ``traffic event``, ``software fault`` or ``no crash``."""
-        if self.is_traffic_crash:
-            return "traffic crash"
-        if self.is_traffic_event:
-            return "traffic event"
-        return "software fault" if self.is_software_fault else "no crash"
+    def category(self) -> Category:
+        """What a report calls it; of an oracle's own that nobody has declared here, ``traffic event``."""
+        return _CATEGORIES.get(self.value, "traffic event")
+
+
+_CATEGORIES: dict[str, Category] = {
+    **dict.fromkeys(("survived", "finished", "invalid"), "no crash"),
+    **dict.fromkeys(("collision", "off_road"), "traffic crash"),
+    **dict.fromkeys(EVENT_WORDS, "traffic event"),
+    **dict.fromkeys(("agent_error", "simulator_error", "process_died", "hang"), "software fault"),
+}
+"""By outcome; what oracles declare is added. It says how a name is to be read and never changes what a trial does."""
+
+
+def in_order(outcomes: Iterable[str]) -> list[Outcome]:
+    """Return outcomes, each once: those that every hunt has in their order, then those of oracles by name."""
+    found = {Outcome(name) for name in outcomes}
+    return [*(outcome for outcome in Outcome if outcome in found), *sorted(found - set(Outcome))]
 
 
 CRASHES = tuple(outcome for outcome in Outcome if outcome.is_traffic_crash or outcome.is_software_fault)

@@ -1,0 +1,131 @@
+"""Oracles as they are chosen: ``NAME`` or ``NAME:key=value,key=value``; NAME is registered or ``module:attribute``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base.blame import place_of
+from crashhunt.base.errors import ArgumentError, CrashhuntError, PluginError, UsageError
+from crashhunt.base.plugins import locate
+from crashhunt.oracles._protocol import BringsOutcomes
+from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from crashhunt.oracles._protocol import Oracle
+    from crashhunt.trial import Value
+
+__all__ = ["DEFAULT_ORACLES", "OracleChoice", "chosen_oracles", "oracle_name", "outcomes_brought", "parse_oracle"]
+
+DEFAULT_ORACLES = ("reported-collision", "overlap", "off-road")
+"""Who looks at every hunt, unless ``none`` is among those that are chosen."""
+
+_NONE = "none"
+# A colon may belong to module:attribute; one that is followed by key= begins the arguments.
+_CHOICE = re.compile(r"(?P<name>.+?)(?::(?P<arguments>[A-Za-z_]\w*=.*))?")
+
+
+@dataclass(frozen=True, slots=True)
+class OracleChoice:
+    """Which oracle, and what it is given.
+
+    Args:
+        name: of a registered one, or ``module:attribute``.
+        arguments: by name.
+    """
+
+    name: str
+    arguments: dict[str, Value]
+
+    def make(self) -> Oracle:
+        """Return a new oracle.
+
+        Raises:
+            CrashhuntError: there is none of that name, or it cannot be made.
+        """
+        factory: Callable[..., Oracle] = locate("oracles", self.name)
+        try:
+            made = factory(**self.arguments)
+            if isinstance(made, BringsOutcomes):
+                for name, category in made.outcomes.items():
+                    Outcome.own(name, category)
+        except CrashhuntError:
+            raise
+        except Exception as error:  # somebody's own
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            message = f"the oracle {self.name!r} cannot be made: {said}"
+            raise PluginError(message, fix="mend it, or what it is given", where=place_of(error)) from error
+        return made
+
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The outcomes that it brings.
+
+        Raises:
+            CrashhuntError: as of `make`.
+        """
+        made = self.make()
+        return tuple(map(Outcome, made.outcomes)) if isinstance(made, BringsOutcomes) else ()
+
+
+def oracle_name(text: str) -> str:
+    """Return the name in a choice; nothing is imported."""
+    match = _CHOICE.fullmatch(text)
+    return match["name"] if match else text
+
+
+def parse_oracle(text: str) -> OracleChoice:
+    """Read a choice.
+
+    Raises:
+        CrashhuntError: there is no such oracle, it takes no such argument, or a value is none of the right type.
+    """
+    match = _CHOICE.fullmatch(text)
+    if match is None:
+        raise UsageError(f"--oracle {text!r} names none", fix="give NAME or NAME:key=value")
+    name, pairs = match["name"], match["arguments"]
+    signature = signature_of(locate("oracles", name))
+    arguments: dict[str, Value] = {}
+    for pair in pairs.split(",") if pairs else ():
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise UsageError(f"--oracle {text!r}: {pair!r} is no argument", fix="write key=value")
+        if key in arguments:
+            raise UsageError(f"--oracle {text!r} gives {key!r} twice", fix="give it once")
+        signature.check([key], where=f"--oracle {name}")
+        kind = signature.arguments[key].kind if key in signature.arguments else None
+        distribution = parse_spec(value, kind, where=f"--oracle {name}:{key}")
+        if not isinstance(distribution, Constant):
+            fix = "give one value; what is searched are the arguments of agents and of the scenario"
+            raise ArgumentError(f"{value!r} is not one value", fix=fix, where=f"--oracle {name}:{key}")
+        arguments[key] = distribution.value
+    return OracleChoice(name, arguments)
+
+
+def chosen_oracles(asked: Sequence[str]) -> tuple[str, ...]:
+    """Return who looks at a hunt, in the order in which they are asked: the default ones, then those that are chosen.
+
+    Args:
+        asked: what ``--oracle`` was given, as often as it was; ``none`` drops the default ones.
+
+    Raises:
+        CrashhuntError: one of them cannot be had, or nobody is left.
+    """
+    added = [text for text in asked if text != _NONE]
+    found = tuple(dict.fromkeys([*(() if _NONE in asked else DEFAULT_ORACLES), *added]))
+    if not found:
+        raise UsageError("--oracle none leaves nobody to look for crashes", fix="choose another one as well")
+    for text in added:
+        parse_oracle(text).make()
+    return found
+
+
+def outcomes_brought(oracles: Iterable[str]) -> tuple[Outcome, ...]:
+    """Return the outcomes that oracles bring, beyond those that every hunt stops on.
+
+    Raises:
+        CrashhuntError: one of them cannot be had.
+    """
+    return tuple(dict.fromkeys(outcome for text in oracles for outcome in parse_oracle(text).outcomes()))
