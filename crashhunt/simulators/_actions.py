@@ -63,7 +63,7 @@ class SpaceAction:
         self.space = space
         self._dtype = np.dtype(space.dtype)
 
-    def encode(self, action: Any) -> NDArray[np.generic]:
+    def encode(self, action: object) -> NDArray[np.generic]:
         """Return an array of the space's type and shape."""
         try:
             array = cast(action, self._dtype)
@@ -90,14 +90,14 @@ class MetaAction(SpaceAction):
         super().__init__(spaces.Discrete(len(meanings)))
         self.space.meanings = meanings  # type: ignore[attr-defined]
 
-    def encode(self, action: Any) -> NDArray[np.generic]:
+    def encode(self, action: object) -> NDArray[np.generic]:
         """Return int64, shape (1,)."""
         if isinstance(action, np.ndarray) and action.size == 1:
             action = action.reshape(())
         return super().encode(action).reshape(1)
 
 
-def cast(action: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+def cast(action: object, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return an action as an array of a type; an encoded one stays as it is.
 
     Raises:
@@ -117,12 +117,12 @@ def cast(action: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
     return array
 
 
-def is_masked(action: Any) -> bool:
+def is_masked(action: object) -> bool:
     """Whether a part of an array is not there."""
     return isinstance(action, np.ma.MaskedArray) and bool(np.ma.is_masked(action))
 
 
-def told(action: Any) -> str:
+def told(action: object) -> str:
     """Return what an agent has returned as errors show it: one line of at most 200 characters."""
     try:
         text = " ".join(repr(action).split())

@@ -47,7 +47,7 @@ class ActionForm(Protocol):
     def names(self) -> tuple[str, ...]:
         """What the elements of an encoded action are."""
 
-    def encode(self, action: Any) -> NDArray[np.generic]:
+    def encode(self, action: object) -> NDArray[np.generic]:
         """Return the action as an array of fixed shape and type; an encoded action is encoded to itself.
 
         Raises:

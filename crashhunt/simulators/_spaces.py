@@ -43,7 +43,7 @@ class ObservationForm:
         self.space: Space[Any] = spaces.flatten_space(space) if self.flattened else space
         self._dtype = np.dtype(self.space.dtype)
 
-    def encode(self, observation: Any) -> NDArray[Any]:
+    def encode(self, observation: object) -> NDArray[Any]:
         """Return an array of its own, of the type and shape of `space`."""
         if self.flattened:
             observation = spaces.flatten(self.original, observation)
@@ -65,7 +65,7 @@ class FlatAction:
         self.space = space
         self._flat = spaces.flatten_space(space)
 
-    def encode(self, action: Any) -> NDArray[np.generic]:
+    def encode(self, action: object) -> NDArray[np.generic]:
         """Return the flattened action; one that is flattened already stays as it is."""
         array: NDArray[Any] = np.empty(0)
         try:
@@ -87,7 +87,7 @@ class FlatAction:
         return array
 
 
-def _any_masked(action: Any) -> bool:
+def _any_masked(action: object) -> bool:
     parts = action.values() if isinstance(action, Mapping) else action if isinstance(action, list | tuple) else ()
     return is_masked(action) or any(map(_any_masked, parts))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env.utils import not_zero
@@ -20,7 +20,9 @@ from crashhunt.simulators.accelerator._known import are_numbers, kinds_of, origi
 from crashhunt.simulators.accelerator._network import wrap_to_pi
 
 if TYPE_CHECKING:
-    from highway_env.road.road import Road
+    from highway_env.road.road import LaneIndex, Road
+    from highway_env.vehicle.behavior import IDMVehicle
+    from highway_env.vehicle.objects import RoadObject
 
     from crashhunt.simulators.accelerator._frame import Frame
 
@@ -77,8 +79,8 @@ class _Decisions:
 
     def take(self) -> None:
         """Choose lanes one after another, then steer and accelerate."""
-        steering: list[tuple[int, Any]] = []
-        following: list[tuple[int, Any, Any]] = []  # row, who follows, whom
+        steering: list[tuple[int, ControlledVehicle]] = []
+        following: list[tuple[int, IDMVehicle, Vehicle]] = []  # row, who follows, whom
         changing: list[int] = []  # which of these follow somebody on another lane as well
         index = self.network.index
         for row, vehicle in enumerate(self.road.vehicles):
@@ -113,26 +115,26 @@ class _Decisions:
                 action["acceleration"] = vehicle.KP_A * (vehicle.target_speed - vehicle.speed)
             vehicle.action = action
 
-    def _coordinates(self, row: int, vehicle: Any, key: Any) -> tuple[float, float]:
+    def _coordinates(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[float, float]:
         lane = self.network.index.get(key)
         if lane is None:  # such as a key without a number
             s, r = self.road.network.get_lane(key).local_coordinates(vehicle.position)
             return float(s), float(r)
         return self.frame.coordinates(row, lane)
 
-    def _neighbours(self, row: int, vehicle: Any, key: Any) -> Any:
+    def _neighbours(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[RoadObject | None, RoadObject | None]:
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
             found = originals["neighbour_vehicles"](self.road, vehicle, key)
         return found
 
-    def _follow_road(self, row: int, vehicle: Any) -> None:
+    def _follow_road(self, row: int, vehicle: Vehicle) -> None:
         key = vehicle.target_lane_index
         s, _ = self._coordinates(row, vehicle, key)
         if s > self.road.network.get_lane(key).length - 5 / 2:
             vehicle.follow_road()
 
-    def _change_lane(self, row: int, vehicle: Any) -> None:
+    def _change_lane(self, row: int, vehicle: Vehicle) -> None:
         """`IDMVehicle.change_lane_policy`."""
         lane, target = vehicle.lane_index, vehicle.target_lane_index
         if lane != target:
@@ -161,7 +163,7 @@ class _Decisions:
             if self._mobil(row, vehicle, key):
                 vehicle.target_lane_index = key
 
-    def _mobil(self, row: int, vehicle: Any, key: Any) -> bool:
+    def _mobil(self, row: int, vehicle: Vehicle, key: LaneIndex) -> bool:
         """`IDMVehicle.mobil`; accelerations that cannot decide anything are not computed."""
         ahead, behind = self._neighbours(row, vehicle, key)
         limit = -vehicle.LANE_CHANGE_MAX_BRAKING_IMPOSED
@@ -184,14 +186,14 @@ class _Decisions:
             gain = gain + vehicle.POLITENESS * (behind_then - behind_now + old_then - old_now)
         return not gain < vehicle.LANE_CHANGE_MIN_ACC_GAIN
 
-    def _lane_distance(self, row: int, vehicle: Any, other: Any) -> float:
+    def _lane_distance(self, row: int, vehicle: Vehicle, other: RoadObject) -> float:
         """`RoadObject.lane_distance_to`."""
         lane = self.network.number.get(id(vehicle.lane))
         if lane is None:
             return float(vehicle.lane_distance_to(other))
         return self.frame.coordinates(self.frame.row[id(other)], lane)[0] - self.frame.coordinates(row, lane)[0]
 
-    def _desired_gap(self, row: int, driver: Any, vehicle: Any, other: Any) -> float:
+    def _desired_gap(self, row: int, driver: IDMVehicle, vehicle: Vehicle, other: RoadObject) -> float:
         """`IDMVehicle.desired_gap`, with the driver's parameters."""
         limit = -driver.COMFORT_ACC_MAX * driver.COMFORT_ACC_MIN
         faster = self.velocities[row] - self.velocities[self.frame.row[id(other)]]
@@ -199,7 +201,7 @@ class _Decisions:
         speed = vehicle.speed
         return float(driver.DISTANCE_WANTED + speed * driver.TIME_WANTED + speed * closing / (2 * math.sqrt(limit)))
 
-    def _acceleration(self, driver: Any, vehicle: Any, ahead: Any) -> float:
+    def _acceleration(self, driver: IDMVehicle, vehicle: Vehicle, ahead: RoadObject) -> float:
         """`IDMVehicle.acceleration`: of a vehicle behind another one, with the driver's parameters."""
         if not vehicle or not isinstance(vehicle, Vehicle):
             return 0
@@ -213,7 +215,7 @@ class _Decisions:
             wanted -= comfort * float(np.power(gap / not_zero(distance), 2))
         return float(wanted)
 
-    def _accelerate_all(self, following: list[tuple[int, Any, Any]]) -> list[float]:
+    def _accelerate_all(self, following: list[tuple[int, IDMVehicle, Vehicle]]) -> list[float]:
         """The same for many who follow for themselves."""
         table = np.array([self.following[id(vehicle)] for _, vehicle, _ in following], float).T
         comfort, braking, delta, distance_wanted, time_wanted = table
@@ -237,7 +239,7 @@ class _Decisions:
         found: list[float] = wanted.tolist()
         return found
 
-    def _steer(self, steering: list[tuple[int, Any]]) -> list[float]:
+    def _steer(self, steering: list[tuple[int, ControlledVehicle]]) -> list[float]:
         """`ControlledVehicle.steering_control` of many."""
         vehicles = self.road.vehicles
         places, ahead = [], []
@@ -262,7 +264,7 @@ class _Decisions:
         return found_angles
 
 
-def _target_speed(vehicle: Any) -> float:
+def _target_speed(vehicle: Vehicle) -> float:
     target = getattr(vehicle, "target_speed", 0)
     lane = vehicle.lane
     if lane and lane.speed_limit is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env.vehicle.objects import Landmark
@@ -12,7 +12,9 @@ from highway_env.vehicle.objects import Landmark
 from crashhunt.simulators.accelerator._known import kinds_of
 
 if TYPE_CHECKING:
-    from highway_env.road.road import Road
+    from collections.abc import Sequence
+
+    from highway_env.road.road import LaneIndex, Road
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
@@ -44,7 +46,7 @@ class Frame:
         self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
         self._columns: dict[int, tuple[list[float], list[float]]] = {}
         self._single: dict[tuple[int, int], tuple[float, float]] = {}
-        self._queues: dict[Any, tuple[list[float], list[RoadObject]]] = {}
+        self._queues: dict[LaneIndex, tuple[list[float], list[RoadObject]]] = {}
 
     def is_of(self, road: Road) -> bool:
         """Whether everybody is still there, and where they were."""
@@ -84,7 +86,9 @@ class Frame:
             found = self._columns[lane] = s[:, column].tolist(), r[:, column].tolist()
         return found
 
-    def neighbours(self, vehicle: RoadObject, row: int, key: Any) -> tuple[Any, Any] | None:
+    def neighbours(
+        self, vehicle: RoadObject, row: int, key: LaneIndex
+    ) -> tuple[RoadObject | None, RoadObject | None] | None:
         """Who is ahead and who is behind on a lane: `Road.neighbour_vehicles`. None where that must be asked."""
         lane = self.network.index.get(key)
         if lane is None:
@@ -130,7 +134,7 @@ class Frame:
         network = self.network
         if network.is_axis[lane]:
             s, r = self.column(lane)
-            rows: Any = range(len(self.things))
+            rows: Sequence[int] = range(len(self.things))
         else:
             limit = network.half_widths[lane] + 5
             rows = np.flatnonzero(self.boxes[:, network.column[lane]] <= limit).tolist()

@@ -142,7 +142,7 @@ class Kind:
                 left_alone[name] = own
                 logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
 
-    def is_of(self, thing: Any) -> bool:
+    def is_of(self, thing: object) -> bool:
         """Whether an object has no method of its own instead of its class's."""
         return self.methods.isdisjoint(vars(thing))
 
@@ -159,7 +159,7 @@ def kind_of(kind: type) -> Kind:
     return found
 
 
-def kinds_of(things: Iterable[Any]) -> list[Kind]:
+def kinds_of(things: Iterable[object]) -> list[Kind]:
     """Return what is known about the class of each object."""
     types = list(map(type, things))
     known = {kind: kind_of(kind) for kind in set(types)}
@@ -169,7 +169,7 @@ def kinds_of(things: Iterable[Any]) -> list[Kind]:
 _kinds: dict[type, Kind] = {}
 
 
-def are_numbers(values: Iterable[Any]) -> bool:
+def are_numbers(values: Iterable[object]) -> bool:
     """Whether arithmetic on all of these is that of Python's and NumPy's usual numbers."""
     return _NUMBERS.issuperset(map(type, values))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
@@ -18,8 +18,13 @@ from crashhunt.simulators.accelerator._network import wrap_to_pi
 if TYPE_CHECKING:
     from highway_env.road.regulation import RegulatedRoad
     from highway_env.road.road import Road
+    from highway_env.vehicle.kinematics import Vehicle
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
 
     from crashhunt.simulators.accelerator._network import Network
+
+    Path = tuple[list[NDArray[np.float64]], list[float]]  # positions and headings that are predicted
 
 __all__ = ["collide", "enforce", "move"]
 
@@ -77,7 +82,7 @@ def move(road: Road, network: Network, dt: float) -> Frame | None:
     return frame
 
 
-def _clip_actions(vehicle: Any) -> None:
+def _clip_actions(vehicle: Vehicle) -> None:
     """`Vehicle.clip_actions`."""
     action, speed = vehicle.action, vehicle.speed
     if vehicle.crashed:
@@ -91,7 +96,7 @@ def _clip_actions(vehicle: Any) -> None:
         action["acceleration"] = max(action["acceleration"], 1.0 * (vehicle.MIN_SPEED - speed))
 
 
-def _closest(frame: Frame, heading: Any) -> list[int]:
+def _closest(frame: Frame, heading: NDArray[np.float64]) -> list[int]:
     """`RoadNetwork.get_closest_lane_index` of every vehicle."""
     network = frame.network
     count = len(heading)
@@ -155,7 +160,7 @@ def collide(road: Road, dt: float) -> None:
             one.handle_collisions(two, dt)
 
 
-def _can_collide(things: list[Any]) -> bool:
+def _can_collide(things: list[RoadObject]) -> bool:
     """Whether all collide as highway-env has it, and all that this depends on are numbers of the usual kinds."""
     if not all(kind.collides and kind.is_of(thing) for kind, thing in zip(kinds_of(things), things, strict=True)):
         return False
@@ -165,7 +170,7 @@ def _can_collide(things: list[Any]) -> bool:
         return False
 
 
-def _stay_apart(one: Any, two: Any, dt: float) -> bool:
+def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:
     """Whether some axis surely separates two outlines, now and until the next moment."""
     (x, y), (other_x, other_y) = one.position.tolist(), two.position.tolist()
     dx, dy = other_x - x, other_y - y
@@ -227,7 +232,7 @@ def enforce(road: RegulatedRoad) -> bool:
     return True
 
 
-def _conflict(one: Any, two: Any, first: Any, second: Any) -> bool:
+def _conflict(one: Vehicle, two: Vehicle, first: Path, second: Path) -> bool:
     """The rest of `RegulatedRoad.is_conflict_possible`."""
     for place, heading, other_place, other_heading in zip(*first, *second, strict=False):
         if np.linalg.norm(other_place - place) > one.LENGTH:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
@@ -15,6 +15,7 @@ from crashhunt.simulators.accelerator._known import are_numbers, kind_of
 if TYPE_CHECKING:
     from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
     from highway_env.road.road import Road
+    from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
     from crashhunt.simulators.accelerator._frame import Frame
@@ -27,8 +28,15 @@ _OF_OBJECTS = _KNOWN - {"heading"}
 
 
 def close_objects(
-    frame: Frame, vehicle: Any, distance: float, count: int | None, *, see_behind: bool, sort: bool, vehicles_only: bool
-) -> list[Any] | None:
+    frame: Frame,
+    vehicle: Vehicle,
+    distance: float,
+    count: int | None,
+    *,
+    see_behind: bool,
+    sort: bool,
+    vehicles_only: bool,
+) -> list[RoadObject] | None:
     """`Road.close_objects_to`; None where that must be asked."""
     lane = frame.network.number.get(id(vehicle.lane))
     row = frame.row.get(id(vehicle))
@@ -55,7 +63,7 @@ def close_objects(
     return [frame.things[number] for _, number in found]
 
 
-def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[Any] | None:
+def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
     """`KinematicObservation.observe`; None where that must be asked."""
     env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
     if frame is None or not _KNOWN.issuperset(features) or not _is_plain(vehicle, features):
@@ -126,14 +134,14 @@ def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float6
     return places
 
 
-def _is_plain(thing: Any, features: list[str]) -> bool:
+def _is_plain(thing: RoadObject, features: list[str]) -> bool:
     kind = kind_of(type(thing))
     if not kind.describes or not kind.is_of(thing) or not are_numbers((thing.heading, thing.speed)):
         return False
     return isinstance(thing, Vehicle) or _OF_OBJECTS.issuperset(features)
 
 
-def _values(thing: Any) -> dict[str, float]:
+def _values(thing: RoadObject) -> dict[str, float]:
     """The part of `to_dict` that is asked for."""
     x, y = thing.position.tolist()
     c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))

@@ -16,6 +16,7 @@ from highway_env.vehicle import behavior, controller, kinematics, objects
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
+    from types import ModuleType
 
 __all__ = ["MODULES", "Watch", "is_plain"]
 
@@ -39,7 +40,7 @@ class Watch:
         but: members that do not matter, as ``Class.name``.
     """
 
-    def __init__(self, places: Iterable[tuple[str, Mapping[str, Any]]], but: Iterable[str] = ()) -> None:
+    def __init__(self, places: Iterable[tuple[str, Mapping[str, object]]], but: Iterable[str] = ()) -> None:
         skipped = frozenset(but)
         self._places: list[_Place] = [_Place(name, space, skipped) for name, space in places]
         self._told = ""
@@ -87,7 +88,7 @@ class _Place:
     """One namespace."""
 
     def __init__(
-        self, name: str, space: Mapping[str, Any], but: frozenset[str], names: tuple[str, ...] | None = None
+        self, name: str, space: Mapping[str, object], but: frozenset[str], names: tuple[str, ...] | None = None
     ) -> None:
         self.name = name
         self.space = space
@@ -103,7 +104,7 @@ class _Place:
         else:  # of a namespace that is large and others' business, only these
             self._seen, self._but = frozenset(space), frozenset(space)
         self._names = names
-        self._get: Callable[[Any], tuple[Any, ...]] = _getter(names)
+        self._get: Callable[[Any], tuple[object, ...]] = _getter(names)
         self._values = self._get(space)
 
     def same(self) -> bool:
@@ -128,7 +129,7 @@ class _Place:
         return ""
 
 
-def is_plain(value: Any) -> bool:
+def is_plain(value: object) -> bool:
     """Whether a member of a class is a mere value: no function, property or other thing with a life of its own."""
     return not callable(value) and not hasattr(type(value), "__get__") and not inspect.ismodule(value)
 
@@ -137,13 +138,13 @@ def _special(name: str) -> bool:
     return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
 
 
-def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
+def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[object, ...]]:
     if len(names) > 1:
         return itemgetter(*names)
     return lambda space: tuple([space[name] for name in names])
 
 
-def _classes(module: Any) -> list[tuple[str, Mapping[str, Any]]]:
+def _classes(module: ModuleType) -> list[tuple[str, Mapping[str, object]]]:
     found = [value for value in vars(module).values() if isinstance(value, type)]
     return [(kind.__qualname__, vars(kind)) for kind in found if kind.__module__ == module.__name__]
 
