@@ -114,13 +114,15 @@ def approaches(
         near = near[bound <= best[number[near]]]
         place, _, turn, one, two = pairs(near)
         np.minimum.at(gaps, number[near], rectangle_gap(place, turn, one, two))
-    # The circles also bound who can ever touch: closing, and passing nearer than both radii.
+    # The circles also bound who can ever touch: closing, and passing nearer than both radii. Where they overlap by now,
+    # outlines may meet although the centres part, such as those of a lorry and a car that pulls in beside its cab.
     closing = -np.einsum("ij,ij->i", offset, relative)
     squared = np.einsum("ij,ij->i", relative, relative)
     passing = np.abs(offset[:, 0] * relative[:, 1] - offset[:, 1] * relative[:, 0])
     closing_speed = np.sqrt(squared)
     in_time = distance - reach < _HORIZON_S * closing_speed
-    course = np.flatnonzero(others & (closing > 0) & (passing <= reach * closing_speed) & in_time)
+    closing_in = (closing > 0) | (distance < reach)
+    course = np.flatnonzero(others & closing_in & (passing <= reach * closing_speed) & in_time)
     if len(course):
         place, moving, turn, one, two = pairs(course)
         contact = time_to_contact(place, moving, turn, one, two)

@@ -269,3 +269,18 @@ def test_a_sumocfg_that_cannot_be_used_says_why(town, text, ego, says):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(sumocfg(town, text), ego=ego)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("outside", ["../loop.net.xml", "../own beside/loop.net.xml", "absolute"])
+def test_a_file_that_exists_outside_of_the_folder_is_refused(loop, tmp_path, outside):
+    (tmp_path / "own beside").mkdir()
+    for folder in (tmp_path, tmp_path / "own beside"):
+        shutil.copy(loop / "loop.net.xml", folder)
+    change(loop, "sumo", "net", value=str(tmp_path / "loop.net.xml") if outside == "absolute" else outside)
+    with pytest.raises(ScenarioError, match="lies outside the scenario's folder"):
+        load_scenario(loop)
+
+
+def test_a_way_out_and_in_again_is_inside(loop):
+    change(loop, "sumo", "net", value="../own/loop.net.xml")
+    assert load_scenario(loop).sumo.net == "../own/loop.net.xml"

@@ -128,3 +128,17 @@ class Silent:
 def test_an_object_that_fails_when_it_is_looked_at_is_refused(name):
     with pytest.raises(ActionError, match=r"of class Silent, whose repr raises RuntimeError, is not"):
         FORMS[name].encode(Silent())
+
+
+def test_a_lane_change_is_whole():
+    form = SpeedAndLaneChange()
+    for change in (-1, 0, 1, -1.0, 1.0, np.int8(-1), True):
+        assert form.encode((10.0, change)).tolist() == [10.0, float(change)]
+    for change in (0.5, -0.5, 0.999, 2, -2, float("nan"), None, "1"):
+        with pytest.raises(ActionError, match="not \\(target_speed, lane_change\\)"):
+            form.encode((10.0, change))
+    for speed in (0.0, 100.0):
+        assert form.encode((speed, 0)).tolist() == [speed, 0.0]
+    for speed in (-1e-9, 100.1, float("nan"), float("inf")):
+        with pytest.raises(ActionError, match="within 0 and 100 m/s"):
+            form.encode((speed, 0))

@@ -1,0 +1,178 @@
+"""Copies of the repository in which pytest runs, each in a fork of this process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import CodeType, FrameType
+
+__all__ = ["ROOT", "Slot", "Watcher"]
+
+ROOT = Path(__file__).resolve().parent.parent
+# What the parent has imported differently, or must not have imported at all.
+OURS = {"crashhunt", "conftest", "py", "xdist", "_hypothesis_pytestplugin", "__main__", "slips", "copies"}
+PYTEST = (
+    "-q", "-x", "--tb=no", "-p", "no:randomly", "-p", "no:cacheprovider", "--hypothesis-profile=slips",
+    "-W", "ignore::pytest.PytestAssertRewriteWarning",
+)  # fmt: skip
+
+
+class Watcher:
+    """A pytest plugin that notes which lines of some files each test runs, and how long it takes.
+
+    Args:
+        files: the absolute paths of the files.
+    """
+
+    def __init__(self, files: list[str]) -> None:
+        self.test = ""
+        self.reached: dict[str, dict[str, set[int]]] = {file: {} for file in files}
+        self.seconds: Counter[str] = Counter()
+        self._known: dict[CodeType, bool] = {}
+
+    def start(self) -> None:
+        """Begin to trace."""
+        sys.settrace(self._call)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test begins."""
+        self.test = nodeid
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """A part of a test is over."""
+        self.seconds[report.nodeid] += report.duration
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        """A test is over."""
+        self.test = ""
+
+    def _call(self, frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
+        code = frame.f_code
+        ours = self._known.get(code)
+        if ours is None:
+            ours = self._known[code] = code.co_filename in self.reached
+        return self._line if ours else None
+
+    def _line(self, frame: FrameType, event: str, _: object) -> Callable[..., Any]:
+        code = frame.f_code
+        function = code.co_flags & 0x1  # CO_OPTIMIZED, which modules and bodies of classes are not
+        self.reached[code.co_filename].setdefault(self.test if function else "", set()).add(frame.f_lineno)
+        return self._line
+
+
+class Slot:
+    """A copy of the repository, in which one pytest runs at a time.
+
+    Args:
+        tree: where the copy is.
+    """
+
+    def __init__(self, tree: Path) -> None:
+        self.tree = tree
+        self._written = 0
+        self._pid = 0
+        self._deadline = 0.0
+        shutil.copytree(ROOT, tree, ignore=lambda _, names: [name for name in names if name[0] == "."])
+
+    def put(self, file: Path, text: str) -> None:
+        """Write a source file into the copy."""
+        self._written += 1
+        path = self.tree / file
+        path.write_text(text, encoding="utf-8")
+        # Python knows what it has compiled by size and time of the source, and two slips may have both in common.
+        os.utime(path, (self._written, self._written))
+
+    def start(self, arguments: list[str], *, seconds: float, watcher: Watcher | None = None) -> None:
+        """Run pytest in a process of its own, for so much time of the processor and at most ten times as long."""
+        self._deadline = time.monotonic() + 10 * seconds
+        self._pid = os.fork()
+        if self._pid == 0:
+            code = 70
+            try:
+                code = self._child(arguments, seconds, watcher)
+            finally:
+                os._exit(code)
+
+    def poll(self) -> str | None:
+        """Return how pytest has ended, such as ``passed``; None while it runs."""
+        if time.monotonic() > self._deadline:
+            self.kill()
+            return "timeout"
+        pid, status = os.waitpid(self._pid, os.WNOHANG)
+        if not pid:
+            return None
+        self._sweep()
+        self._pid = 0
+        if os.WIFSIGNALED(status):
+            return "timeout" if os.WTERMSIG(status) == signal.SIGXCPU else "failed"
+        return "passed" if os.WEXITSTATUS(status) == 0 else "failed"
+
+    def wait(self) -> str:
+        """Wait until pytest has ended."""
+        while (ended := self.poll()) is None:
+            time.sleep(0.02)
+        return ended
+
+    def kill(self) -> None:
+        """End pytest and what it has started."""
+        if self._pid:
+            self._sweep()
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(self._pid, 0)
+            self._pid = 0
+
+    def said(self) -> str:
+        """Return what pytest has printed."""
+        return (self.tree / ".said").read_text(encoding="utf-8", errors="replace")
+
+    def _sweep(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._pid, signal.SIGKILL)
+
+    def _child(self, arguments: list[str], seconds: float, watcher: Watcher | None) -> int:
+        os.setsid()
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 10))
+        for what, most in ((resource.RLIMIT_FSIZE, 2 << 30), (resource.RLIMIT_AS, 8 << 30)):
+            resource.setrlimit(what, (most, resource.getrlimit(what)[1]))  # a slip may take without an end
+        os.chdir(self.tree)
+        output = os.open(".said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        for number in (1, 2):
+            os.dup2(output, number)
+        sys.path.insert(0, str(self.tree))
+        os.environ["PYTHONPATH"] = str(self.tree)  # for what the tests start
+        import hypothesis
+        import pytest
+
+        # An example that fails is enough: it need not be a small one.
+        phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
+        hypothesis.settings.register_profile("slips", phases=phases, deadline=None, derandomize=True, database=None)
+        if watcher is not None:
+            watcher.start()
+        code = pytest.main([*PYTEST, f"--basetemp={self.tree}.tmp", *arguments], plugins=[watcher] if watcher else [])
+        sys.settrace(None)
+        if watcher is not None:
+            reached = {
+                file: {test: sorted(lines) for test, lines in found.items()} for file, found in watcher.reached.items()
+            }
+            others = [name for name, module in [*sys.modules.items()] if self._is_installed(name, module)]
+            facts = {"reached": reached, "seconds": watcher.seconds, "modules": others}
+            Path(".facts").write_text(json.dumps(facts), encoding="utf-8")
+        sys.stdout.flush()
+        return int(code)
+
+    def _is_installed(self, name: str, module: object) -> bool:
+        file = getattr(module, "__file__", None) or ""
+        top = name.partition(".")[0]
+        return top not in OURS and not top.startswith(("pytest", "_pytest")) and not file.startswith(str(self.tree))

@@ -1,0 +1,260 @@
+"""Which plausible slips the nearest tests do not notice. Run it as ``scripts/mutate``.
+
+A slip is put into a copy of the repository, and of the tests nearest to its module those run that reach its line, the
+fastest first, up to the first that fails. Nearest are the tests that lie as the module does: those of
+``crashhunt/world/_scene.py`` are ``tests/world/test_scene*.py``, and where there are none all of ``tests/world``.
+
+Each run is a fork of this process, which has imported everything that is not crashhunt: about a second a slip, where a
+process of its own would take four. mutmut and cosmic-ray were looked at: the former chooses among all tests by what it
+has traced, and works inside the tree; the latter starts a process a slip, and changes the files in place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import json
+import os
+import random
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from copies import ROOT, Slot, Watcher
+from slips import Slip, find_slips
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+DEFAULT = ("oracles", "world", "crashes", "recording", "episode", "hunts.ledger")
+ENOUGH = 0.2  # the share of survivors that is tolerated
+
+
+@dataclass(slots=True)
+class Target:
+    """A module to put slips into, as it was when this began.
+
+    Args:
+        package: what it was asked for by.
+        file: relative to the repository.
+        source: its text.
+        tests: the nearest test files, likewise.
+        reached: test to the lines that it runs; those that run at import have no test.
+        seconds: test to how long it takes.
+    """
+
+    package: str
+    file: Path
+    source: str
+    tests: Sequence[Path]
+    reached: dict[str, set[int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def tests_of(self, slip: Slip) -> list[str]:
+        """Return the tests that reach a slip, the fastest first."""
+        lines = range(slip.span[0], slip.span[1] + 1)
+        imported = not self.reached.get("", set()).isdisjoint(lines)
+        found = [test for test, reached in self.reached.items() if test and not reached.isdisjoint(lines)]
+        if imported and not found:
+            found = [test for test, reached in self.reached.items() if test and reached] or [*self.seconds]
+        return sorted(found, key=lambda test: (self.seconds[test], test))
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a slip.
+
+    Args:
+        target: where it was.
+        slip: which.
+        noticed: ``failed`` or ``timeout``; empty where no test noticed it.
+        reached: whether any of the tests runs its line.
+    """
+
+    target: Target
+    slip: Slip
+    noticed: str
+    reached: bool = True
+
+
+def modules_of(name: str) -> list[Path]:
+    """Return the files that a package or a module of crashhunt has; of a module also its private neighbours."""
+    path = ROOT / "crashhunt" / name.replace(".", "/").removesuffix("/py")
+    if path.is_dir():
+        return sorted(file.relative_to(ROOT) for file in path.rglob("*.py"))
+    found = [file for file in path.parent.glob("*.py") if file.stem.lstrip("_").startswith(path.name.lstrip("_"))]
+    if not found:
+        raise SystemExit(f"there is no module {name!r} in crashhunt: give a package or a module such as world.scene")
+    return sorted(file.relative_to(ROOT) for file in found)
+
+
+def nearest_tests(file: Path) -> tuple[Path, ...]:
+    """Return the test files that lie as a module does."""
+    words = file.stem.strip("_").split("_")
+    folder = ROOT / "tests" / file.parent.relative_to("crashhunt")
+    for places in (folder.glob, (ROOT / "tests").rglob):
+        for count in range(len(words), 0, -1):  # of `_ledger_file`, those of `ledger` are better than none
+            found = sorted(places(f"test_{'_'.join(words[:count])}*.py")) if words[0] != "init" else []
+            if found:
+                return tuple(path.relative_to(ROOT) for path in found)
+        if folder.is_dir() and folder != ROOT / "tests":
+            return tuple(sorted(path.relative_to(ROOT) for path in folder.glob("test_*.py")))
+    return ()
+
+
+def targets_of(name: str, tests: Sequence[Path] | None = None) -> list[Target]:
+    """Return the modules of a package that have tests nearby, or those that are given."""
+    return [
+        Target(name, file, (ROOT / file).read_text(encoding="utf-8"), tests or nearest_tests(file))
+        for file in modules_of(name)
+        if tests or nearest_tests(file)
+    ]
+
+
+def say(line: str) -> None:
+    """Tell whoever waits how far it is."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
+
+
+def survey(slot: Slot, targets: list[Target]) -> None:
+    """Run the tests of some modules without a slip, and note what they reach.
+
+    Raises:
+        SystemExit: they fail.
+    """
+    files = sorted({str(path) for target in targets for path in target.tests})
+    watcher = Watcher([str(slot.tree / target.file) for target in targets])
+    slot.start(files, seconds=300, watcher=watcher)
+    if slot.wait() != "passed":
+        raise SystemExit(f"the tests fail without any slip:\n{slot.said()}")
+    facts = json.loads((slot.tree / ".facts").read_text(encoding="utf-8"))
+    for target in targets:
+        mine = {test for test in facts["seconds"] if test.partition("::")[0] in map(str, target.tests)}
+        found = facts["reached"][str(slot.tree / target.file)]
+        target.seconds = {test: facts["seconds"][test] for test in mine}
+        target.reached = {test: set(lines) for test, lines in found.items() if not test or test in mine}
+    for name in facts["modules"]:  # so that the forks have them
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+
+
+def judge(slots: list[Slot], name: str, chosen: list[tuple[Target, Slip]]) -> list[Verdict]:
+    """Put in one slip after another, as many at a time as there are slots, and return what became of each."""
+    verdicts: list[Verdict] = []
+    waiting = chosen[::-1]
+    running: dict[int, tuple[Target, Slip]] = {}
+    while waiting or running:
+        for number, slot in enumerate(slots):
+            if number in running:
+                ended = slot.poll()
+                if ended is None:
+                    continue
+                target, slip = running.pop(number)
+                slot.put(target.file, target.source)
+                verdicts.append(Verdict(target, slip, "" if ended == "passed" else ended))
+            while waiting and number not in running:
+                target, slip = waiting.pop()
+                tests = target.tests_of(slip)
+                if tests:
+                    slot.put(target.file, slip.apply(target.source))
+                    slot.start(tests, seconds=10 + 4 * sum(target.seconds[test] for test in tests))
+                    running[number] = target, slip
+                else:
+                    verdicts.append(Verdict(target, slip, "", reached=False))
+        survivors = sum(not verdict.noticed for verdict in verdicts)
+        say(f"{name}: {len(verdicts)} of {len(chosen)} slips, {survivors} not noticed")
+        time.sleep(0.02)
+    return verdicts
+
+
+def counted(name: str, verdicts: list[Verdict]) -> dict[str, Any]:
+    """Return the figures of a package or a module."""
+    survived = sum(not verdict.noticed for verdict in verdicts)
+    return {
+        "name": name,
+        "slips": len(verdicts),
+        "survived": survived,
+        "unreached": sum(not verdict.reached for verdict in verdicts),
+        "timeouts": sum(verdict.noticed == "timeout" for verdict in verdicts),
+        "share": round(survived / len(verdicts), 3) if verdicts else 0.0,
+    }
+
+
+def described(verdict: Verdict) -> dict[str, Any]:
+    """Return a slip that nobody noticed."""
+    target, slip = verdict.target, verdict.slip
+    diff = slip.diff(target.source)
+    where = f"{target.file}:{slip.line}"
+    return {"where": where, "what": slip.what, "reached": verdict.reached, "diff": diff}
+
+
+def shown(facts: dict[str, Any]) -> str:
+    """Return the report in words."""
+    lines = []
+    for slip in facts["survivors"]:
+        reached = "" if slip["reached"] else " (no test reaches it)"
+        lines += [f"{slip['where']}: {slip['what']}{reached}", slip["diff"], ""]
+    lines.append(f"{'not noticed by the nearest tests':<44}{'slips':>7}{'not':>7}{'share':>8}")
+    for kind in ("modules", "packages"):
+        for row in facts[kind]:
+            lines.append(f"{row['name']:<44}{row['slips']:>7}{row['survived']:>7}{row['share']:>8.0%}")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def parsed() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(prog="scripts/mutate", description=__doc__.splitlines()[0])
+    parser.add_argument("--module", action="append", help="a package or module of crashhunt; may be given again")
+    parser.add_argument("--tests", action="append", type=Path, metavar="FILE", help="these, instead of the nearest")
+    parser.add_argument("--sample", type=int, metavar="N", help="so many slips of each package, instead of all")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample (default: 0)")
+    parser.add_argument("--parallel", type=int, default=2, metavar="N", help="how many run at once (default: 2)")
+    parser.add_argument("--at-most", type=float, default=ENOUGH, metavar="SHARE", help="exit with 1 above (0.2)")
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Run, and return 1 where too many slips of a package survive."""
+    options = parsed()
+    verdicts: list[Verdict] = []
+    asked = options.module or DEFAULT
+    everything = {name: targets_of(name, options.tests) for name in asked}
+    with tempfile.TemporaryDirectory(prefix="crashhunt-mutate-") as folder:
+        slots = [Slot(Path(folder) / str(number)) for number in range(options.parallel)]
+        try:
+            for name, targets in everything.items():
+                say(f"{name}: the tests without any slip")
+                survey(slots[0], targets)
+                slips = [(target, slip) for target in targets for slip in find_slips(target.source)]
+                if options.sample is not None and options.sample < len(slips):
+                    slips = random.Random(f"{options.seed} {name}").sample(slips, options.sample)
+                slips.sort(key=lambda found: (found[0].file, found[1].start))
+                verdicts += judge(slots, name, slips)
+        except KeyboardInterrupt:
+            return 130
+        finally:
+            for slot in slots:
+                slot.kill()
+            say("")
+    verdicts.sort(key=lambda verdict: (verdict.target.file, verdict.slip.start))
+    files = dict.fromkeys(verdict.target.file for verdict in verdicts)
+    facts = {
+        "modules": [counted(str(file), [each for each in verdicts if each.target.file == file]) for file in files],
+        "packages": [counted(name, [each for each in verdicts if each.target.package == name]) for name in asked],
+        "survivors": [described(verdict) for verdict in verdicts if not verdict.noticed],
+    }
+    print(json.dumps(facts, indent=1) if options.json else shown(facts))
+    return int(any(row["share"] > options.at_most for row in facts["packages"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
