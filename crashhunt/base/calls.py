@@ -4,47 +4,120 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from dataclasses import MISSING, fields
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
 from crashhunt.base.names import one_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping
 
-__all__ = ["clear_calls"]
+__all__ = ["Documented", "called_with", "clear_calls", "clear_constructor"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 
-def clear_calls(*, options_of: Callable[..., Any] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a public function: a keyword that it does not have is a `CallError` that names the likely one.
-
-    Args:
-        options_of: the function that receives its ``**options``, whose keywords are its own then.
-    """
+def clear_calls() -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a public function: a keyword that it does not have is a `CallError` that names the likely one."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
-        known = _keywords(signature) | (_keywords(inspect.signature(options_of)) if options_of is not None else {})
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            name = function.__name__
-            for keyword in kwargs:
-                if keyword not in known:
-                    fix = one_of(keyword, known, give="it takes", none="no keywords")
-                    raise CallError(f"{name}() has no argument {keyword!r}", fix=fix)
-            try:
-                signature.bind(*args, **kwargs)
-            except TypeError as problem:
-                raise CallError(f"{name}(): {problem}", fix=f"call {name}{_shown(signature)}") from None
+            _refuse(function.__name__, signature, args, kwargs)
             return function(*args, **kwargs)
 
         return call
 
     return decorate
+
+
+def clear_constructor(kind: type[T]) -> type[T]:
+    """Decorate a public class in the same way: its constructor refuses keywords that it does not have."""
+    made: Any = kind
+    constructor = made.__init__
+    known = inspect.signature(kind)
+
+    @functools.wraps(constructor)
+    def construct(self: T, *args: Any, **kwargs: Any) -> None:
+        _refuse(kind.__name__, known, args, kwargs)
+        constructor(self, *args, **kwargs)
+
+    made.__init__ = construct
+    return kind
+
+
+class Documented(Protocol):
+    """An argument that says itself what it means."""
+
+    @property
+    def line(self) -> str:
+        """``name: meaning``."""
+
+
+def called_with(
+    shape: Callable[P, T], *, documents: Iterable[Documented] = ()
+) -> Callable[[Callable[[T], R]], Callable[P, R]]:
+    """Decorate a public function that receives one dataclass: it is called as the dataclass is constructed.
+
+    So the fields of the dataclass are its arguments, for type checkers and editors too, and keywords that it does not
+    have are refused as by `clear_calls`.
+
+    Args:
+        shape: the dataclass; its ``Args`` become those of the function.
+        documents: further arguments, for the same.
+    """
+    known = _signature_of(shape)
+
+    def decorate(function: Callable[[T], R]) -> Callable[P, R]:
+        returned = inspect.signature(function).return_annotation
+
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            _refuse(function.__name__, known, args, kwargs)
+            return function(shape(*args, **kwargs))
+
+        call.__doc__ = _with_arguments(function.__doc__ or "", shape.__doc__ or "", documents)
+        call.__signature__ = known.replace(return_annotation=returned)  # type: ignore[attr-defined]
+        return call
+
+    return decorate
+
+
+def _signature_of(shape: Any) -> inspect.Signature:
+    """The signature of a dataclass's constructor, with what is made anew for every call, not with a ``<factory>``."""
+    known = inspect.signature(shape)
+    made = {item.name: item.default_factory() for item in fields(shape) if item.default_factory is not MISSING}
+    return known.replace(
+        parameters=[
+            parameter.replace(default=made[name]) if name in made else parameter
+            for name, parameter in known.parameters.items()
+        ]
+    )
+
+
+def _with_arguments(doc: str, of_shape: str, documents: Iterable[Documented]) -> str:
+    """A docstring with the arguments of a dataclass, as `help` shows them."""
+    _, _, arguments = inspect.cleandoc(of_shape).partition("Args:\n")
+    lines = [*arguments.rstrip().splitlines(), *(f"    {known.line}" for known in documents)]
+    purpose, parts, rest = inspect.cleandoc(doc).partition("\n\nRaises:")
+    return "\n".join([purpose, "", "Args:", *lines]) + parts + rest
+
+
+def _refuse(name: str, signature: inspect.Signature, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+    known = _keywords(signature)
+    for keyword in kwargs:
+        if keyword not in known:
+            fix = one_of(keyword, known, give="it takes", none="no keywords")
+            raise CallError(f"{name}() has no argument {keyword!r}", fix=fix)
+    try:
+        signature.bind(*args, **kwargs)
+    except TypeError as problem:
+        raise CallError(f"{name}(): {problem}", fix=f"call {name}{_shown(signature)}") from None
 
 
 def _keywords(signature: inspect.Signature) -> dict[str, None]:

@@ -5,6 +5,7 @@ What fits to the letter is built without pydantic, whose import and schemas are 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import EnumType
 from functools import cache
@@ -54,7 +55,7 @@ def _built(kind: Any, data: Any) -> Any:
         return _member_built(inner, data)
     if origin is Literal and any(type(data) is type(choice) and data == choice for choice in inner):
         return data
-    if origin is tuple and type(data) in (list, tuple) and inner[1:] == (...,):
+    if ((origin is tuple and inner[1:] == (...,)) or origin is Sequence) and type(data) in (list, tuple):
         return tuple(_built(inner[0], item) for item in data)
     if origin is dict and type(data) is dict:
         return {_built(inner[0], key): _built(inner[1], value) for key, value in data.items()}

@@ -1,9 +1,23 @@
+from ._declaration import HuntOption as HuntOption
+from ._options import (
+    Driver as Driver,
+    HuntOptions as HuntOptions,
+    SnapshotChoices as SnapshotChoices,
+    Spec as Spec,
+    TrialOptions as TrialOptions,
+    hunt_options as hunt_options,
+)
 from ._plan import (
-    Request as Request,
     parse_crash_on as parse_crash_on,
     plan as plan,
     spec_of as spec_of,
     with_settings as with_settings,
+)
+from ._request import (
+    Request as Request,
+    fields_of as fields_of,
+    request_of as request_of,
+    spec_words as spec_words,
 )
 from ._settings import (
     AgentSettings as AgentSettings,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import secrets
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,8 @@ from crashhunt.base.blame import place_of
 from crashhunt.base.errors import ArgumentError, CrashhuntError, PluginError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
+from crashhunt.plans._options import TrialOptions
+from crashhunt.plans._request import fields_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.scenario import Scenario, load_scenario, scenario_digest, with_action
 from crashhunt.simulators.accelerator import ACCELERATED
@@ -23,49 +25,12 @@ from crashhunt.world import LIMITS, TOLD_BY
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
+    from crashhunt.plans._request import Request
     from crashhunt.samplers import Sampler
     from crashhunt.trial import Signature
 
-__all__ = ["Request", "parse_crash_on", "plan", "spec_of", "with_settings"]
-
-_ZERO = {"PARALLEL": " (0: one per core)", "--recycle-after": " (0: never)"}  # what nought means, where it may be given
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What somebody asks of a hunt; everything else is decided by `plan`.
-
-    Args:
-        trials: how many.
-        max_steps: the bound on each, in steps.
-        scenario: a shipped name, or a path.
-        ego: which vehicle of a bare ``.sumocfg``.
-        action: how agents act on SUMO, ``continuous`` or ``meta``; empty: as the scenario says.
-        agents: agent id to locator; the id may be empty where the scenario has one controlled vehicle.
-        arguments: ``NAME`` or ``AGENT.NAME`` to specification.
-        scenario_arguments: name to specification.
-        sampler: its name.
-        points: how many values grid and sweep try of a range without a step.
-        seed: of the hunt; drawn where it is None.
-        crash_on: the outcomes that count; a traffic event may have a limit, as in ``not_moving:30``.
-        run: how it is run.
-    """
-
-    trials: int
-    max_steps: int
-    scenario: str | Path = "loop"
-    ego: str = ""
-    action: str = ""
-    agents: Mapping[str, str] = field(default_factory=dict)
-    arguments: Mapping[str, str] = field(default_factory=dict)
-    scenario_arguments: Mapping[str, str] = field(default_factory=dict)
-    sampler: str = "random"
-    points: int = 10
-    seed: int | None = None
-    crash_on: Sequence[str] = CRASHES
-    run: RunSettings = field(default_factory=RunSettings)
+__all__ = ["parse_crash_on", "plan", "spec_of", "with_settings"]
 
 
 def plan(request: Request) -> tuple[Scenario, HuntSettings]:
@@ -74,7 +39,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     Raises:
         CrashhuntError: with what is wrong with it.
     """
-    _check_numbers(request)
+    request = request.checked()
     run = replace(request.run, parallel=request.run.parallel or len(os.sched_getaffinity(0)))  # of this machine
     scenario = load_scenario(request.scenario, ego=request.ego)
     scenario = _acting(
@@ -84,15 +49,17 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     hunted = not getattr(sampler, "only_asked", False)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
     crash_on, limits = parse_crash_on(request.crash_on)
+    options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
+    options |= {
+        "seed": request.seed if request.seed is not None else secrets.randbits(32),
+        "crash_on": crash_on,
+    }
     settings = HuntSettings(
+        **options,
         scenario=str(request.scenario),
         scenario_digest=scenario_digest(scenario),
         trials=request.trials,
         max_steps=request.max_steps,
-        seed=request.seed if request.seed is not None else secrets.randbits(32),
-        sampler=request.sampler,
-        points=request.points,
-        crash_on=crash_on,
         events=limits,
         agents=_agents(request, scenario, signatures, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
@@ -169,23 +136,6 @@ def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
         fix = f"it tells {', '.join(told)}" if told else "leave it out"
         raise UsageError(f"--crash-on {names}: the simulator {scenario.simulator!r} never tells that", fix=fix)
     return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never tells {names}"))
-
-
-def _check_numbers(request: Request) -> None:
-    for name, value, least in (
-        ("TRIALS", request.trials, 1),
-        ("MAX_STEPS", request.max_steps, 1),
-        ("PARALLEL", request.run.parallel, 0),
-        ("--points", request.points, 1),
-        ("--recycle-after", request.run.recycle_after, 0),
-        ("--seed", request.seed or 0, 0),
-    ):
-        if value < least:
-            raise UsageError(f"{name} is {value}", fix=f"give at least {least}{_ZERO.get(name, '')}")
-    if not 0 <= request.run.audit <= 1:
-        raise UsageError(f"--audit is {request.run.audit:g}", fix="give a share of the trials, from 0 to 1")
-    if not 0 < request.run.timeout_s < float("inf"):
-        raise UsageError(f"--timeout is {request.run.timeout_s:g}", fix="give seconds above 0")
 
 
 def parse_crash_on(words: Sequence[str]) -> tuple[tuple[Outcome, ...], dict[str, float]]:

@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import shlex
 import tomllib
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.names import near_path
+from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
     from crashhunt.samplers import Space
 
 __all__ = ["AgentSettings", "ArgumentSpec", "HuntSettings", "RunSettings", "read_settings", "write_settings"]
+
+
+# What hunt.toml has had from the beginning, in the order in which it is written.
+_KEYS = (
+    "scenario", "scenario_digest", "trials", "max_steps", "seed", "sampler", "points", "crash_on", "oracles", "agents",
+    "scenario_arguments", "events", "run", "schema",
+)  # fmt: skip
+_RUN_KEYS = (
+    "parallel", "keep_going", "deterministic", "keep_trials", "timeout_s", "recycle_after", "audit", "accelerate",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,34 +58,22 @@ class AgentSettings:
     action: str | None = None
 
 
+@clear_constructor
 @dataclass(frozen=True, kw_only=True)
-class RunSettings:
+class RunSettings(RunOptions):
     """``[run]``: how the hunt is run. None of it changes what a trial is, so a resumed hunt may have other values.
 
     Args:
         parallel: trials at a time.
-        keep_going: collect all crashes instead of stopping at the first.
-        deterministic: at a crash, let running trials of lower numbers finish; the lowest crash counts.
-        keep_trials: keep the logs of every trial.
-        timeout_s: wall-clock limit of a trial, in s.
-        recycle_after: trials after which a worker is replaced by a fresh one.
-        audit: the share of trials without a crash that are run again in a fresh process, 0 to 1.
-        accelerate: whether simulators are sped up where that changes no bit.
     """
 
     parallel: int = 1
-    keep_going: bool = False
-    deterministic: bool = False
-    keep_trials: bool = False
-    timeout_s: float = 60.0
-    recycle_after: int = 1000
-    audit: float = 0.0
-    accelerate: bool = True
 
 
+@clear_constructor
 @dataclass(frozen=True, kw_only=True)
-class HuntSettings:
-    """``hunt.toml``.
+class HuntSettings(TrialOptions):
+    """``hunt.toml``, with those options of the list that decide what a trial is.
 
     Args:
         scenario: the name or path that was given.
@@ -81,8 +81,6 @@ class HuntSettings:
         trials: how many to run.
         max_steps: the bound on each, in steps.
         seed: of the hunt; with a trial's number it determines the trial.
-        sampler: the name of a registered sampler, or ``module:attribute``.
-        points: how many values grid and sweep try of a range without a step.
         crash_on: the outcomes that count as a crash.
         oracles: names of registered oracles, or ``module:attribute``.
         agents: agent id to who drives it.
@@ -97,8 +95,6 @@ class HuntSettings:
     trials: int
     max_steps: int
     seed: int
-    sampler: str = "random"
-    points: int = 10
     crash_on: tuple[Outcome, ...] = CRASHES
     oracles: tuple[str, ...] = ("reported-collision", "overlap", "off-road")
     agents: dict[str, AgentSettings] = field(default_factory=dict)
@@ -152,11 +148,19 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str]) -> No
     data = _without_none(asdict(settings))
     if not settings.events:
         del data["events"]
+    data = {**_in_order(data, settings, _KEYS), "run": _in_order(data["run"], settings.run, _RUN_KEYS)}
     # No line break of an argument may end the comment.
     line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     text = f"# {line}\n{tomli_w.dumps(data)}"
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _in_order(data: dict[str, Any], settings: HuntSettings | RunSettings, first: tuple[str, ...]) -> dict[str, Any]:
+    """What every version knows, in its order; then what came later, where it is not as it was before it came."""
+    later = (item for item in fields(settings) if item.name not in first and item.default_factory is MISSING)
+    asked = [item.name for item in later if getattr(settings, item.name) != item.default]
+    return {name: data[name] for name in (*first, *asked) if name in data}
 
 
 def read_settings(path: Path) -> HuntSettings:

@@ -24,7 +24,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
-from crashhunt.plans import HuntSettings, read_settings, write_settings
+from crashhunt.plans import HuntSettings, SnapshotChoices, read_settings, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described, load_scenario
 from crashhunt.scenario.backends.sumo import movable
 from crashhunt.snapshots._environment import environment
@@ -65,6 +65,16 @@ class SnapshotOptions:
     def __post_init__(self) -> None:
         if not self.limit_mb > 0:  # nor what is not a number
             raise UsageError(f"--snapshot-limit is {self.limit_mb:g}", fix="give MB above 0, or --no-snapshot")
+
+    @classmethod
+    def of(cls, choices: SnapshotChoices) -> SnapshotOptions:
+        """Return what the options of a hunt say.
+
+        Raises:
+            UsageError: the limit is none.
+        """
+        limit_mb = choices.snapshot_limit_mb
+        return cls(code=choices.snapshot_code, roots=tuple(map(Path, choices.snapshot_roots)), limit_mb=limit_mb)
 
 
 class Snapshot:

@@ -1,3 +1,3 @@
-from ._processes import run_all as run_all
+from ._processes import RunRequest as RunRequest, run_all as run_all
 from ._rerun import rerun as rerun
-from ._suite import Suite as Suite, default_suite as default_suite
+from ._suite import Suite as Suite, SuiteEntry as SuiteEntry, default_suite as default_suite

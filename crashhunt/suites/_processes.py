@@ -12,16 +12,16 @@ import time
 import traceback
 from collections import deque
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.signals import stop_requests
 from crashhunt.hunts import HuntDirectory, Ledger
-from crashhunt.plans import Request, RunSettings, plan, read_settings, with_settings
+from crashhunt.plans import Request, RunSettings, SnapshotChoices, fields_of, plan, read_settings, with_settings
 from crashhunt.scenario import load_scenario
 from crashhunt.snapshots import SnapshotOptions, latest_snapshot
 
@@ -47,12 +47,16 @@ class RunRequest:
     Args:
         request: of the hunt.
         folder: from where agents are imported.
-        snapshot_roots: what the snapshot takes in besides the agents' own projects.
+        snapshot: what the snapshot takes in.
     """
 
     request: Request
     folder: str
-    snapshot_roots: tuple[str, ...] = ()
+    snapshot: SnapshotChoices = field(default_factory=SnapshotChoices)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data: what the snapshot takes in stands beside the request."""
+        return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
     @classmethod
     def read(cls, file: Path) -> RunRequest:
@@ -65,11 +69,8 @@ class RunRequest:
             data = json.loads(file.read_text(encoding="utf-8"))
             given = data["request"]
             run = RunSettings(**given.pop("run"))
-            return cls(
-                Request(**{**given, "crash_on": tuple(given["crash_on"]), "run": run}),
-                data["folder"],
-                tuple(data["snapshot_roots"]),
-            )
+            snapshot = {name: data[name] for name in fields_of(SnapshotChoices) if name in data}
+            return cls(Request(**{**given, "run": run}), data["folder"], SnapshotChoices(**snapshot))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise HuntDirectoryError(f"no {REQUEST}: {error}", fix="plan the suite anew", where=str(file)) from None
 
@@ -77,7 +78,7 @@ class RunRequest:
 def write_request(folder: Path, request: RunRequest) -> None:
     """Write ``request.json``, all of it or nothing."""
     with whole_file(folder / REQUEST) as temporary:
-        temporary.write_text(json.dumps(asdict(request), indent=1, default=str), encoding="utf-8")
+        temporary.write_text(json.dumps(request.to_json(), indent=1, default=str), encoding="utf-8")
 
 
 def slots_of(parallel: int) -> int:
@@ -186,7 +187,7 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
     try:
         asked = RunRequest.read(folder / REQUEST)
         scenario, settings = _planned(folder, asked.request, parallel)
-        snapshot = SnapshotOptions(roots=tuple(map(Path, asked.snapshot_roots)))
+        snapshot = SnapshotOptions.of(asked.snapshot)
         hunt = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"], snapshot=snapshot)
         deadline = time.monotonic() + _BUSY_S
         while True:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.hunts import HuntState, Ledger, hunt_state
-from crashhunt.plans import HuntSettings, Request, read_settings
+from crashhunt.plans import HuntSettings, Request, TrialOptions, fields_of, read_settings
 from crashhunt.scenario import shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.suites._processes import REQUEST, RunRequest, run_all, set_aside, slots_of, write_request
@@ -86,17 +86,16 @@ def _request_of(settings: HuntSettings) -> Request:
         for agent, chosen in settings.agents.items()
         for name, spec in chosen.arguments.items()
     }
+    options = {name: getattr(settings, name) for name in fields_of(TrialOptions)}
     return Request(
+        **{**options, "crash_on": settings.crash_on_words},
         trials=settings.trials,
         max_steps=settings.max_steps,
         scenario=settings.scenario,
+        action=next((chosen.action for chosen in settings.agents.values() if chosen.action), ""),
         agents={agent: chosen.agent for agent, chosen in settings.agents.items()},
         arguments=arguments,
         scenario_arguments={name: spec.spec for name, spec in settings.scenario_arguments.items()},
-        sampler=settings.sampler,
-        points=settings.points,
-        seed=settings.seed,
-        crash_on=settings.crash_on_words,
         run=settings.run,
     )
 

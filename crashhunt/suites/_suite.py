@@ -12,74 +12,44 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.names import near_path
 from crashhunt.base.validation import validate
 from crashhunt.hunts import HuntState, hunt_state, is_hunt
-from crashhunt.plans import Request, RunSettings
+from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, request_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.suites._processes import REQUEST, RunRequest, run_all, slots_of, write_request
-from crashhunt.trial import CRASHES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 __all__ = ["Suite", "SuiteEntry", "default_suite"]
 
-Plain = str | int | float | bool
-
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]*")
 
 
+@clear_constructor
 @dataclass(frozen=True, kw_only=True)
-class SuiteEntry:
-    """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys.
+class SuiteEntry(HuntOptions):
+    """``[[hunts]]``: one hunt of a suite; ``[defaults]`` has the same keys. Options are those of the list.
 
     Args:
         id: names its folder; unique in the suite.
-        scenario: a shipped name, or a path from the folder of the file.
-        ego: which vehicle of a bare ``.sumocfg``.
-        action: how agents act on SUMO, ``continuous`` or ``meta``; by default as the scenario says.
         agent: who drives, where the scenario has one controlled vehicle.
         agents: vehicle to who drives it, where it has several.
-        arguments: ``NAME`` or ``AGENT.NAME`` to a value or a specification, as in ``--arg``.
-        scenario_arguments: likewise, as in ``--set``.
         runs: how often, each with a seed of its own.
         trials: of each run, at most.
         max_steps: the bound on each trial, in steps.
-        seed: from which the seeds of the runs come; drawn where it is not given.
-        sampler: its name.
-        points: values that grid and sweep try of a range without a step.
-        crash_on: the outcomes that count.
-        keep_going: collect all crashes instead of stopping at the first.
-        deterministic: the same seed gives the same crash.
-        timeout_s: wall-clock limit of a trial, in s.
-        keep_trials: keep the logs of every trial.
-        audit: the share of trials without a crash that are run again in a fresh process.
-        snapshot_roots: files and folders, from the folder of the file, that the snapshot takes in as well.
     """
 
+    # Paths of scenario and snapshot_roots are from the folder of the file; the seeds of the runs come from seed.
     id: str = ""
-    scenario: str = "loop"
-    ego: str = ""
-    action: str = ""
     agent: str = ""
     agents: dict[str, str] = field(default_factory=dict)
-    arguments: dict[str, Plain] = field(default_factory=dict)
-    scenario_arguments: dict[str, Plain] = field(default_factory=dict)
     runs: int = 1
     trials: int = 100
     max_steps: int = 1500
-    seed: int | None = None
-    sampler: str = "random"
-    points: int = 10
-    crash_on: tuple[str, ...] = tuple(str(outcome) for outcome in CRASHES)
-    keep_going: bool = False
-    deterministic: bool = False
-    timeout_s: float = 60.0
-    keep_trials: bool = False
-    audit: float = 0.0
-    snapshot_roots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +172,9 @@ class Suite:
 
     def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:
         roots = tuple(str((self.folder / root).resolve()) for root in entry.snapshot_roots)
-        wanted = RunRequest(self._request(entry, number), str(self.folder), roots)
+        snapshot = SnapshotChoices(**{name: getattr(entry, name) for name in fields_of(SnapshotChoices)})
+        snapshot = replace(snapshot, snapshot_roots=roots)
+        wanted = RunRequest(self._request(entry, number), str(self.folder), snapshot)
         if not (folder / REQUEST).exists():
             return wanted
         before = RunRequest.read(folder / REQUEST)
@@ -217,32 +189,13 @@ class Suite:
         return before
 
     def _request(self, entry: SuiteEntry, number: int) -> Request:
-        scenario = entry.scenario
+        scenario = str(entry.scenario)
         if scenario not in shipped_scenarios():
             scenario = str((self.folder / scenario).resolve())
         seed = entry.seed if entry.seed is not None else secrets.randbits(32)
         drawn = np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]
-        return Request(
-            trials=entry.trials,
-            max_steps=entry.max_steps,
-            scenario=scenario,
-            ego=entry.ego,
-            action=entry.action,
-            agents=entry.agents or ({"": entry.agent} if entry.agent else {}),
-            arguments={name: _spec(value) for name, value in entry.arguments.items()},
-            scenario_arguments={name: _spec(value) for name, value in entry.scenario_arguments.items()},
-            sampler=entry.sampler,
-            points=entry.points,
-            seed=int(drawn),
-            crash_on=tuple(entry.crash_on),
-            run=RunSettings(
-                keep_going=entry.keep_going,
-                deterministic=entry.deterministic,
-                timeout_s=entry.timeout_s,
-                keep_trials=entry.keep_trials,
-                audit=entry.audit,
-            ),
-        )
+        asked = replace(entry, scenario=scenario, seed=int(drawn))
+        return request_of(asked, trials=entry.trials, max_steps=entry.max_steps)
 
 
 def default_suite() -> str:
@@ -284,7 +237,3 @@ def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, 
         both = isinstance(value, dict) and isinstance(found.get(key), dict) and key != "agents"
         found[key] = {**found[key], **value} if both else value
     return found
-
-
-def _spec(value: Plain) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

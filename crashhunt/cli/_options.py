@@ -1,0 +1,56 @@
+"""The options of a hunt on the command line, as the list has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.cli._common import integer, number, pairs
+from crashhunt.plans import hunt_options
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Mapping
+
+    from crashhunt.plans import HuntOption
+
+__all__ = ["add_options", "chosen_options"]
+
+
+def add_options(groups: Mapping[str, argparse._ArgumentGroup]) -> None:
+    """Add every option that has a flag to its group of the help."""
+    for option in hunt_options():
+        if option.about.flag:
+            _add(groups[option.about.group], option)
+
+
+def chosen_options(given: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that were given, as `crashhunt.prepare` takes them.
+
+    Raises:
+        UsageError: a value has no name, or a name comes twice.
+    """
+    return {option.name: _value(option, getattr(given, option.name)) for option in hunt_options() if option.about.flag}
+
+
+def _add(group: argparse._ArgumentGroup, option: HuntOption) -> None:
+    about = option.about
+    if option.form == "flag":
+        action = "store_false" if option.default else "store_true"
+        group.add_argument(about.flag, action=action, dest=option.name, help=option.help)
+        return
+    words: dict[str, Any] = {"default": option.default}
+    if option.form in ("integer", "number"):
+        words["type"] = integer if option.form == "integer" else number
+    elif option.form == "table" or (option.form == "list" and not about.separator):
+        words = {"action": "append", "default": [], "type": Path if about.metavar == "PATH" else None}
+    group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=option.help, **words)
+
+
+def _value(option: HuntOption, given: Any) -> Any:
+    about = option.about
+    if option.form == "table":
+        return pairs(given, about.flag, named=about.named)
+    if about.separator and isinstance(given, str):
+        return tuple(word for word in given.split(about.separator) if word)
+    return given

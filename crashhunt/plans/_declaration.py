@@ -1,0 +1,179 @@
+"""How an option of a hunt is declared, and what follows from it: its form, its help, and which values it refuses."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+from crashhunt.base.errors import UsageError
+
+__all__ = [
+    "About", "Form", "HuntOption", "above_zero", "at_least", "declared", "declared_options", "option", "within",
+]  # fmt: skip
+
+T = TypeVar("T")
+
+Form = Literal["flag", "integer", "number", "text", "list", "table"]
+Check = Callable[[Any], str]  # what to give instead; empty where the value is fine
+
+_ABOUT = "crashhunt"  # the key of a field's metadata
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class About:
+    """What the list says of an option besides its name, type and default.
+
+    Args:
+        meaning: of its value, in words.
+        help: the same on the command line, where it has to be said otherwise.
+        unset: what holds where it is not given, in words; left out where that is the default itself.
+        flag: on the command line; empty where it is not there.
+        metavar: of its value, on the command line.
+        group: of the help of ``crashhunt run``.
+        check: says what to give instead of a value that is none.
+        separator: of a list that is one word on the command line; empty where its flag may be repeated.
+        named: of a table, whether every value has a name.
+        anywhere: whether ``suite run`` and ``rerun`` have the flag as well, for all their hunts: it belongs to the
+            machine, and not to the hunt.
+    """
+
+    meaning: str
+    help: str = ""
+    unset: str = ""
+    flag: str = ""
+    metavar: str = ""
+    group: Literal["what", "how"] = "how"
+    check: Check | None = None
+    separator: str = ""
+    named: bool = True
+    anywhere: bool = False
+
+
+def option(default: T, meaning: str, **about: Any) -> T:
+    """Declare an option: a field of a dataclass. For ``about``, see `About`."""
+    metadata = {_ABOUT: About(meaning=meaning, **about)}
+    if isinstance(default, dict):
+        return cast(T, field(default_factory=dict, metadata=metadata))
+    return field(default=default, metadata=metadata)
+
+
+def at_least(least: int, *, zero: str = "") -> Check:
+    """Return the check of a number; ``zero`` says what nought means, where it may be given."""
+    fix = f"give at least {least}{f' (0: {zero})' if zero else ''}"
+    return lambda value: fix if value < least else ""
+
+
+def within(least: float, most: float, fix: str) -> Check:
+    """Return the check of a number with two bounds, both of which it may be."""
+    return lambda value: "" if least <= value <= most else fix  # what is not a number is not within, either
+
+
+def above_zero(fix: str, *, finite: bool = True) -> Check:
+    """Return the check of a number above 0."""
+    return lambda value: "" if value > 0 and not (finite and math.isinf(value)) else fix
+
+
+@dataclass(frozen=True, slots=True)
+class HuntOption:
+    """One option of the list.
+
+    Args:
+        name: in Python and in files.
+        form: of its values.
+        default: what holds where it is not given.
+        about: everything else.
+    """
+
+    name: str
+    form: Form
+    default: Any
+    about: About
+
+    @property
+    def shown(self) -> str:
+        """How errors call it."""
+        return self.about.flag or self.name
+
+    @property
+    def line(self) -> str:
+        """What the documentation of a function says of it."""
+        return f"{self.name}: {self.about.meaning}{f'; by default {self.about.unset}' if self.about.unset else ''}."
+
+    @property
+    def help(self) -> str:
+        """What the command line says of it."""
+        said = self.about.unset
+        if self.form in ("integer", "number", "text") and self.default not in ("", None):
+            said = f"{self.default:g}" if self.form == "number" else str(self.default)
+        return f"{self.about.help or self.about.meaning}{f'; default: {said}' if said else ''}"
+
+    def checked(self, value: Any) -> Any:
+        """Return a value of this option, plain where it was NumPy's.
+
+        Raises:
+            UsageError: it is none.
+        """
+        if value is None and self.default is None:
+            return None
+        kinds, fix = _FORMS[self.form]
+        stranger = isinstance(value, bool) != (self.form == "flag") or (self.form == "list" and isinstance(value, str))
+        if stranger or not isinstance(value, kinds):
+            raise UsageError(f"{self.shown} is {value!r}", fix=fix)
+        plain = _plain(value, self.form)
+        fix = self.about.check(plain) if self.about.check is not None else ""
+        if fix:
+            said = f"{plain:g}" if self.form == "number" else str(plain)
+            raise UsageError(f"{self.shown} is {said}", fix=fix)
+        return plain
+
+
+def _plain(value: Any, form: Form) -> Any:
+    if form == "list":
+        return tuple(value)
+    if form == "integer":
+        return int(value)
+    return float(value) if form == "number" and type(value) is not int else value
+
+
+# What a value of a form may be, and what to give instead.
+_FORMS: Mapping[Form, tuple[tuple[type, ...], str]] = {
+    "flag": ((bool,), "give True or False"),
+    "integer": ((Integral,), "give a whole number"),
+    "number": ((Real,), "give a number"),
+    "text": ((str, Path), "give a text"),
+    "list": ((Iterable,), "give a list"),
+    "table": ((Mapping, NoneType), "give a dictionary"),
+}
+
+
+def declared(kind: Any) -> frozenset[str]:
+    """Return the names of the options that a dataclass declares, or has from one that does."""
+    return frozenset(item.name for item in fields(kind) if _ABOUT in item.metadata)
+
+
+def declared_options(kind: Any) -> tuple[HuntOption, ...]:
+    """Return the options that a dataclass declares, in its order."""
+    hints = get_type_hints(kind)
+    return tuple(
+        HuntOption(item.name, _form(hints[item.name]), _default(item), item.metadata[_ABOUT])
+        for item in fields(kind)
+        if _ABOUT in item.metadata
+    )
+
+
+def _default(item: Field[Any]) -> Any:
+    return {} if item.default is MISSING else item.default
+
+
+def _form(hint: Any) -> Form:
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    forms = {_FORM_OF.get(get_origin(kind) or kind, "text") for kind in kinds if kind is not NoneType}
+    return forms.pop() if len(forms) == 1 else "text"
+
+
+_FORM_OF: Mapping[Any, Form] = {
+    bool: "flag", int: "integer", float: "number", Sequence: "list", tuple: "list", Mapping: "table", dict: "table",
+}  # fmt: skip

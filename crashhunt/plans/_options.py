@@ -1,0 +1,185 @@
+"""The one list of hunt options.
+
+The command line, `crashhunt.prepare` and ``run``, ``suite.toml``, ``request.json`` and ``hunt.toml`` are made of it: an
+option is added by adding a field to one of the classes here, and all of them have it. Which class it is says where the
+option is kept:
+
+- `Subject` is resolved into ``hunt.toml`` by `plan`, which has to learn of it;
+- `TrialOptions` decides what a trial is: a key of ``hunt.toml``, and another value makes another hunt;
+- `RunOptions` only decides how trials are run: a key of ``[run]``, which a resumed hunt may have otherwise;
+- `SnapshotOptions` of the ``snapshots`` package is made of `SnapshotChoices`, which are not kept.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
+from crashhunt.trial import CRASHES
+
+__all__ = [
+    "Driver", "HuntOptions", "RunOptions", "SnapshotChoices", "Spec", "Subject", "TrialOptions", "checked",
+    "hunt_options",
+]  # fmt: skip
+
+P = TypeVar("P", bound="_Options")
+
+Spec = str | int | float | bool
+Driver = str | Callable[..., Any]  # a class is one, too
+
+_SPEC = "a value (20), a range (5:40, 5:40:5), a log range (log:1e-3:1) or a choice (a|b|c)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, list):  # what was read from a file is the same as what was given in Python
+                object.__setattr__(self, item.name, tuple(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject(_Options):
+    """What is hunted."""
+
+    scenario: Path | str = option(
+        "loop", "a shipped name, or a path",
+        help="a shipped scenario (see crashhunt scenarios), a folder, a scenario.toml or a .sumocfg",
+        flag="--scenario", metavar="NAME|PATH", group="what",
+    )  # fmt: skip
+    ego: str = option(
+        "", "which vehicle of a bare ``.sumocfg``",
+        help="for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one", unset="the first",
+        flag="--ego", metavar="VEHICLE", group="what",
+    )  # fmt: skip
+    action: str = option(
+        "", "how agents act on SUMO, ``continuous`` or ``meta``",
+        help="on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions)",
+        unset="as the scenario says, and continuous for a .sumocfg",
+        flag="--action", metavar="FORM", group="what",
+    )  # fmt: skip
+    agents: Mapping[str, Driver] | None = option(
+        {}, "vehicle to who drives it, where there are several",
+        help="who drives: a class or function, or a name that crashhunt agents lists; ID= where the scenario has "
+        "several controlled vehicles",
+        flag="--agent", metavar="[ID=]MODULE:ATTR", group="what", named=False,
+    )  # fmt: skip
+    arguments: Mapping[str, Spec] | None = option(
+        {}, '``NAME`` or ``AGENT.NAME`` to a value or a specification such as ``"5:40"``',
+        help=f"what to try for an argument of the agent: {_SPEC}; ID.NAME=SPEC for one of several agents",
+        flag="--arg", metavar="NAME=SPEC", group="what",
+    )  # fmt: skip
+    scenario_arguments: Mapping[str, Spec] | None = option(
+        {}, "the same for arguments of the scenario: name to value or specification",
+        help="the same for an argument of the scenario, such as its traffic demand",
+        flag="--set", metavar="NAME=SPEC", group="what",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialOptions(_Options):
+    """What a trial is; `HuntSettings` has them too."""
+
+    sampler: str = option(
+        "random", "its name", help="random, grid or sweep", flag="--sampler", metavar="NAME",
+    )  # fmt: skip
+    points: int = option(
+        10, "values that grid and sweep try of a range without a step", flag="--points", metavar="N",
+        check=at_least(1),
+    )  # fmt: skip
+    seed: int | None = option(
+        None, "of the hunt", unset="a new one, which is printed", flag="--seed", metavar="N", check=at_least(0),
+    )  # fmt: skip
+    crash_on: Sequence[str] = option(
+        CRASHES, "the outcomes that count as a crash",
+        help="the outcomes that count as a crash: collision, off_road, agent_error, simulator_error, process_died, "
+        "hang, which are the default; and traffic events: red_light, wrong_way, off_route, not_moving (for 60 s, or "
+        "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
+        flag="--crash-on", metavar="KIND,…", separator=",",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(_Options):
+    """How trials are run; `RunSettings` has them too."""
+
+    keep_going: bool = option(
+        False, "collect all crashes instead of stopping at the first", flag="--keep-going",
+    )  # fmt: skip
+    deterministic: bool = option(
+        False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
+        flag="--deterministic",
+    )  # fmt: skip
+    timeout_s: float = option(
+        60.0, "wall-clock limit of a trial, in s", flag="--timeout", metavar="S",
+        check=above_zero("give seconds above 0"),
+    )  # fmt: skip
+    keep_trials: bool = option(
+        False, "keep the logs of every trial, not of crashes only", flag="--keep-trials",
+    )  # fmt: skip
+    accelerate: bool = option(
+        True, "speed simulators up where that changes no bit",
+        help="run highway-env as it is; the accelerator changes no bit, and only the time it takes",
+        flag="--no-accelerate",
+    )  # fmt: skip
+    recycle_after: int = option(
+        1000, "trials after which a worker is replaced; 0 for never",
+        help="replace a worker after so many trials; 0: never",
+        flag="--recycle-after", metavar="N", check=at_least(0, zero="never"),
+    )  # fmt: skip
+    audit: float = option(
+        0.0, "the share of trials without a crash that are run again in a fresh process, to see that they are the same",
+        help="run this share of the trials without a crash again, each in a fresh process, and say where one is not "
+        "the same: 0.02 is one in fifty",
+        flag="--audit", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapshotChoices(_Options):
+    """What the snapshot of the code takes in."""
+
+    snapshot_roots: Sequence[str | Path] = option(
+        (), "files and folders that the snapshot takes in besides the agents' own projects",
+        help="a file or folder that the snapshot takes in besides the agent's own project; may be repeated",
+        flag="--snapshot-root", metavar="PATH",
+    )  # fmt: skip
+    snapshot_limit_mb: float = option(
+        500.0, "the most that a snapshot may have, in MB", help="the most that a snapshot may have",
+        flag="--snapshot-limit", metavar="MB",
+        check=above_zero("give MB above 0, or --no-snapshot", finite=False),
+    )  # fmt: skip
+    snapshot_code: bool = option(
+        True, "whether the snapshot has code at all; without, a replay runs what is current",
+        help="keep no code; a replay then runs what is current", flag="--no-snapshot",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class HuntOptions(SnapshotChoices, RunOptions, TrialOptions, Subject):
+    """All of them, in the order of the help: what `crashhunt.prepare` takes, and a hunt of a ``suite.toml``."""
+
+    agent: Driver | None = option(None, "who drives, where the scenario has one controlled vehicle")
+
+
+def checked(part: P) -> P:
+    """Return a dataclass of the list whose values are in order, as plain as they can be.
+
+    Raises:
+        UsageError: one is none.
+    """
+    return replace(part, **{known.name: known.checked(getattr(part, known.name)) for known in hunt_options(type(part))})
+
+
+def hunt_options(kind: type = HuntOptions) -> tuple[HuntOption, ...]:
+    """Return the options of the list, or those of them that a dataclass has which is made of it."""
+    names = declared(kind)
+    return tuple(known for known in _all_options() if known.name in names)
+
+
+@cache
+def _all_options() -> tuple[HuntOption, ...]:
+    return declared_options(HuntOptions)

@@ -1,0 +1,105 @@
+"""What somebody asks of a hunt, in Python, on the command line or in a file: before anything is resolved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.calls import clear_constructor
+from crashhunt.base.errors import UsageError
+from crashhunt.plans._declaration import at_least
+from crashhunt.plans._options import (
+    Driver,
+    HuntOptions,
+    RunOptions,
+    Spec,
+    Subject,
+    TrialOptions,
+    checked,
+)
+from crashhunt.plans._settings import RunSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["Request", "fields_of", "request_of", "spec_words"]
+
+_BOUNDS = {  # the numbers of a hunt that are no options: everybody has to give them
+    "TRIALS": at_least(1),
+    "MAX_STEPS": at_least(1),
+    "PARALLEL": at_least(0, zero="one per core"),
+}
+
+
+@clear_constructor
+@dataclass(frozen=True, kw_only=True)
+class Request(TrialOptions, Subject):
+    """What somebody asks of a hunt; everything else is decided by `plan`. Options are those of the list.
+
+    Args:
+        trials: how many.
+        max_steps: the bound on each, in steps.
+        agents: agent id to locator; the id may be empty where the scenario has one controlled vehicle.
+        arguments: ``NAME`` or ``AGENT.NAME`` to specification.
+        scenario_arguments: name to specification.
+        run: how it is run.
+    """
+
+    trials: int
+    max_steps: int
+    agents: Mapping[str, str] = field(default_factory=dict)
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    scenario_arguments: Mapping[str, str] = field(default_factory=dict)
+    run: RunSettings = field(default_factory=RunSettings)
+
+    def checked(self) -> Request:
+        """Return the same with plain values.
+
+        Raises:
+            UsageError: a value cannot be meant.
+        """
+        for (name, check), value in zip(_BOUNDS.items(), (self.trials, self.max_steps, self.run.parallel), strict=True):
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise UsageError(f"{name} is {value!r}", fix="give a whole number")
+            if fix := check(value):
+                raise UsageError(f"{name} is {value}", fix=fix)
+        return replace(checked(self), run=checked(self.run))
+
+
+def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:
+    """Return the request for options as they are given in Python or in a ``suite.toml``.
+
+    Raises:
+        UsageError: who drives is in no module that a worker could import.
+    """
+    drivers = {} if asked.agent in (None, "") else {"": asked.agent}
+    given: dict[str, Any] = {
+        **{name: getattr(asked, name) for name in (*fields_of(Subject), *fields_of(TrialOptions))},
+        "agents": {name: _locator(who) for name, who in {**(asked.agents or {}), **drivers}.items() if who is not None},
+        "arguments": spec_words(asked.arguments),
+        "scenario_arguments": spec_words(asked.scenario_arguments),
+    }
+    run = RunSettings(parallel=parallel, **{name: getattr(asked, name) for name in fields_of(RunOptions)})
+    return Request(trials=trials, max_steps=max_steps, run=run, **given)
+
+
+def fields_of(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass."""
+    return tuple(item.name for item in fields(kind))
+
+
+def _locator(who: Driver) -> str:
+    if isinstance(who, str):
+        return who
+    module, name = getattr(who, "__module__", ""), getattr(who, "__qualname__", "")
+    if module in ("", "__main__") or not name or "<" in name:
+        raise UsageError(
+            f"{name or who!r} is in no module that a worker could import",
+            fix="put it into a file of its own, and give it from there or as 'module:attribute'",
+        )
+    return f"{module}:{name}"
+
+
+def spec_words(given: Mapping[str, Spec] | None) -> dict[str, str]:
+    """Return specifications as they are written on the command line."""
+    return {name: str(spec).lower() if isinstance(spec, bool) else str(spec) for name, spec in (given or {}).items()}
