@@ -7,6 +7,7 @@ import subprocess
 import sys
 import sysconfig
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,7 +103,12 @@ def _is_installed(place: Path | None) -> bool:
     """Whether a module lies with the installed ones, which are everybody's and recorded by their versions."""
     if place is None or not {"site-packages", "dist-packages"}.isdisjoint(place.parts):
         return True
-    return any(place.is_relative_to(Path(path).resolve()) for path in sysconfig.get_paths().values())
+    return any(map(place.is_relative_to, _installed_places()))
+
+
+@cache
+def _installed_places() -> tuple[Path, ...]:
+    return tuple({Path(path).resolve() for path in sysconfig.get_paths().values()})
 
 
 def _place_of(name: str) -> Path | None:
