@@ -142,7 +142,8 @@ try:
 except HuntDirectoryError as error:
     print("refused:", error.message)
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    # -B: what Python compiles would be cut off as well.
+    done = subprocess.run([sys.executable, "-B", "-c", program], capture_output=True, text=True, check=True)
     assert "refused: cannot be written: File too large" in done.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["box"]
     assert signal.SIGXFSZ
