@@ -26,14 +26,7 @@ if TYPE_CHECKING:
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 # What `run` and `replay` import; the rest of a command's modules is imported by its fork.
-IMPORTED = (
-    "crashhunt.cli",
-    "crashhunt.api",
-    "crashhunt.hunts._hunt",
-    "crashhunt.report._summary",
-    "crashhunt.snapshots._snapshot",
-    "rich.console",
-)
+IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _MESSAGE = 1 << 20
@@ -149,8 +142,10 @@ def _be_command(request: dict, out: int, err: int) -> NoReturn:
 
 if __name__ == "__main__":
     sys.path[0] = str(CRASHHUNT.parent)  # where the script lies, and not these tests
-    for module in IMPORTED:
-        importlib.import_module(module)
+    for package in IMPORTED:
+        module = importlib.import_module(f"crashhunt.{package}")
+        for name in module.__all__:
+            getattr(module, name)  # which imports what it lies in
     gc.collect()
     gc.freeze()
     _serve(socket.socket(fileno=int(sys.argv[1])))

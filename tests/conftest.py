@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import json
 import os
@@ -18,10 +19,12 @@ from commands import CRASHHUNT, Commands
 from crashhunt.base.integrity import describe_files, digest_of_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Container, Iterable, Iterator
 
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
-hypothesis.settings.register_profile("crashhunt", deadline=None)
+hypothesis.settings.register_profile(
+    "crashhunt", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
 hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 150.0
@@ -113,6 +116,15 @@ def needed(*names: str) -> str:
     return found
 
 
+def mostly_nightly(cases: Iterable[Any], always: Container[Any]) -> list[Any]:
+    """Cases of one contract, of which some run always, and the others where `nightly` tests are asked for."""
+    return [
+        case if case in always
+        else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.nightly)
+        for case in cases
+    ]  # fmt: skip
+
+
 @pytest.fixture
 def shell(tmp_path: Path) -> Shell:
     """An empty folder with a module `faulty` of agents that go wrong."""
@@ -122,16 +134,25 @@ def shell(tmp_path: Path) -> Shell:
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[Shell], object], Shell], Shell]:
-    """Fills a folder with what a function makes in one; it is called once, everybody gets a copy."""
-    made: dict[Callable[[Shell], object], Path] = {}
+    """Fills a folder with what a function makes in one; it is called once, everybody gets a copy.
+
+    Once a session, and not once a worker of pytest-xdist: the others wait for the one that has begun.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "made"
+    shared.mkdir(exist_ok=True)
 
     def fill(make: Callable[[Shell], object], shell: Shell) -> Shell:
-        if make not in made:
-            folder = tmp_path_factory.mktemp("made")
-            shutil.copytree(shell.folder, folder, dirs_exist_ok=True)
-            make(Shell(folder))
-            made[make] = folder
-        shutil.copytree(made[make], shell.folder, dirs_exist_ok=True)
+        folder = shared / f"{make.__module__}.{make.__qualname__}"
+        with folder.with_name(f"{folder.name}.lock").open("a+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            lock.seek(0)
+            if not lock.read():
+                shutil.rmtree(folder, ignore_errors=True)  # of somebody who failed
+                shutil.copytree(shell.folder, folder)
+                make(Shell(folder))
+                lock.write("made")
+        shutil.copytree(folder, shell.folder, dirs_exist_ok=True)
         return shell
 
     return fill

@@ -14,6 +14,7 @@ import gymnasium
 import highway_env
 import numpy as np
 import pytest
+from conftest import mostly_nightly
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
@@ -47,6 +48,12 @@ CONFIGS = {
     },
     "grid": {"observation": {"type": "OccupancyGrid", "align_to_vehicle_axes": True}},
 }  # fmt: skip
+# The environments of our scenarios as they are, and every configuration on a motorway and on a bent road.
+ALWAYS = [
+    (name, "default")
+    for name in ("intersection-v2", "intersection-multi-agent-v2", "merge-generic-v1", "roundabout-generic-v1")
+]
+ALWAYS += [(name, config) for name in ("highway-fast-v0", "racetrack-oval-v0") for config in CONFIGS]
 STEPS = {"highway-v0": 4, "lane-keeping-v0": 40}
 
 
@@ -137,7 +144,7 @@ def both(*words, **options):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:.*invalid value:RuntimeWarning")
-@pytest.mark.parametrize(("name", "config"), CASES)
+@pytest.mark.parametrize(("name", "config"), mostly_nightly(CASES, ALWAYS))
 def test_every_bit_is_the_same_after_every_sub_step(name, config):
     chosen = dict(CONFIGS[config])
     if name.startswith(("merge", "roundabout", "two-way")):
