@@ -30,7 +30,7 @@ __all__ = [
     "off_path",
 ]
 
-CAR_LENGTH_M = 5.0
+CAR_LENGTH_M = 5.0  # highway-env's, and SUMO's default; the observation does not say how long others are
 # The default layout: presence, x, y, vx, vy, cos_h, sin_h; x ahead and y to the right of the vehicle.
 PRESENCE, X, Y, VX, VY, COS_H, SIN_H = range(7)
 

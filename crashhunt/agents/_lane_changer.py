@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = ["LaneChanger"]
 
-LANE_WIDTH_M = 3.2
-LEFT, RIGHT = 1, -1
+LANE_WIDTH_M = 3.2  # SUMO's default; an observation has no lanes to count
+LEFT, RIGHT = 1, -1  # as in the action
 MIN_GAP_M = 5.0  # a truck's half is up to 2.5 m longer than a car's
-REACTION_S = 1.0
+REACTION_S = 1.0  # of whoever is behind in the other lane, before it brakes
 BRAKE = 4.0  # m/s², what it expects of whoever has to brake after a lane change
 
 

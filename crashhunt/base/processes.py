@@ -17,7 +17,7 @@ from pathlib import Path
 
 __all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "is_alive", "kill"]
 
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _PATIENCE_S = 2.0  # for processes that do not die at once; those of another user never do
 
 

@@ -19,7 +19,7 @@ __all__ = ["confine", "landlock_version"]
 
 # The numbers are the same on every processor (include/uapi/linux/landlock.h).
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
-_VERSION_ONLY, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38
+_VERSION_ONLY, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38  # of <linux/landlock.h> and <sys/prctl.h>
 
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR, _TRUNCATE = 1 << 0, 1 << 1, 1 << 2, 1 << 3, 1 << 14
 _READ = _EXECUTE | _READ_FILE | _READ_DIR

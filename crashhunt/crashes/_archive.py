@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 __all__ = ["Archive", "export_crash", "open_archive"]
 
 SCHEMA = 1
-_MAX_BYTES = 4 * 10**9
-_MAX_FILES = 100_000
-_CHUNK = 1 << 20
+_MAX_BYTES = 4 * 10**9  # unpacked; a few hundred bytes of a zip can stand for terabytes
+_MAX_FILES = 100_000  # so many make a file system slow
+_CHUNK = 1 << 20  # bytes at a time, so that a large file needs little memory
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Encounter", "Manner", "Moment", "Position", "last_escape"]
 
-_LOOKS_BACK_S = 30.0
+_LOOKS_BACK_S = 30.0  # before the end; what was longer ago has not led to it
 _PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
 
 Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "crossing from the right", "left", "right"]

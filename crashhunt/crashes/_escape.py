@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["find_escape", "partner"]
 
-_RUNS = 12
+_RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # nobody asks what could have been done longer ago
-_WALL_S = 60.0
+_WALL_S = 60.0  # a crash is confirmed while somebody waits
 _GUESS = 4.5  # m/s², where nobody knows better; a guess costs nothing but runs
 _STANDS = 0.1  # m/s
-_AFTERWARDS_S = 5.0
+_AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
 _AS_IT_CAN = "as hard as it can"
 
 Ending = Literal["avoided", "hit", "unclear"]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Episodes"]
 
 _SIZE = (960, 540)  # of the picture, in pixels
-_TRAIL_S = 4.0
+_TRAIL_S = 4.0  # of where the agent has been
 
 
 class Episodes:

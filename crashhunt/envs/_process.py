@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["RemoteEpisodes"]
 
 _LOOK_EVERY_S = 1.0  # whether whoever asks is still there
-_GOOD_BYE_S = 5.0
+_GOOD_BYE_S = 5.0  # for SUMO to close; then it is killed
 
 
 class RemoteEpisodes:

@@ -44,7 +44,7 @@ _IGNORED = frozenset({
     "last_exc", "last_type", "last_value", "last_traceback", "_",
 })  # fmt: skip
 _MOST = 50_000  # values of a user's that are looked at
-_DEEPEST = 6
+_DEEPEST = 6  # containers within containers; deeper ones are taken for unchanged
 _LIMITS = (
     resource.RLIMIT_NOFILE,
     resource.RLIMIT_AS,

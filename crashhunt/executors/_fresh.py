@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 __all__ = ["FreshProcessExecutor", "fresh_environment"]
 
-_LOOK_EVERY_S = 0.01
-_LAST_WORDS_S = 0.2
-_START_UP_S = 60.0
-_ESCAPE_S = 60.0
+_LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
+_LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
+_START_UP_S = 60.0  # for Python and the agent to be imported, before a trial counts as begun
+_ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
 
 @dataclass(slots=True)

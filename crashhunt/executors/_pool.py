@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 __all__ = ["PoolExecutor"]
 
-_LOOK_EVERY_S = 0.1
+_LOOK_EVERY_S = 0.1  # whether somebody hangs; those who end make themselves heard
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
 _START_UP_S = 60.0  # for a new worker to get ready, before a trial counts as begun
-_RECEIVED = 1 << 16
+_RECEIVED = 1 << 16  # bytes at a time; a result is a few hundred
 
 
 @dataclass(slots=True, eq=False)

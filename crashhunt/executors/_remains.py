@@ -25,7 +25,7 @@ __all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "signal_name", "wher
 DAMAGED = 79
 """The exit code of a worker that has run its trial to the end, and could not say what came of it."""
 _FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
-_ATTEMPTS = 3
+_ATTEMPTS = 3  # of a trial whose process is killed from outside; then somebody means it
 
 
 @dataclass(slots=True)

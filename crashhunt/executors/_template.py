@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-_MESSAGE = 1 << 16
-_ORPHANS_EVERY_S = 0.5
+_MESSAGE = 1 << 16  # bytes; an order to start a worker is some hundred
+_ORPHANS_EVERY_S = 0.5  # looking for what dead workers have left behind walks all of /proc
 _LOOK_EVERY_S = 0.02  # where the kernel does not tell when a process ends
 # What belongs to the process as a whole is for the hunt; a worker dies of it as any process does.
 _NOT_OURS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["TemplateLink"]
 
-_MESSAGE = 1 << 16
+_MESSAGE = 1 << 16  # bytes, as in _template
 _DEATHS = 3  # in a row, without a trial between them, before the pool gives up
-_END_S = 5.0
+_END_S = 5.0  # for the template to say why it ended
 _FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
 _numbers = itertools.count()
 

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
-_TICK_S = 0.1
-_HEARTBEAT_S = 1.0
-_INVALID_BEFORE_GIVING_UP = 10
+_TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
+_HEARTBEAT_S = 1.0  # another machine takes a hunt for dead after a minute of silence
+_INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
 

@@ -22,7 +22,7 @@ __all__ = ["painted"]
 
 _TOP, _LEFT, _BOTTOM, _RIGHT = 20, 38, 18, 10  # room for title and labels, in pixels
 _SHORT = 12  # characters of a name that are written large
-_HUGE = 1e100
+_HUGE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
 
 
 def painted(panel: kinds.Panel, width: int, height: int, label: str) -> NDArray[np.uint8]:

@@ -37,10 +37,10 @@ _MAGIC = b"CRASHBB1"
 _HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
 _WHERE = struct.Struct("<QqiI")  # the last four of them
 _WHERE_OFFSET = _HEADER.size - _WHERE.size
-_FIRST = 64
+_FIRST = 64  # where records begin; the header has room to grow
 _HEAD = struct.Struct("<BxHI")
-_CHUNK = 1 << 20
-_MAPPED = 64 << 20
+_CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
+_MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves every view
 DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
 """What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
 

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 __all__ = ["foxglove_layout", "lane_borders", "read_lanes", "write_views"]
 
-_MAP_REACH_M = 300.0
-_HEIGHT_M = 1.5
-_PERSON_HEIGHT_M = 1.7
+_MAP_REACH_M = 300.0  # around where anybody drove; a town's whole map is too much for a viewer
+_HEIGHT_M = 1.5  # of a car, where nobody says
+_PERSON_HEIGHT_M = 1.7  # likewise
 _COLORS = {
     "ego": (1.0, 0.8, 0.1, 1.0),
     "agent": (0.2, 0.8, 0.4, 1.0),

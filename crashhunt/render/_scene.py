@@ -22,10 +22,10 @@ __all__ = ["SceneView"]
 
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
 _EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
-_TRAIL_S = 4.0
+_TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _FINE = 2  # drawn so many times larger, for smooth edges
-_LEGEND_STEP = 22
+_LEGEND_STEP = 22  # pixels
 
 
 class SceneView:

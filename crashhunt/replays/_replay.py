@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Code", "ReplayOptions", "ReplayReport", "Rerun", "Verdict", "confirm", "prepare", "replay"]
 
-_LOOK_EVERY_S = 0.5
+_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 Code = Literal["snapshot", "current", "log"]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["comparison_page", "describe_comparison"]
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a5a5a")
-_BINS = 10
+_BINS = 10  # more, and most hunts have too few crashes a bin
 _MOST = 200_000  # trials of a hunt that the plots are made from
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b2430; --faint: #5d6b7d; --line: #d9dfe7; --paper: #fff; --back: #f6f7f9; }

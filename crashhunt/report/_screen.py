@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
 
-_LINE_EVERY_S = 5.0
-_LEAST_BAR = 8
+_LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a log of CI
+_LEAST_BAR = 8  # columns; a shorter one says nothing, and the words need the room
 _STYLES = {
     "traffic crash": "bold red",
     "traffic event": "bold yellow",

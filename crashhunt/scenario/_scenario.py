@@ -48,7 +48,7 @@ __all__ = [
     "with_action",
 ]
 
-_STEP_LENGTH_S = 0.1
+_STEP_LENGTH_S = 0.1  # ten decisions a second, as drivers' models are made for
 _ENDINGS = (".toml", ".sumocfg", ".sumo.cfg")
 _TABLES = {"sumo": "net and routes", "highway": "the id of the environment", "gym": "the id of the environment"}
 

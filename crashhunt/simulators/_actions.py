@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["META_ACTIONS", "MetaAction", "SpaceAction", "SpeedAndLaneChange", "cast", "is_masked", "told"]
 
-MAX_TARGET_SPEED = 100.0
+MAX_TARGET_SPEED = 100.0  # m/s; no vehicle is faster, and a space needs an end
 _LONGEST = 200  # characters of an action in a message
 META_ACTIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 """In the order of highway-env's DiscreteMetaAction."""

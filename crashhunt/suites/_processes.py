@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "slots_of", "write_request"]
 
 REQUEST = layout.REQUEST
-_LOOK_EVERY_S = 0.1
-_WATCH_EVERY_S = 1.0
+_LOOK_EVERY_S = 0.1  # at processes that may have ended
+_WATCH_EVERY_S = 1.0  # the table of `suite run --watch`
 _BUSY_S = 15.0  # for the process of an earlier run to leave the directory
 _PR_SET_PDEATHSIG = 1
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["EscapeCheck", "RecordedThenBrakes", "check_escape"]
 
-_NEVER = 10**9
-_AFTERWARDS_S = 10.0
+_NEVER = 10**9  # a step that no episode reaches
+_AFTERWARDS_S = 10.0  # longer than what is checked looks
 
 
 @dataclass(frozen=True, slots=True)

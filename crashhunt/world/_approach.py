@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ApproachMeter", "approaches", "closest_approach"]
 
-_CHUNK = 256
+_CHUNK = 256  # scenes at a time, which costs a tenth of one at a time
 _HORIZON_S = 10.0  # a collision course further ahead than this says nothing
 
 

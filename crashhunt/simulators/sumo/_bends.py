@@ -19,8 +19,8 @@ __all__ = ["Bends", "height_at", "is_articulated"]
 _RAILS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
 _RIGID_M = 15.0  # no longer bus or lorry may be built in one piece (Directive 96/53/EC); what is longer has a joint
 _JOINT_M = 6.0  # between two joints of what has any: a shorter one is drawn as one piece
-_PIECE_M = 5.0
-_STRAIGHT_M = 0.05
+_PIECE_M = 5.0  # a car's length; the corner of a piece in the tightest bend is off by centimetres
+_STRAIGHT_M = 0.05  # off the straight line is as good as straight
 _MISPLACED_M = 1.0  # from its lane; who has been put beside it, with moveToXY, is taken as straight
 
 Point = tuple[float, float]

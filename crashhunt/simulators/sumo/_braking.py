@@ -18,7 +18,7 @@ __all__ = ["HardBraking"]
 
 _LOOKED_INTO = 2.0  # m/s²; a weaker braking is nobody's limit
 _TOLERANCE = 0.01  # m/s²
-_LEADER_M = 100.0
+_LEADER_M = 100.0  # nobody brakes hard for who is further ahead
 
 
 class HardBraking:

@@ -27,8 +27,8 @@ _RED = ("r", "u")  # red, and red with yellow; after a stop, "s" may be passed
 _LINKS_AT_ONCE = 6  # that a vehicle crosses in one long step
 _DIRECTION_EVERY = 10  # steps; how often a vehicle that stays on its lane is asked which way it drives
 _AGAINST = -0.5  # cosine of the angle between a course and a lane
-_SIGHT_M = 150.0
-_CONSEQUENCE_S = 5.0
+_SIGHT_M = 150.0  # a collision further away has nothing to do with the agent
+_CONSEQUENCE_S = 5.0  # after hard braking for the agent, a collision may be its consequence
 
 
 class SumoEvents:

@@ -29,7 +29,7 @@ _LOOK_AROUND_S = 1.0  # in which two that come towards each other do not get thr
 _SIGHT_SQUARED = SIGHT_M**2
 _RADIANS = math.pi / 180.0
 _HEIGHT_EVERY_M = 20.0  # along each lane, to see whether the map is flat
-_FLAT_M = 0.5
+_FLAT_M = 0.5  # a map that rises less has no bridges
 _WITH_PERSONS = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
 """SUMO's types of collision in which the victim is a person, who may have the id of a vehicle."""
 

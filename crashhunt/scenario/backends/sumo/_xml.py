@@ -50,7 +50,7 @@ _NOWHERE = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "S
 _PATTERNS = dict.fromkeys((b"File", b"output", b"dest", b"href"), rb"\s*=")
 _PATTERNS |= {b"file": rb"(?:\s*=|[\"'])", b"<!DOCTYPE": b""}
 _WORTH_PARSING = {word: re.compile(word + rest) for word, rest in _PATTERNS.items()}
-_MAX_BYTES = 10**9
+_MAX_BYTES = 10**9  # of a compressed file, unpacked
 _TAG = re.compile(rb"<[^\s/>]+")
 _ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
