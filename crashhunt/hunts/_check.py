@@ -197,7 +197,7 @@ _GO_ON = "crashhunt check --salvage TO copies what is whole, and the same hunt g
 
 
 def _read_everything(ledger: Ledger) -> None:
-    for rows in (ledger.results(), ledger.table()):
+    for rows in (ledger.results(), ledger.table(), ledger.turns()):
         for _ in rows:
             pass
     for read in (ledger.facts, ledger.events, ledger.replaced, ledger.outcomes, ledger.steps_total):

@@ -81,6 +81,7 @@ def _copy_rows(found: Checked, settings: HuntSettings, to: Path) -> int:
         if found.trials and has_begun(source):
             bundles = {int(name.partition("-")[0]) for name in found.crashes if name.partition("-")[0].isdecimal()}
             with closing(Ledger(source)) as old:
+                ledger.propose(old.intact_turns())
                 for number, row in old.intact_rows(sorted(found.trials)):
                     if row is not None and (row[2] not in settings.crash_on or number in bundles):
                         ledger.copy(row)

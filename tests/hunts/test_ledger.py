@@ -117,17 +117,6 @@ def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
     found.close()
 
 
-def test_a_ledger_of_another_version_is_refused(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    Ledger(path, writable=True).close()
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA user_version = 99")
-    database.close()
-    for writable in (False, True):
-        with pytest.raises(HuntDirectoryError, match="a ledger of version 99"):
-            Ledger(path, writable=writable)
-
-
 def test_a_trial_that_ran_again_counts_once(tmp_path):
     ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
     ledger.record(result(1, Outcome.HANG), snapshot="")
@@ -149,7 +138,11 @@ def test_the_nearest_miss_is_no_crash_and_no_void(tmp_path):
     ledger.close()
 
 
-@given(st.dictionaries(st.text(), st.none() | st.integers() | st.text() | st.lists(st.floats(allow_nan=False))))
+# Not what the ledger says of itself, which Hypothesis knows from its source.
+NAMES = st.text().filter(lambda name: name not in ("seal", "reader"))
+
+
+@given(st.dictionaries(NAMES, st.none() | st.integers() | st.text() | st.lists(st.floats(allow_nan=False))))
 def test_facts_are_kept_and_none_removes_one(tmp_path_factory, facts):
     ledger = Ledger(tmp_path_factory.mktemp("ledger") / "ledger.sqlite", writable=True)
     ledger.note(**dict.fromkeys(facts, "before"))

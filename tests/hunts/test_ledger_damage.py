@@ -112,12 +112,14 @@ def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
 @pytest.mark.parametrize(
     ("statement", "says"),
     [
-        ("ALTER TABLE trials DROP COLUMN digest", "it is not as version 2 is: digest of the table trials"),
+        ("ALTER TABLE trials DROP COLUMN digest", "it is not as version 3 is: digest of the table trials"),
         ("ALTER TABLE hunt DROP COLUMN digest", "digest of the table hunt"),
         ("DROP TABLE events", "without the table events"),
         ("DROP INDEX trials_by_outcome", "no such index"),
         ("PRAGMA user_version = 1", "it is not as version 1 is"),
+        ("PRAGMA user_version = 2", "it is not as version 2 is: with the table proposals"),
         ("PRAGMA user_version = 0", "its version is 0"),
+        ("DROP TABLE proposals", "without the table proposals"),
         ("UPDATE hunt SET value = '61' WHERE key = 'planned'", "a fact is not as it was written"),
         ("UPDATE hunt SET value = replace(value, '15', '16') WHERE key = 'seal'", "its seal is not as it was written"),
         ("UPDATE events SET detail = 'no disk'", "what it says of its states is not as it was written"),
@@ -174,10 +176,12 @@ def test_one_that_was_killed_is_read_whole(tmp_path):
 
 
 def as_version_1(path):
-    """Make of a ledger what crashhunt wrote when rows had no digests."""
+    """Make of a ledger what crashhunt wrote when rows had no digests, and samplers no proposals."""
     change(
         path,
-        "DELETE FROM hunt WHERE key = 'seal'",
+        "DROP TABLE proposals",
+        "DROP INDEX trials_with_events",
+        "DELETE FROM hunt WHERE key IN ('seal', 'reader')",
         *(f"ALTER TABLE {table} DROP COLUMN digest" for table in ("trials", "replaced", "events", "hunt")),
         "PRAGMA user_version = 1",
     )

@@ -1,0 +1,325 @@
+"""What a ledger says; whoever reads a row checks that it is as it was written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.hunts._ledger_file import checked, damaged, explained, plain_trial
+from crashhunt.hunts._ledger_schema import OWN_FACTS, SEAL, WITH_EVENTS
+from crashhunt.trial import TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from crashhunt.hunts._ledger_schema import Shape
+
+__all__ = ["LedgerReader", "Turn"]
+
+_CHUNK = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn with a sampler that learns.
+
+    Args:
+        told: the numbers of the trials whose results it was told, in that order, after its turn before.
+        spec: the trial that it proposed then.
+    """
+
+    told: tuple[int, ...]
+    spec: TrialSpec
+
+
+class LedgerReader:
+    """Answers what a ledger says.
+
+    Args:
+        database: that is open.
+        path: of its file.
+        shape: what its tables have.
+    """
+
+    def __init__(self, database: sqlite3.Connection, path: Path, shape: Shape) -> None:
+        self._database = database
+        self._path = path
+        self._shape = shape
+
+    @property
+    def protected(self) -> bool:
+        """Whether every row has a digest; the earliest ledgers had none."""
+        return self._shape.protected
+
+    @property
+    def sealed(self) -> bool:
+        """Whether whoever wrote last has closed it."""
+        return self._seal() is not None
+
+    def events(self) -> list[tuple[float, str, str]]:
+        """Return when the hunt got into which state, and why."""
+        seal = self._seal()
+        rows = list(self._select(f"{self._shape.select('events')} ORDER BY rowid"))
+        self._compare_seal(seal, "events", len(rows))
+        return [self._checked(row, "what it says of its states")[:3] for row in rows]
+
+    def replaced(self) -> list[TrialResult]:
+        """Return the trials that ran again, as they were."""
+        seal = self._seal()
+        rows = list(self._select(f"{self._shape.select('replaced')} ORDER BY rowid"))
+        self._compare_seal(seal, "replaced", len(rows))
+        return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
+
+    def turns(self) -> Iterator[Turn]:
+        """Yield what a sampler that learns has proposed, in order; nothing for any other.
+
+        Raises:
+            HuntDirectoryError: something of it is not as it was written, or missing; what was before was yielded.
+        """
+        if not self._proposing:
+            return
+        seal, count = self._seal(), 0
+        for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn"):
+            count += 1
+            yield self._turn(row)
+        self._compare_seal(seal, "proposals", count)
+
+    def intact_turns(self) -> list[Turn]:
+        """Return those that are as they were written, whatever has become of the others."""
+        found: list[Turn] = []
+        try:
+            for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn") if self._proposing else ():
+                try:
+                    found.append(self._turn(row))
+                except HuntDirectoryError:
+                    continue
+        except HuntDirectoryError:  # the table cannot be read on
+            pass
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts about the hunt itself."""
+        seal = self._seal()
+        rows = [self._checked(row, "a fact") for row in self._select(self._shape.select("hunt"))]
+        self._compare_seal(seal, "facts", sum(row[0] != SEAL for row in rows))
+        try:
+            return {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS}
+        except (ValueError, TypeError, RecursionError) as error:
+            raise damaged(self._path, f"a fact cannot be read: {error}") from None
+
+    def finished(self) -> set[int]:
+        """Return the numbers of the trials that have ended."""
+        return {number for (number,) in self._select("SELECT number FROM trials")}
+
+    def outcomes(self) -> dict[str, int]:
+        """Return how many trials ended how."""
+        seal = self._seal()
+        found = self._outcomes()
+        self._compare_seal(seal, "outcomes", found)
+        return found
+
+    def traffic_events(self) -> dict[str, tuple[int, int]]:
+        """Return how many traffic events of each kind there were, and in how many trials."""
+        rows = self._select(
+            "SELECT event.key, sum(event.value), count(*) FROM trials, "
+            f"json_each(iif(json_valid(result), result, '{{}}'), '$.events') AS event "
+            f"WHERE {WITH_EVENTS} GROUP BY event.key"
+        )
+        return {kind: (count, trials) for kind, count, trials in rows}
+
+    def steps_total(self) -> int:
+        """Return how many steps were run in all."""
+        seal = self._seal()
+        found = self._steps()
+        self._compare_seal(seal, "steps", found)
+        return found
+
+    def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
+        """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
+        return map(self._result, self.plain_results(outcomes=outcomes))
+
+    def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the same as plain data, which takes a third of the time.
+
+        Raises:
+            HuntDirectoryError: a trial is not as it was written, or one is missing; those before were yielded.
+        """
+        where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
+        seal, count = self._seal(), 0
+        for row in self._select(f"{self._shape.select('trials')} {where} ORDER BY number", outcomes):
+            count += 1
+            yield self._plain(row)
+        if seal is not None:
+            said = {name: number for name, number in seal["outcomes"].items() if not outcomes or name in outcomes}
+            if count != sum(said.values()) and self._seal() == seal:
+                raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
+
+    def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, tuple[Any, ...] | None]]:
+        """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
+        for number in numbers:
+            try:
+                row = self._row(number)
+                if row is not None:
+                    self._plain(row)
+                    yield number, row[:11]
+            except HuntDirectoryError:
+                yield number, None
+
+    def check_pages(self) -> None:
+        """Have SQLite look at the file.
+
+        Raises:
+            HuntDirectoryError: it is damaged.
+        """
+        for (found,) in self._select("PRAGMA integrity_check(1)"):
+            if found != "ok":
+                raise damaged(self._path, " ".join(str(found).split()))
+
+    def result(self, number: int) -> TrialResult | None:
+        """Return one trial, or None where it has not ended."""
+        row = self._row(number)
+        if row is None:
+            self.outcomes()  # which finds out whether one is missing
+            return None
+        return self._result(self._plain(row))
+
+    def result_text(self, number: int) -> str | None:
+        """Return one trial as it is written, or None where it has not ended."""
+        row = self._row(number)
+        return None if row is None else str(self._plain(row) and row[10])
+
+    def snapshot_of(self, number: int) -> str:
+        """Return the digest of the snapshot that a trial ran from."""
+        row = self._row(number)
+        return str(self._plain(row) and row[9]) if row else ""
+
+    def nearest_miss(self) -> TrialResult | None:
+        """Return the trial that did not crash and came nearest to it, by time to collision."""
+        least = [
+            row
+            for outcome in ("survived", "finished")
+            for row in self._select(
+                "SELECT time_to_collision_s, number FROM trials WHERE outcome = ? AND time_to_collision_s IS NOT NULL "
+                "ORDER BY time_to_collision_s, number LIMIT 1",
+                (outcome,),
+            )
+        ]
+        return self.result(min(least)[1]) if least else None
+
+    def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
+        """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.
+
+        Raises:
+            HuntDirectoryError: they are not as they were written; they were yielded all the same.
+        """
+        seal = self._seal()
+        if seal is None:  # without one, only the whole rows say whether they are as they were written
+            for row in self._select(f"{self._shape.select('trials')} ORDER BY number"):
+                self._plain(row)
+                yield row[:5]
+            return
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+            yield from rows
+        self._compare_seal(seal, "table", said.hexdigest())
+
+    def last_ended_at(self) -> float | None:
+        """Return when the last trial ended, in s since the epoch; None where none has."""
+        row = next(self._select(f"{self._shape.select('trials')} ORDER BY number DESC LIMIT 1"), None)
+        return float(row[8]) if row and self._plain(row) else None
+
+    def _select(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        try:
+            for row in self._database.execute(query, values):  # noqa: UP028 - it would close the cursor, maybe too late
+                yield row
+        except sqlite3.Error as error:  # also in the middle of a file that is damaged
+            raise explained(self._path, error) from error
+
+    def _row(self, number: int) -> tuple[Any, ...] | None:
+        return next(self._select(f"{self._shape.select('trials')} WHERE number = ?", (number,)), None)
+
+    def _checked(self, row: tuple[Any, ...], what: str) -> tuple[Any, ...]:
+        return checked(row, what, self._path) if self.protected else row
+
+    def _plain(self, row: tuple[Any, ...]) -> dict[str, Any]:
+        return plain_trial(self._checked(row, f"trial {row[0]}"), self._path, trusted=self.protected)
+
+    def _result(self, data: dict[str, Any]) -> TrialResult:
+        try:
+            return TrialResult.from_json(data)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(self._path, f"a trial cannot be read: {type(error).__name__}: {error}") from None
+
+    @property
+    def _proposing(self) -> bool:
+        return "proposals" in self._shape.columns
+
+    def _turn(self, row: tuple[Any, ...]) -> Turn:
+        try:
+            _, _, told, spec, *_ = self._checked(row, f"the proposal of trial {row[1]}")
+            return Turn(tuple(json.loads(told)), TrialSpec.from_json(json.loads(spec)))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(self._path, f"a proposal cannot be read: {type(error).__name__}: {error}") from None
+
+    def _seal(self) -> dict[str, Any] | None:
+        if not self.protected:
+            return None
+        row = next(self._select(f"{self._shape.select('hunt')} WHERE key = ?", (SEAL,)), None)
+        if row is None:
+            return None
+        found: dict[str, Any] = json.loads(self._checked(row, "its seal")[1])
+        return found
+
+    def _make_seal(self) -> dict[str, Any]:
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+        return {
+            "outcomes": self._outcomes(),
+            "steps": self._steps(),
+            "table": said.hexdigest(),
+            "events": self._count("events"),
+            "replaced": self._count("replaced"),
+            "proposals": self._count("proposals") if self._proposing else 0,
+            "facts": self._count(f"hunt WHERE key <> '{SEAL}'"),
+        }
+
+    def _fits(self, seal: Mapping[str, Any]) -> bool:
+        """Whether what is there is what was sealed, by a version that knew less or more, too."""
+        found = self._make_seal()
+        return all(found[name] == seal[name] for name in found.keys() & seal.keys())
+
+    def _compare_seal(self, seal: dict[str, Any] | None, name: str, found: object) -> None:
+        # A writer may have come meanwhile; then it is another seal, or none. One of before may say less.
+        if seal is not None and found != seal.get(name, found) and self._seal() == seal:
+            raise damaged(self._path, f"{name} are not those that were written")
+
+    def _outcomes(self) -> dict[str, int]:
+        return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+
+    def _count(self, table: str) -> int:
+        return int(next(self._select(f"SELECT count(*) FROM {table}"))[0])
+
+    def _steps(self) -> int:
+        return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
+
+    def _chunks(self) -> Iterator[list[tuple[Any, ...]]]:
+        try:
+            cursor = self._database.execute(
+                "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
+                "ORDER BY outcome, time_to_collision_s, number"
+            )
+            while rows := cursor.fetchmany(_CHUNK):
+                yield rows
+        except sqlite3.Error as error:
+            raise explained(self._path, error) from error
+
+
+def _as_text(rows: list[tuple[Any, ...]]) -> bytes:
+    return "".join(map(repr, rows)).encode()

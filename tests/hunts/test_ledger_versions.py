@@ -1,0 +1,167 @@
+"""Ledgers of other versions: those of before are read and gone on with, those of later are read where they allow it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from crashhunt.base.integrity import digest_of_row
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import Ledger
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
+
+# Every version of the tables leaves one here, written by the crashhunt of then: `write` is what was called.
+FROZEN = sorted((Path(__file__).parent / "ledgers").glob("version-*.sqlite"))
+OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.FINISHED, Outcome.INVALID)
+EVENTS = {2: {"running_a_red_light": 2, "emergency_braking": 1}, 6: {"running_a_red_light": 6, "emergency_braking": 1}}
+
+
+def result(number, *, events=True):
+    spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5 + number}}, {"vehicles": number}, max_steps=20)
+    closest = ClosestApproach(number / 3, 1.0, 2.0) if number % 3 else ClosestApproach()
+    some = {"events": EVENTS[number]} if events and number in EVENTS else {}
+    digest = f"{number:032x}"
+    return TrialResult(spec, OUTCOMES[number % 4], steps=number, wall_s=0.125, closest=closest, digest=digest, **some)
+
+
+def write(path):
+    with closing(Ledger(path, writable=True)) as ledger:
+        ledger.enter("running", owner=None, planned=12, hunt_seed=5)
+        for number in range(10):
+            ledger.record(result(number), snapshot="0123456789abcdef")
+        ledger.replace([3])
+        ledger.enter("interrupted", "by somebody")
+
+
+@pytest.fixture
+def copy(request, tmp_path):
+    shutil.copy(request.param, tmp_path / "ledger.sqlite")
+    return tmp_path / "ledger.sqlite"
+
+
+def version(path):
+    with closing(sqlite3.connect(path)) as database:
+        return database.execute("PRAGMA user_version").fetchone()[0]
+
+
+def check(ledger, frozen):
+    """See that a ledger says what was written."""
+    trials = [result(number, events=frozen > 1) for number in range(10)]
+    gone = trials.pop(3)
+    assert list(ledger.results()) == trials
+    assert ledger.replaced() == [gone]
+    assert ledger.facts() == {"planned": 12, "hunt_seed": 5, "state": "interrupted", "detail": "by somebody"}
+    assert [event[1:] for event in ledger.events()] == [("running", ""), ("interrupted", "by somebody")]
+    assert ledger.outcomes() == {"collision": 3, "finished": 2, "invalid": 1, "survived": 3}
+    assert ledger.steps_total() == 42
+    assert ledger.snapshot_of(4) == "0123456789abcdef"
+    assert ledger.traffic_events() == (
+        {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)} if frozen > 1 else {}
+    )
+    assert sorted(row[0] for row in ledger.table()) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert list(ledger.turns()) == []
+
+
+@pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
+def test_a_ledger_of_before_is_read_as_it_is_and_goes_on_as_one_of_today(copy, tmp_path):
+    frozen = version(copy)
+    was = copy.read_bytes()
+    with closing(Ledger(copy)) as ledger:
+        check(ledger, frozen)
+        assert ledger.protected == (frozen > 1)
+    assert copy.read_bytes() == was
+    Ledger(copy, writable=True).close()
+    write(tmp_path / "new.sqlite")
+    assert version(copy) == version(tmp_path / "new.sqlite")
+    with closing(Ledger(copy)) as ledger:
+        check(ledger, frozen)
+        assert ledger.protected
+        assert ledger.sealed
+    with closing(Ledger(copy, writable=True)) as ledger:
+        ledger.record(result(3), snapshot="")
+        assert ledger.finished() == set(range(10))
+    assert _plan(copy) == _plan(tmp_path / "new.sqlite")
+
+
+def _plan(path):
+    """How the trials with traffic events are found."""
+    with closing(sqlite3.connect(path)) as database:
+        query = """SELECT number FROM trials WHERE instr(result, '"events": {"') > 0"""
+        return [row[-1] for row in database.execute(f"EXPLAIN QUERY PLAN {query}")]
+
+
+def test_trials_with_traffic_events_are_found_without_reading_the_others(tmp_path):
+    write(tmp_path / "new.sqlite")
+    assert _plan(tmp_path / "new.sqlite") == ["SCAN trials USING INDEX trials_with_events"]
+
+
+@pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
+def test_a_migration_that_fails_leaves_the_ledger_as_it_was(copy, monkeypatch):
+    from crashhunt.hunts import _migrations
+
+    def fail(database):
+        database.execute("CREATE TABLE half (number)")
+        raise sqlite3.OperationalError("database or disk is full")
+
+    was = version(copy)
+    last = max(_migrations.MIGRATIONS)
+    if was > last:
+        return
+    monkeypatch.setitem(_migrations.MIGRATIONS, last, fail)
+    with pytest.raises(HuntDirectoryError, match="the disk is full"):
+        Ledger(copy, writable=True)
+    assert version(copy) == was
+    with closing(Ledger(copy)) as ledger:
+        check(ledger, was)
+
+
+def newer(path, *, reader):
+    """Make of a ledger what a later version might write: a table, a column and a fact that nobody here knows."""
+    with closing(Ledger(path)) as ledger:
+        seal = ledger._seal()
+    with closing(sqlite3.connect(path)) as database, database:
+        database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
+        database.execute("CREATE TABLE dangers (number INTEGER, danger REAL)")
+        database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
+        names = [name for _, name, *_ in database.execute("PRAGMA table_info(trials)") if name != "digest"]
+        database.execute("UPDATE trials SET danger = 0.5")
+        database.execute(f"UPDATE trials SET digest = digest_of_row({', '.join(names)})")
+        facts = {"seal": {**seal, "dangers": 3, "facts": seal["facts"] + 1}, "reader": reader, "climate": "warm"}
+        for key, value in facts.items():
+            row = (key, json.dumps(value))
+            database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
+        database.execute("PRAGMA user_version = 99")
+
+
+def test_a_ledger_of_later_is_read_where_it_says_so_and_never_written(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    write(path)
+    today = version(path)
+    newer(path, reader=today)
+    with closing(Ledger(path)) as ledger:
+        assert ledger.facts()["climate"] == "warm"
+        assert ledger.outcomes() == {"collision": 3, "finished": 2, "invalid": 1, "survived": 3}
+        assert [trial.spec.number for trial in ledger.results()] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+        assert ledger.result(4) == result(4)
+        assert len(list(ledger.table())) == 9
+    with pytest.raises(HuntDirectoryError, match=f"a ledger of version 99, and this crashhunt writes version {today}"):
+        Ledger(path, writable=True)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE trials SET danger = 0.4 WHERE number = 4")
+    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
+        list(ledger.results())
+
+
+def test_a_ledger_of_later_that_asks_for_more_is_refused(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    write(path)
+    newer(path, reader=98)
+    for writable in (False, True):
+        with pytest.raises(HuntDirectoryError, match="of version 99, and this crashhunt reads the versions up to"):
+            Ledger(path, writable=writable)
