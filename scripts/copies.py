@@ -143,6 +143,7 @@ class Slot:
 
     def _child(self, arguments: list[str], seconds: float, watcher: Watcher | None) -> int:
         os.setsid()
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 10))
         for what, most in ((resource.RLIMIT_FSIZE, 2 << 30), (resource.RLIMIT_AS, 8 << 30)):
             resource.setrlimit(what, (most, resource.getrlimit(what)[1]))  # a slip may take without an end

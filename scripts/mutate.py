@@ -17,6 +17,7 @@ import importlib
 import json
 import os
 import random
+import signal
 import sys
 import tempfile
 import time
@@ -225,6 +226,8 @@ def parsed() -> argparse.Namespace:
 def main() -> int:
     """Run, and return 1 where too many slips of a package survive."""
     options = parsed()
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell has started it in the background
+        signal.signal(number, signal.default_int_handler)
     verdicts: list[Verdict] = []
     asked = options.module or DEFAULT
     everything = {name: targets_of(name, options.tests) for name in asked}

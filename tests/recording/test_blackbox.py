@@ -99,6 +99,15 @@ def test_every_record_is_read_as_it_was_written(box, tmp_path):
     assert bytes(box.committed())[8:] == b"\1\2\3" + bytes(5)
 
 
+def test_the_numbers_on_disk_stay_what_they_are():
+    """Digests run over them, and logs that were written before have them."""
+    assert [(tag.name, tag.value) for tag in Tag] == [
+        ("PROLOGUE", 1), ("ACTORS", 2), ("ROSTER", 3), ("OBSERVATION", 4), ("ACTION", 5), ("STEP", 6), ("LANES", 7),
+        ("EVENTS", 8), ("HEIGHTS", 9), ("SPINES", 10), ("NOTES", 11),
+    ]  # fmt: skip
+    assert [(phase.name, phase.value) for phase in Phase] == [("SETUP", 0), ("ACT", 1), ("SIMULATE", 2), ("DONE", 3)]
+
+
 def test_an_incomplete_record_is_left_out():
     whole = Record(Tag.LANES, 0, b"12345").encode() + Record(Tag.EVENTS, 1, b"{}").encode()
     assert [record.tag for record in decode_records(whole)] == [Tag.LANES, Tag.EVENTS]
