@@ -266,7 +266,7 @@ class _Path:
     """A driven path, and its straight continuation."""
 
     def __init__(self, poses: list[tuple[float, float, float]]) -> None:
-        self._poses = np.array(poses)
+        self._poses = np.array(poses).reshape(-1, 3)
         lengths = np.hypot(*np.diff(self._poses[:, :2], axis=0).T)
         self.distances = [0.0, *np.cumsum(lengths).tolist()]
 

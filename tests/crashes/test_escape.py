@@ -1,0 +1,212 @@
+"""The search for the last escape: which trials it runs, and what it makes of their endings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.crashes import find_escape, partner
+from crashhunt.recording import Prologue, StepRecord
+from crashhunt.simulators import FullBraking
+from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
+from crashhunt.world import Actor, Roster, Scene
+
+ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "passenger", 5.0, 2.0)))
+DT = 0.5
+SPEC = TrialSpec(1, 2, {"ego": {}}, {}, max_steps=100)
+HIT = Collision("ego", "collider", "ego", "other", ("overlap",))
+
+
+class World:
+    """The ego drives at 20 m/s at a wall of a car, and may brake; every run is a recording of it.
+
+    Args:
+        gap: at the beginning, in m.
+        braking: that the ego really has.
+        change: what else becomes of a run, from a result and its scenes.
+    """
+
+    def __init__(self, gap=90.0, braking=8.0, change=None):
+        self.gap, self.braking, self.change = gap, braking, change
+        self.runs = []
+
+    def drive(self, after, max_steps):
+        x, speed, scenes = 0.0, 20.0, []
+        for step in range(max_steps + 1):
+            if step:
+                if after is not None and step > after:
+                    speed = max(0.0, speed - self.braking * DT)
+                x += speed * DT
+            scenes.append(Scene(step * DT, ROSTER, [(x, 0.0), (self.gap + 5.0, 0.0)], [0.0, 0.0], [speed, 0.0]))
+            if x > self.gap:
+                return scenes, True
+        return scenes, False
+
+    def recording(self, scenes):
+        steps = [StepRecord(number, scene) for number, scene in enumerate(scenes)]
+        found = SimpleNamespace(all_steps=steps, prologue=Prologue((), DT), steps=len(scenes) - 1)
+        found.scene = lambda step: scenes[step]
+        found.scenes = lambda: scenes
+        return found
+
+    def crash(self):
+        scenes, _ = self.drive(None, 60)
+        result = TrialResult(SPEC, Outcome.COLLISION, steps=len(scenes) - 1, collision=HIT)
+        return result, self.recording(scenes)
+
+    def run(self, spec):
+        self.runs.append(spec.overruled.after)
+        self.last = spec
+        scenes, hit = self.drive(spec.overruled.after, spec.max_steps)
+        result = TrialResult(
+            spec, Outcome.COLLISION if hit else Outcome.SURVIVED, steps=len(scenes) - 1, collision=HIT if hit else None
+        )
+        if self.change is not None:
+            result, scenes = self.change(result, scenes)
+        return result, self.recording(scenes)
+
+    def escape(self, said=8.0, how="with its brakes"):
+        return find_escape(*self.crash(), FullBraking(None, how, said), self.run)
+
+    def truth(self):
+        """The last step after which braking helps, tried one by one."""
+        end = self.crash()[0].steps
+        helps = [after for after in range(end) if not self.drive(after, end + 60)[1]]
+        return max(helps, default=None)
+
+
+@pytest.mark.parametrize("gap", [60.0, 75.0, 90.0, 103.0])
+@pytest.mark.parametrize("said", [8.0, 5.0, 12.0, None])
+def test_the_answer_is_where_one_more_step_is_too_many(gap, said):
+    world = World(gap)
+    found = world.escape(said)
+    assert found.step == world.truth()
+    assert found.too_late == found.step + 1
+    assert {found.step, found.too_late} <= set(world.runs)
+    assert len(world.runs) == len(set(world.runs)) <= 12
+    assert found.braking == pytest.approx(8.0)
+    expected = (
+        "at 8 m/s², with its brakes," if said == 8.0 else "with its brakes" if said is None else "as hard as it can"
+    )
+    assert found.how == expected
+
+
+def test_a_run_goes_on_for_as_long_as_stopping_takes():
+    world = World()
+    world.escape(said=4.0)
+    assert world.last.max_steps == world.crash()[0].steps + math.ceil((5.0 + 20 / 4.0) / DT)
+    assert world.last.overruled.agent == "ego"
+    assert (world.last.seed, world.last.arguments) == (SPEC.seed, SPEC.arguments)
+    world.escape(said=None)
+    assert world.last.max_steps == world.crash()[0].steps + math.ceil((5.0 + 20 / 4.5) / DT)
+
+
+def test_brakes_that_never_help_or_always_do():
+    none = World(gap=30.0, braking=2.0)  # 100 m to stop
+    found = none.escape(said=2.0)
+    assert (found.step, found.too_late) == (None, 0)
+    assert found.braking == pytest.approx(2.0)
+    always = World(gap=25.0, braking=60.0)
+    found = always.escape(said=60.0)
+    assert found.step == always.truth() == always.crash()[0].steps - 1
+    assert found.too_late is None  # after the step of the crash it is too late by itself
+    assert World(braking=0.0).escape(said=8.0).braking is None
+
+
+def test_nobody_asks_what_was_longer_than_ten_seconds_ago():
+    world = World(gap=300.0, braking=0.6)  # 333 m to stop, and 15 s to the crash
+    found = world.escape(said=0.6)
+    assert found.step is None
+    assert found.too_late == world.crash()[0].steps - 20 == min(world.runs)
+
+
+def unclear(change):
+    return World(change=change).escape()
+
+
+def test_what_the_runs_do_not_say_clearly_is_not_said():
+    def ending(**changes):
+        return lambda result, scenes: (dataclasses.replace(result, **changes), scenes)
+
+    assert unclear(ending(outcome=Outcome.AGENT_ERROR)) is None
+    another = dataclasses.replace(HIT, victim="third")
+    assert unclear(ending(outcome=Outcome.COLLISION, collision=another)) is None
+    assert unclear(ending(outcome=Outcome.COLLISION, collision=None)) is None
+
+    def otherwise(result, scenes):
+        scenes[0].points[1] = (1.0, 1.0)
+        return result, scenes
+
+    assert unclear(otherwise) is None
+    assert unclear(lambda result, scenes: (result, scenes[:2])) is None
+
+    def still_closing(result, scenes):  # the episode ended before the danger had passed
+        return result, scenes[:-18] if result.outcome is Outcome.SURVIVED else scenes
+
+    assert unclear(still_closing) is None
+
+
+def test_danger_is_over_where_one_has_left_or_they_part():
+    alone = Roster(ROSTER.actors[:1])
+    gone = Roster(ROSTER.actors[1:])
+
+    def without(roster):
+        def change(result, scenes):
+            if result.outcome is Outcome.SURVIVED:
+                end = scenes[-1]
+                row = ROSTER.index[roster.actors[0].id]
+                scenes[-1] = Scene(end.time_s, roster, [end.points[row]], [0.0], [9.0])
+            return result, scenes
+
+        return change
+
+    world = World()
+    for roster in (alone, gone):
+        assert World(change=without(roster)).escape().step == world.truth()
+
+    def parting(result, scenes):
+        if result.outcome is Outcome.SURVIVED:
+            scenes[-1].speeds[1] = 30.0
+            scenes[-1].speeds[0] = 5.0
+        return result, scenes
+
+    def closing(result, scenes):
+        if result.outcome is Outcome.SURVIVED:
+            scenes[-1].speeds[0] = 5.0
+        return result, scenes
+
+    assert World(change=parting).escape().step == world.truth()
+    assert World(change=closing).escape() is None
+    finished = World(change=lambda result, scenes: (
+        dataclasses.replace(result, outcome=Outcome.FINISHED) if result.outcome is Outcome.SURVIVED else result, scenes
+    ))  # fmt: skip
+    assert finished.escape().step == world.truth()
+
+
+def test_other_crashes_have_none():
+    world = World()
+    result, recording = world.crash()
+    braking = FullBraking(None, "", 8.0)
+    for changes in (
+        {"outcome": Outcome.OFF_ROAD},
+        {"collision": None},
+        {"collision": dataclasses.replace(HIT, role="victim")},
+        {"collision": dataclasses.replace(HIT, role="alone", victim="")},
+    ):
+        assert find_escape(dataclasses.replace(result, **changes), recording, braking, world.run) is None
+    stranger = dataclasses.replace(HIT, victim="never seen")
+    assert find_escape(dataclasses.replace(result, collision=stranger), recording, braking, world.run) is None
+    assert world.runs == []
+
+
+def test_the_partner_is_the_other_one():
+    def of(**changes):
+        return partner(TrialResult(SPEC, Outcome.COLLISION, collision=dataclasses.replace(HIT, **changes)))
+
+    assert of() == "other"
+    assert of(role="victim", collider="other", victim="ego") == "other"
+    assert of(role="alone") == ""
+    assert partner(TrialResult(SPEC, Outcome.COLLISION)) == ""
