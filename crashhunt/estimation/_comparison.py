@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["Comparison", "HuntFigures", "Pair", "compare"]
 
 _CONFIDENCE = 0.95
-_INDEPENDENT = ("random",)  # samplers that draw every trial independently of the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +217,7 @@ def _figures(hunt: HuntResults, table: NDArray[Any]) -> HuntFigures:
 
 def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
     settings = hunt.settings
-    if settings.sampler not in _INDEPENDENT:
+    if not hunt.independent:
         return f"the sampler {settings.sampler} does not draw trials independently"
     if crashes and not settings.run.keep_going:
         return "it stopped at its first crash, and the rate of such a hunt is too high; use --keep-going"
@@ -236,7 +235,7 @@ def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: ND
     why_not = "" if same.any() else "they have no seed in common: run both with the same --seed"
     if not why_not:
         why_not = _other_traffic(first.settings, second.settings)
-        if not why_not and not _same_draws(first.settings, second.settings):
+        if not why_not and not _same_draws(first, second):
             same &= _same_arguments(first, second, left["number"])
             why_not = "" if same.any() else "they have other values of the scenario's arguments with the same seeds"
         if why_not:
@@ -283,11 +282,12 @@ def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
     return ""
 
 
-def _same_draws(one: HuntSettings, other: HuntSettings) -> bool:
+def _same_draws(first: HuntResults, second: HuntResults) -> bool:
     """Whether it is sure that trials of the same number and seed have the same scenario arguments."""
-    if all(isinstance(spec.distribution, Constant) for spec in one.scenario_arguments.values()):
+    if all(isinstance(spec.distribution, Constant) for spec in first.settings.scenario_arguments.values()):
         return True
-    return one.sampler == other.sampler == "random"  # which draws them before any agent's
+    # Independent samplers draw them before any agent's.
+    return first.settings.sampler == second.settings.sampler and first.independent and second.independent
 
 
 def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[Any]) -> NDArray[Any]:

@@ -6,11 +6,10 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
-from crashhunt.base.plugins import locate
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
@@ -21,21 +20,22 @@ from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._preflight import Preflight
 from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
-from crashhunt.hunts._state import this_process
-from crashhunt.plans import spec_of, with_settings
+from crashhunt.hunts._state import draws_independently, this_process
+from crashhunt.hunts._trials import LAG, Trials
+from crashhunt.plans import with_settings
 from crashhunt.replays import confirm
+from crashhunt.samplers import NamedSampler
 from crashhunt.scenario.backends.sumo import explained
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import BlackBoxHeader
-    from crashhunt.samplers import Sampler
     from crashhunt.scenario import Scenario
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
@@ -125,7 +125,7 @@ class Hunt:
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
         snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
-        sampler: Sampler = locate("samplers", settings.sampler)(settings.space, points=settings.points)
+        sampler = NamedSampler(settings.sampler, settings.space, points=settings.points)
         progress = Progress()
         finished = ledger.finished()
         for bundle in list_bundles(self.directory):
@@ -135,8 +135,9 @@ class Hunt:
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         progress.crashes = list_bundles(self.directory)
-        for result in ledger.results() if sampler.learns else ():
-            self._teach(result, sampler, progress)
+        before = ledger.facts()
+        lag = self._lag(before)
+        trials = Trials(settings, sampler, ledger, finished, lag=lag)
         ledger.enter(
             "running",
             owner=this_process(),
@@ -145,12 +146,14 @@ class Hunt:
             heartbeat=time.time(),
             planned=settings.trials,
             hunt_seed=settings.seed,
+            independent=sampler.independent and (not finished or draws_independently(before, settings)),
+            lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         stopped: StoppedBecause | None = None
         if progress.crashes and not settings.run.keep_going:
             stopped = "crash"
         if stopped is None:
-            stopped = self._hunt(ledger, sampler, snapshot, progress, finished, watch)
+            stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
         watch(self._status(progress, "done"))
@@ -177,7 +180,7 @@ class Hunt:
     def _hunt(
         self,
         ledger: Ledger,
-        sampler: Sampler,
+        trials: Trials,
         snapshot: Snapshot,
         progress: Progress,
         finished: set[int],
@@ -197,7 +200,6 @@ class Hunt:
             audit=run.audit,
             hunt_seed=settings.seed,
         )
-        waiting = iter(number for number in range(settings.trials) if number not in finished)
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))
         executor = PoolExecutor(worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         preflight = Preflight(
@@ -209,18 +211,15 @@ class Hunt:
         try:
             while True:
                 stopping = bool(progress.found)
-                while not stopping and len(in_flight) < run.parallel * (1 + _QUEUED_PER_WORKER):
-                    number = next(waiting, None)
-                    if number is None:
-                        break
-                    executor.submit(spec_of(number, settings, sampler))
-                    in_flight.add(number)
+                for spec in [] if stopping else trials.take(self._capacity - len(in_flight)):
+                    executor.submit(spec)
+                    in_flight.add(spec.number)
                 if not in_flight:
                     break
                 for result in executor.completed(_TICK_S):
                     in_flight.discard(result.spec.number)
                     for known in preflight.sift(audit.add(result)):
-                        self._take(known, ledger, snapshot, sampler, progress)
+                        self._take(known, ledger, snapshot, trials, progress)
                     if result.outcome in settings.crash_on and not run.keep_going:
                         above = min(progress.found) if run.deterministic else -1
                         executor.cancel(above=above)
@@ -263,6 +262,17 @@ class Hunt:
             return "no_valid_trial"
         return "all_trials"
 
+    @property
+    def _capacity(self) -> int:
+        """How many trials are under way at once."""
+        return self.settings.run.parallel * (1 + _QUEUED_PER_WORKER)
+
+    def _lag(self, before: Mapping[str, Any]) -> int:
+        """By how many trials a sampler that learns is told late."""
+        if not self.settings.run.deterministic:
+            return self._capacity
+        return int(before.get("lag") or max(LAG, self._capacity))
+
     def _listen(
         self, executor: PoolExecutor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
@@ -287,11 +297,11 @@ class Hunt:
             progress.notes.append(note)
 
     def _take(
-        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, sampler: Sampler, progress: Progress
+        self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, trials: Trials, progress: Progress
     ) -> None:
         """Account for a trial that has ended."""
         settings = self.settings
-        self._teach(result, sampler, progress)
+        trials.ended(result)
         progress.ended_here += 1
         progress.outcomes[str(result.outcome)] += 1
         if result.outcome in settings.crash_on:
@@ -309,15 +319,6 @@ class Hunt:
         if result.kept:
             write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
-
-    def _teach(self, result: TrialResult, sampler: Sampler, progress: Progress) -> None:
-        """Tell a sampler that learns how trials ended, in the order of their numbers."""
-        if not sampler.learns:
-            return
-        progress.untold[result.spec.number] = result
-        while progress.next_told in progress.untold:
-            sampler.tell(progress.untold.pop(progress.next_told))
-            progress.next_told += 1
 
     def _save(self, result: TrialResult, ledger: Ledger, snapshot: Snapshot, progress: Progress) -> None:
         """Save a crash: first the bundle, then the row, so that a crash in the ledger always has its bundle."""

@@ -108,7 +108,5 @@ class Progress:
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     nearest: TrialResult | None = None
     last_invalid: TrialResult | None = None
-    untold: dict[int, TrialResult] = field(default_factory=dict)  # that the sampler has not been told yet
-    next_told: int = 0
     notes: list[str] = field(default_factory=list)
     audit: AuditReport | None = None

@@ -17,7 +17,7 @@ from crashhunt.base.names import one_of
 from crashhunt.crashes import Bundle, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._ledger import Ledger, has_begun
-from crashhunt.hunts._state import HuntState, find_hunts, hunt_state
+from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
 from crashhunt.plans import HuntSettings, read_settings, with_settings
 from crashhunt.snapshots import Snapshot, latest_snapshot
 from crashhunt.trial import EVENTS
@@ -37,6 +37,7 @@ FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
     "wall_s", "digest", *map(str, EVENTS),
 )  # fmt: skip
+_ORIGINS = ("parent", "origin")  # of trials that a sampler made of others, or by one of several strategies
 
 
 class UnfinishedWarning(UserWarning):
@@ -84,6 +85,18 @@ class HuntResults:
             )
         return settings
 
+    @cached_property
+    def independent(self) -> bool:
+        """Whether every trial was drawn independently of the others, so that the rate of crashes means something."""
+        with closing(self._ledger()) as ledger:
+            return draws_independently(ledger.facts(), self.settings)
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing."""
+        with closing(self._ledger()) as ledger:
+            return (*columns_of(self.settings), *(_ORIGINS if ledger.facts().get("origins") else ()))
+
     @property
     def crashes(self) -> list[Bundle]:
         """What was found, in order of the trials; `Bundle.recording` has the arrays."""
@@ -101,7 +114,7 @@ class HuntResults:
 
     def rows(self, *, outcomes: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
         """Yield the trials as rows of the table that `trials` returns."""
-        names = columns_of(self.settings)
+        names = self.columns
         with closing(self._ledger()) as ledger:
             for data in ledger.plain_results(outcomes=tuple(outcomes)):
                 yield _row(data, names)
@@ -129,7 +142,7 @@ class HuntResults:
         Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A number that
         there is none of is NaN.
         """
-        names = columns_of(self.settings)
+        names = self.columns
         columns: dict[str, list[Any]] = {name: [] for name in names}
         for row in self.rows():
             for name, value in row.items():
@@ -223,7 +236,14 @@ def columns_of(settings: HuntSettings) -> tuple[str, ...]:
 def _row(data: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
     """A trial as a row of the table; None where it has no such value."""
     spec = data["spec"]
-    values = {**data, **data["closest"], "number": spec["number"], "seed": spec["seed"]}
+    values = {
+        **data,
+        **data["closest"],
+        "number": spec["number"],
+        "seed": spec["seed"],
+        "parent": spec.get("parent"),
+        "origin": spec.get("origin", ""),
+    }
     events = data.get("events")
     if events is not None:  # somebody has looked for them
         values |= {**dict.fromkeys(EVENTS, 0), **events}

@@ -9,7 +9,7 @@ import time
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
@@ -18,7 +18,12 @@ from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._ledger_file import damaged
 from crashhunt.trial import Outcome
 
-__all__ = ["HuntState", "State", "find_hunts", "hunt_state", "is_hunt", "this_process"]
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.plans import HuntSettings
+
+__all__ = ["HuntState", "State", "draws_independently", "find_hunts", "hunt_state", "is_hunt", "this_process"]
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
@@ -158,6 +163,16 @@ def _state(directory: Path, facts: dict[str, Any], outcomes: dict[str, int], las
         (planned - run) / rate if state == "running" and rate > 0 else None,
         alive,
     )
+
+
+def draws_independently(facts: Mapping[str, Any], settings: HuntSettings) -> bool:
+    """Whether every trial of a hunt was drawn independently of the others, as its sampler said when it ran.
+
+    Args:
+        facts: of its ledger.
+        settings: of the hunt; before samplers said it, of ours the random one did.
+    """
+    return bool(facts.get("independent", settings.sampler == "random"))
 
 
 def this_process() -> dict[str, Any]:

@@ -10,12 +10,13 @@ from typing import IO, TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
-from crashhunt.hunts._results import HuntResults, columns_of
 from crashhunt.trial import EVENTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
+    from crashhunt.hunts._results import HuntResults
 
 __all__ = ["write_parquet", "write_text"]
 
@@ -31,7 +32,7 @@ def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence
         form: ``csv``, ``json`` (one array) or ``jsonl`` (an object per line).
         outcomes: only those; empty for all.
     """
-    names = columns_of(hunt.settings)
+    names = hunt.columns
     count = 0
     if form == "csv":
         writer = csv.writer(out)
@@ -81,7 +82,8 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
     known = {"int": "Int64", "float": "Float64", "bool": "Boolean", "str": "String"}
     kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
     kinds |= dict.fromkeys(EVENTS, "Int64")
-    columns = columns_of(settings)
+    kinds |= {"parent": "Int64", "origin": "String"}
+    columns = hunt.columns
     for name in columns:
         kind = specs[name].kind if name in specs else "float"
         if kind is None:  # the agent does not say; what was tried first does

@@ -10,7 +10,6 @@ from ._options import (
 from ._plan import (
     parse_crash_on as parse_crash_on,
     plan as plan,
-    spec_of as spec_of,
     with_settings as with_settings,
 )
 from ._request import (

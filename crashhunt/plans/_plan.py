@@ -7,30 +7,27 @@ import os
 import secrets
 from dataclasses import replace
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from crashhunt.base.blame import place_of
-from crashhunt.base.errors import ArgumentError, CrashhuntError, PluginError, ScenarioError, UsageError
+from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.samplers import NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, load_scenario, scenario_digest, with_action
 from crashhunt.simulators.accelerator import ACCELERATED
-from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, TrialSpec, parse_spec, signature_of
+from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_spec, signature_of
 from crashhunt.world import LIMITS, TOLD_BY
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.plans._request import Request
-    from crashhunt.samplers import Sampler
     from crashhunt.trial import Signature
 
-__all__ = ["parse_crash_on", "plan", "spec_of", "with_settings"]
+__all__ = ["parse_crash_on", "plan", "with_settings"]
 
 
 def plan(request: Request) -> tuple[Scenario, HuntSettings]:
@@ -45,8 +42,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )
-    sampler = locate("samplers", request.sampler)
-    hunted = not getattr(sampler, "only_asked", False)
+    hunted = not varies_only_asked(request.sampler)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
     crash_on, limits = parse_crash_on(request.crash_on)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
@@ -69,20 +65,8 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, run), crash_on)
-    _try_sampler(sampler, settings)
+    NamedSampler(settings.sampler, settings.space, points=settings.points)  # it refuses what it cannot sample
     return scenario, settings
-
-
-def _try_sampler(sampler: Callable[..., Sampler], settings: HuntSettings) -> None:
-    """Make the sampler, which refuses what it cannot sample, before anything runs."""
-    try:
-        sampler(settings.space, points=settings.points)
-    except CrashhuntError:
-        raise
-    except Exception as error:  # somebody's own
-        said = " ".join(f"{type(error).__name__}: {error}".split())
-        message = f"the sampler {settings.sampler!r} cannot be made: {said}"
-        raise PluginError(message, fix="mend it", where=place_of(error)) from error
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
@@ -289,14 +273,3 @@ def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -
             )
         specs[name] = ArgumentSpec(spec=spec, kind=argument.kind)
     return specs
-
-
-def spec_of(number: int, settings: HuntSettings, sampler: Sampler) -> TrialSpec:
-    """Return a trial of a hunt; it depends on the hunt's seed and on the number only."""
-    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
-    seed = int(rng.integers(2**31))
-    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
-    scenario_arguments: dict[str, Any] = {}
-    for (agent, name), value in sorted(sampler.ask(number, rng).items()):
-        (arguments[agent] if agent else scenario_arguments)[name] = value
-    return TrialSpec(number, seed, arguments, scenario_arguments, max_steps=settings.max_steps)

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
+from crashhunt.samplers._protocol import Proposal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +29,7 @@ class GridSampler:
     """
 
     learns = False
+    independent = False  # in a hunt that ends in the middle, some values come more often than others
     only_asked = True
 
     def __init__(self, space: Space, *, points: int = 10) -> None:
@@ -40,13 +42,13 @@ class GridSampler:
         """How many combinations there are."""
         return math.prod(len(values) for _, values in self._axes)
 
-    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return the combination whose turn it is."""
         chosen: dict[Key, Value] = {}
         for key, values in reversed(self._axes):
             number, index = divmod(number, len(values))
             chosen[key] = values[index]
-        return chosen
+        return Proposal(chosen)
 
     def tell(self, result: TrialResult) -> None:
         """Nothing to learn."""

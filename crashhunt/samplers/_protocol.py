@@ -1,9 +1,10 @@
-"""The sampler protocol: which arguments the next trial gets."""
+"""The sampler protocol: what the next trial is to be."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from crashhunt.trial import Distribution, Value
 
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialResult
 
-__all__ = ["Key", "Sampler", "Space"]
+__all__ = ["Independent", "Key", "OnlyAsked", "Proposal", "Sampler", "Space"]
 
 Key = tuple[str, str]
 """(agent id, argument name); the agent id is empty for an argument of the scenario."""
@@ -20,23 +21,50 @@ Key = tuple[str, str]
 Space = Mapping[Key, Distribution]
 
 
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What a sampler asks for.
+
+    Args:
+        arguments: a value for every key of the space.
+        seed: of the trial, 0 to 2**31 - 1; None for the one that its number has in the hunt.
+        parent: the number of the trial that it was made from; None where there is none.
+        origin: a word on where it came from, such as the name of a strategy; empty for nothing.
+    """
+
+    arguments: Mapping[Key, Value]
+    seed: int | None = None
+    parent: int | None = None
+    origin: str = ""
+
+
 class Sampler(Protocol):
-    """Proposes arguments, and may learn from results.
+    """Proposes trials, and may learn from their results.
 
-    Contract: a proposal depends on the trial's number, its generator and the results told so far, never on time or
-    on anything else. Results are told in the order of their numbers. A sampler that does not learn ignores them, so
-    that the proposals for a number are the same however many trials run at once.
+    It is made with the space and, as a keyword, ``points``: how many values to try of a range that has no step of its
+    own.
 
-    A sampler is called with the space and, as a keyword, ``points``: how many values to try of a range that has no
-    step of its own. One whose ``only_asked`` is true varies only what somebody asks for by name; everything else is
-    a constant in its space.
+    Contract: a proposal depends on the trial's number, its generator and the results told so far, in their order, never
+    on time, on what was asked before or on anything else. So one that is made anew and told the same results proposes
+    the same, which is how a hunt goes on after it was interrupted.
+
+    One whose ``learns`` is false is told nothing, and its proposals for a number are the same however many trials run
+    at once.
+
+    One that learns is told results by this rule. Before the proposal for trial n is asked for, all results up to
+    n - lag are told that are there and were not told before, in the order of their numbers. A trial that has not ended
+    by then is not waited for: it is told late, before the first proposal after its end, so that one that hangs keeps
+    nobody from learning. The lag is how many trials a hunt has under way at once. A hunt with
+    ``--deterministic`` waits: there, exactly the results up to n - lag are told, and the lag is 32, or what the hunt
+    that began had under way where that is more; so its trials are the same whatever runs how fast. Proposals, and what
+    was told before each, are in the ledger before their trials start. So a hunt that goes on, however it ended, runs
+    those very trials, and tells the results in the order in which they were told.
     """
 
     learns: bool
-    only_asked: bool
 
-    def ask(self, number: int, rng: np.random.Generator) -> dict[Key, Value]:
-        """Return a value for every key of the space.
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal | Mapping[Key, Value]:
+        """Return a proposal, or only its arguments.
 
         Args:
             number: of the trial, from 0.
@@ -44,4 +72,27 @@ class Sampler(Protocol):
         """
 
     def tell(self, result: TrialResult) -> None:
-        """Learn how a trial ended."""
+        """Learn how a trial ended; its ``spec`` says what was proposed."""
+
+
+@runtime_checkable
+class OnlyAsked(Protocol):
+    """A sampler that may vary only what somebody asks for by name.
+
+    Where ``only_asked`` is true, everything else is a constant in its space. The class says so, for it is asked before
+    a sampler is made.
+    """
+
+    only_asked: bool
+
+
+@runtime_checkable
+class Independent(Protocol):
+    """A sampler that may draw every trial from the distributions of its space, independently of all others.
+
+    Where ``independent`` is true, how often a hunt crashes says how often its agent does, and so the rate gets an
+    interval. Such a one draws the scenario's arguments first, in order of their names, so that two hunts with one seed
+    have the same traffic whoever drives.
+    """
+
+    independent: bool

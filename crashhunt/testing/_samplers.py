@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from crashhunt.samplers import Sampler, Space
+from crashhunt.samplers import Independent, OnlyAsked, Proposal, Sampler, Space
+from crashhunt.trial import Outcome, Range, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
 
 __all__ = ["SamplerContract"]
 
 Make = Callable[[Space], Sampler]
+
+_TRIALS, _LAG = 40, 4
+_SLOW = {5: 10, 11: 9, 12: 3}  # trials that hang for a while, and for how many trials
+_OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.INVALID, Outcome.FINISHED)
 
 
 class SamplerContract:
@@ -31,25 +38,87 @@ class SamplerContract:
         """Return a space."""
         raise NotImplementedError("give the suite a fixture named space")
 
-    def _ask(self, sampler: Sampler, number: int) -> dict[Any, Any]:
-        return sampler.ask(number, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(number,))))
-
     def test_every_proposal_is_complete_and_inside_the_space(self, make: Make, space: Space) -> None:
-        """A value for every key, and no other."""
-        sampler = make(space)
-        for number in range(50):
-            proposal = self._ask(sampler, number)
-            assert set(proposal) == set(space)
-            assert all(space[key].contains(value) for key, value in proposal.items())
+        """A value for every key, and no other, as plain data; before it was told anything, and after."""
+        asked: set[int] = set()
+        for number, (_, proposal) in enumerate(_talk(make(space))):
+            assert set(proposal.arguments) == set(space)
+            assert all(space[key].contains(value) for key, value in proposal.arguments.items())
+            json.dumps(list(proposal.arguments.values()))
+            assert proposal.seed is None or 0 <= proposal.seed < 2**31
+            assert proposal.parent is None or proposal.parent in asked
+            assert isinstance(proposal.origin, str)
+            asked.add(number)
 
     def test_a_proposal_depends_on_number_and_generator_alone(self, make: Make, space: Space) -> None:
-        """Before it has learnt anything, the order of asking does not matter."""
+        """Before it was told anything, the order of asking does not matter."""
         forward, backward = make(space), make(space)
-        asked = {number: self._ask(forward, number) for number in range(20)}
-        assert {number: self._ask(backward, number) for number in reversed(range(20))} == asked
+        asked = {number: _ask(forward, number) for number in range(20)}
+        assert {number: _ask(backward, number) for number in reversed(range(20))} == asked
+
+    def test_one_that_is_made_anew_and_told_the_same_proposes_the_same(self, make: Make, space: Space) -> None:
+        """However a hunt ended, it goes on as if it had not; some results come out of order, as the rule allows."""
+        turns = _talk(make(space))
+        for number in (0, 1, _LAG + 1, 9, 16, 23, _TRIALS - 1):
+            again = make(space)
+            for told, _ in turns[: number + 1]:
+                for result in told:
+                    again.tell(result)
+            assert _ask(again, number) == turns[number][1], f"it was asked for trial {number}"
+
+    def test_one_that_does_not_learn_proposes_the_same_whatever_it_is_told(self, make: Make, space: Space) -> None:
+        """The hunt tells it nothing."""
+        sampler = make(space)
+        if not sampler.learns:
+            fresh = make(space)
+            assert [proposal for _, proposal in _talk(sampler)] == [_ask(fresh, number) for number in range(_TRIALS)]
 
     def test_it_says_whether_it_learns(self, make: Make, space: Space) -> None:
         """The hunt asks before it tells."""
         sampler = make(space)
         assert isinstance(sampler.learns, bool)
-        assert isinstance(sampler.only_asked, bool)
+        assert not isinstance(sampler, OnlyAsked) or isinstance(sampler.only_asked, bool)
+
+    def test_independent_draws_of_the_scenario_do_not_depend_on_who_drives(self, make: Make, space: Space) -> None:
+        """So that two hunts with one seed have the same traffic; and what learns is not independent."""
+        sampler = make(space)
+        if not (isinstance(sampler, Independent) and sampler.independent):
+            return
+        assert not sampler.learns
+        other = make({**space, ("", "a scenario's"): Range(0.0, 1.0), ("somebody", "else"): Range(0.0, 1.0)})
+        alone = make({**{key: space[key] for key in space if not key[0]}, ("", "a scenario's"): Range(0.0, 1.0)})
+        for number in range(20):
+            mine, theirs = _ask(alone, number).arguments, _ask(other, number).arguments
+            assert {key: theirs[key] for key in mine} == mine
+
+
+def _ask(sampler: Sampler, number: int) -> Proposal:
+    answer: Any = sampler.ask(number, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(number,))))
+    return answer if isinstance(answer, Proposal) else Proposal(answer)
+
+
+def _talk(sampler: Sampler) -> list[tuple[list[TrialResult], Proposal]]:
+    """What a hunt tells and asks, trial by trial: some end late, and are told then."""
+    turns: list[tuple[list[TrialResult], Proposal]] = []
+    told: set[int] = set()
+    for number in range(_TRIALS):
+        ended = [n for n in range(number - _LAG + 1) if n not in told and number - n > _SLOW.get(n, 0)]
+        told.update(ended)
+        results = [_result(n, turns[n][1]) for n in ended]
+        for result in results:
+            sampler.tell(result)
+        turns.append((results, _ask(sampler, number)))
+    assert told == set(range(_TRIALS - _LAG))
+    return turns
+
+
+def _result(number: int, proposal: Proposal) -> TrialResult:
+    """How a trial might end: now and then without ever having been near to anything."""
+    arguments: dict[str, dict[str, Any]] = {}
+    for (agent, name), value in proposal.arguments.items():
+        arguments.setdefault(agent, {})[name] = value
+    scenario = arguments.pop("", {})
+    seed = number if proposal.seed is None else proposal.seed
+    spec = TrialSpec(number, seed, arguments, scenario, max_steps=50, parent=proposal.parent, origin=proposal.origin)
+    near = ClosestApproach(((7 * number) % 10) / 2, 1.0 + number, 3.0) if number % 4 else ClosestApproach()
+    return TrialResult(spec, _OUTCOMES[number % len(_OUTCOMES)], steps=number + 1, wall_s=0.1, closest=near)

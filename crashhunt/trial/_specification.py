@@ -37,6 +37,8 @@ class TrialSpec:
         scenario_arguments: name to value.
         max_steps: the bound on its length, in steps.
         overruled: which agent is not asked any more, and from when on; None where all drive to the end.
+        parent: the trial that the sampler made it from; None where there is none. It determines nothing.
+        origin: the sampler's word on where it came from, such as the name of a strategy. It determines nothing.
     """
 
     number: int
@@ -45,6 +47,8 @@ class TrialSpec:
     scenario_arguments: Mapping[str, Value]
     max_steps: int
     overruled: Overruled | None = None
+    parent: int | None = None
+    origin: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts and numbers."""
@@ -55,6 +59,8 @@ class TrialSpec:
             "scenario_arguments": dict(self.scenario_arguments),
             "max_steps": self.max_steps,
             **({"overruled": asdict(self.overruled)} if self.overruled else {}),
+            **({"parent": self.parent} if self.parent is not None else {}),
+            **({"origin": self.origin} if self.origin else {}),
         }
 
     @classmethod
@@ -68,4 +74,6 @@ class TrialSpec:
             data["scenario_arguments"],
             max_steps=data["max_steps"],
             overruled=Overruled(**overruled) if overruled else None,
+            parent=data.get("parent"),
+            origin=data.get("origin", ""),
         )

@@ -96,9 +96,9 @@ class TestGridSampler(TestRandomSampler):
         sampler = make(space)
         assert sampler.size == 4 * 2 * 4
         rng = np.random.default_rng(0)
-        one_round = [tuple(sampler.ask(number, rng).values()) for number in range(sampler.size)]
+        one_round = [tuple(sampler.ask(number, rng).arguments.values()) for number in range(sampler.size)]
         assert len(set(one_round)) == sampler.size
-        assert tuple(sampler.ask(sampler.size, rng).values()) == one_round[0]
+        assert tuple(sampler.ask(sampler.size, rng).arguments.values()) == one_round[0]
 
 
 class TestSweepSampler(SamplerContract):
@@ -112,7 +112,7 @@ class TestSweepSampler(SamplerContract):
 
     def test_it_steps_from_start_to_end(self, make, space):
         sampler = make(space)
-        speeds = [sampler.ask(number, np.random.default_rng(0))["ego", "speed"] for number in range(6)]
+        speeds = [sampler.ask(number, np.random.default_rng(0)).arguments["ego", "speed"] for number in range(6)]
         assert speeds == [10, 15, 20, 25, 30, 10]
 
     def test_it_wants_exactly_one_argument(self):

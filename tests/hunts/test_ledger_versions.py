@@ -6,18 +6,20 @@ import json
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger
+from crashhunt.hunts import Ledger, Turn
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 # Every version of the tables leaves one here, written by the crashhunt of then: `write` is what was called.
 FROZEN = sorted((Path(__file__).parent / "ledgers").glob("version-*.sqlite"))
+ORIGIN = {"parent": 1, "origin": "climb"}
 OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.FINISHED, Outcome.INVALID)
 EVENTS = {2: {"running_a_red_light": 2, "emergency_braking": 1}, 6: {"running_a_red_light": 6, "emergency_braking": 1}}
 
@@ -36,6 +38,7 @@ def write(path):
         for number in range(10):
             ledger.record(result(number), snapshot="0123456789abcdef")
         ledger.replace([3])
+        ledger.propose([Turn((), result(10).spec), Turn((1, 0), replace(result(11).spec, **ORIGIN))])
         ledger.enter("interrupted", "by somebody")
 
 
@@ -65,7 +68,8 @@ def check(ledger, frozen):
         {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)} if frozen > 1 else {}
     )
     assert sorted(row[0] for row in ledger.table()) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-    assert list(ledger.turns()) == []
+    turns = [Turn((), result(10).spec), Turn((1, 0), replace(result(11).spec, **ORIGIN))]
+    assert list(ledger.turns()) == (turns if frozen > 2 else [])
 
 
 @pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])

@@ -1,0 +1,123 @@
+"""Hunts with samplers of somebody's own: that learn, that are killed, and that nobody can import any more."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import sqlite3
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+HUNT = ("2", "60", "20", "--scenario", "toy", "--seed", "3", "--keep-going", "--crash-on", "hang", "--json")
+
+INDEPENDENT = """
+from crashhunt.samplers import RandomSampler
+
+
+class Mine:
+    learns = False
+    independent = True
+
+    def __init__(self, space, *, points):
+        self._inner = RandomSampler(space)
+
+    def ask(self, number, rng):
+        return self._inner.ask(number, rng)
+
+    def tell(self, result):
+        raise AssertionError("it does not learn")
+"""
+
+
+@pytest.fixture
+def own(toy):
+    shutil.copy(HERE.parent / "hunts" / "climber.py", toy.folder / "climber.py")
+    (toy.folder / "mine.py").write_text(INDEPENDENT)
+    return toy
+
+
+def trials(hunt):
+    """Number to specification and digest of every trial that has ended."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
+        found = {number: json.loads(text) for number, text in database.execute("SELECT number, result FROM trials")}
+        return {number: (data["spec"], data["digest"]) for number, data in found.items()}
+    return {}
+
+
+def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own):
+    words = (*HUNT, "--sampler", "climber:Climber", "--deterministic")
+    own.crashhunt("run", "whole", *words)
+    whole = trials(own.folder / "whole")
+    assert sorted(whole) == list(range(60))
+    assert sum("parent" in spec for spec, _ in whole.values()) > 5
+    chance = random.Random(5)
+    for ends in (chance.randrange(2, 30), chance.randrange(30, 50)):
+        process = own.start("run", "killed", *words, "--set", "step_wall_s=0.002")
+        deadline = time.monotonic() + 60
+        while len(trials(own.folder / "killed")) < ends:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.kill()
+        process.communicate()
+    own.crashhunt("run", "killed", *words, "--set", "step_wall_s=0.002")
+    killed = trials(own.folder / "killed")
+    for spec, _ in killed.values():
+        assert spec["scenario_arguments"].pop("step_wall_s") == 0.002
+    for spec, _ in whole.values():
+        assert spec["scenario_arguments"].pop("step_wall_s") == 0.0
+    assert killed == whole
+    own.crashhunt("check", "killed")
+
+
+def test_where_trials_come_from_is_in_the_table(own):
+    own.crashhunt("run", "h", *HUNT, "--sampler", "climber:Climber")
+    head, *lines = own.crashhunt("trials", "h", "--format", "csv").out.splitlines()
+    assert head.split(",")[-2:] == ["parent", "origin"]
+    assert lines[0].split(",")[-2:] == ["", "draw 0"]
+    assert any(line.split(",")[-1].startswith("climb ") and line.split(",")[-2].isdigit() for line in lines)
+    own.crashhunt("run", "random", *HUNT)
+    assert "parent" not in own.crashhunt("trials", "random", "--format", "csv").out
+    own.crashhunt("trials", "h", "--format", "parquet", "--out", "h.parquet")
+    import polars as pl
+
+    table = pl.read_parquet(own.folder / "h.parquet")
+    assert (table.schema["parent"], table.schema["origin"]) == (pl.Int64, pl.String)
+
+
+def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
+    words = (*HUNT, "--sampler", "climber:Climber", "--deterministic")
+    own.crashhunt("run", "h", *words)
+    with closing(sqlite3.connect(own.folder / "h" / "ledger.sqlite")) as database, database:
+        database.execute("UPDATE proposals SET spec = replace(spec, 'climb', 'draw') WHERE number = 50")
+        assert database.total_changes == 1
+    assert "the proposal of trial 50 is not as it was written" in own.crashhunt("check", "h", expect=1).out
+    assert "trial 50" in own.crashhunt("run", "h", *words, expect=2).err
+    own.crashhunt("check", "h", "--salvage", "saved", expect=None)
+    with closing(sqlite3.connect(own.folder / "saved" / "ledger.sqlite")) as database:
+        numbers = {number for (number,) in database.execute("SELECT number FROM proposals")}
+    assert numbers == set(range(60)) - {50}
+    before = trials(own.folder / "h")
+    own.crashhunt("run", "saved", *words)
+    assert trials(own.folder / "saved") == before
+
+
+def test_a_sampler_that_says_so_is_independent_even_when_nobody_can_import_it(own):
+    own.crashhunt("run", "mine", *HUNT, "--sampler", "mine:Mine")
+    own.crashhunt("run", "random", *HUNT)
+    own.crashhunt("run", "old", *HUNT, "--sampler", "climber:Old")
+    (own.folder / "mine.py").unlink()
+    mine, theirs, old = own.crashhunt("compare", "mine", "random", "old", "--json").json["hunts"]
+    assert mine["interval"] == theirs["interval"] is not None
+    assert (old["interval"], old["why_not"]) == (None, "the sampler climber:Old does not draw trials independently")
+    assert trials(own.folder / "mine") == trials(own.folder / "random") == trials(own.folder / "old")
+
+
+def test_what_is_wrong_with_a_sampler_is_one_line(own):
+    done = own.crashhunt("run", "h", *HUNT[:-1], "--sampler", "climber:Bad", expect=2)
+    assert "the sampler 'climber:Bad' fails when it is asked for trial 0: KeyError" in done.err
+    assert "climber.py, line" in done.err

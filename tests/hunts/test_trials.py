@@ -1,0 +1,248 @@
+"""Which trials a hunt runs: the same whenever it was killed, and the sampler is told the same."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from contextlib import closing
+
+import pytest
+from climber import Climber
+from hypothesis import given, settings as how, strategies as st
+
+from crashhunt.errors import PluginError
+from crashhunt.hunts import Ledger, Trials
+from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
+from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
+from crashhunt.trial import Outcome, TrialResult
+from crashhunt.world import ClosestApproach
+
+TRIALS = 60
+
+
+def settings(sampler="climber:Climber", *, parallel=2, deterministic=False, trials=TRIALS, argument="gap_m"):
+    return HuntSettings(
+        scenario="toy",
+        scenario_digest="a",
+        trials=trials,
+        max_steps=9,
+        seed=3,
+        sampler=sampler,
+        agents={"ego": AgentSettings(agent="keep-lane", arguments={"speed": ArgumentSpec(spec="1:9", kind="float")})},
+        scenario_arguments={argument: ArgumentSpec(spec="20.0:30.0", kind="float")},
+        run=RunSettings(parallel=parallel, deterministic=deterministic),
+    )
+
+
+def ended(spec):
+    """How a trial ends, which follows from what it is."""
+    speed, gap = spec.arguments["ego"]["speed"], spec.scenario_arguments["gap_m"]
+    outcome = Outcome.INVALID if spec.seed % 11 == 0 else Outcome.SURVIVED
+    return TrialResult(spec, outcome, steps=spec.seed % 9, wall_s=0.1, closest=ClosestApproach(gap / speed, gap, 1.0))
+
+
+class Killed(BaseException):
+    """The process of a hunt is gone."""
+
+
+def hunt(path, chosen, chance, *, kill_after=10**9, lag=None, slow=frozenset(), log=None):
+    """What a hunt does with its trials, which end in any order, until it is killed; return how many were open then."""
+    ledger = Ledger(path, writable=True)
+    finished = ledger.finished()
+    capacity = 2 * chosen.run.parallel
+    sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+    trials = Trials(chosen, sampler, ledger, finished, lag=lag or capacity)
+    running = []
+    while True:
+        for spec in trials.take(capacity - len(running)):
+            running.append(spec)
+            if log is not None:
+                log.append(spec)
+        if kill_after <= 0:
+            raise Killed
+        kill_after -= 1
+        if not running:
+            break
+        ready = [spec for spec in running if spec.number not in slow] or running
+        spec = chance.choice(ready)
+        running.remove(spec)
+        result = ended(spec)
+        trials.ended(result)
+        ledger.record(result, snapshot="")
+    ledger.close()
+
+
+def killed_again_and_again(folder, chosen, chance, kills, *, lag=None, power=False, slow=frozenset()):
+    """Run a hunt that is killed so often; return everything that was started, run by run."""
+    path, started = folder / "0" / "ledger.sqlite", []
+    path.parent.mkdir()
+    for number, kill in enumerate([*kills, 10**9], start=1):
+        log = []
+        started.append(log)
+        try:
+            hunt(path, chosen, chance, kill_after=kill, lag=lag, slow=slow, log=log)
+        except Killed:
+            # The files as they are now, under another name: whoever had them open plays no part any more.
+            shutil.copytree(path.parent, folder / str(number))
+            path = folder / str(number) / "ledger.sqlite"
+            path.with_name("ledger.sqlite-shm").unlink(missing_ok=True)
+            log_file = path.with_name("ledger.sqlite-wal")
+            if power and log_file.exists():  # of what was written last, some never came to the disk
+                size = log_file.stat().st_size
+                with log_file.open("r+b") as file:
+                    file.truncate(chance.randrange(size + 1))
+    return path, started
+
+
+def specs(path):
+    with closing(Ledger(path)) as ledger:
+        return [result.spec for result in ledger.results()]
+
+
+KILLS = st.lists(st.integers(0, 40), max_size=4)
+
+
+@how(max_examples=25)
+@given(st.integers(0, 2**32), KILLS, st.integers(1, 8), st.booleans())
+def test_a_deterministic_hunt_runs_the_same_trials_however_often_it_is_killed(
+    tmp_path_factory, seed, kills, parallel, power
+):
+    folder = tmp_path_factory.mktemp("hunt")
+    hunt(folder / "whole.sqlite", settings(deterministic=True), random.Random(1), lag=16)
+    chosen = settings(deterministic=True, parallel=parallel)
+    path, _ = killed_again_and_again(folder, chosen, random.Random(seed), kills, lag=16, power=power)
+    assert specs(path) == specs(folder / "whole.sqlite")
+    assert any(spec.parent for spec in specs(path))
+
+
+@how(max_examples=25)
+@given(st.integers(0, 2**32), KILLS, st.integers(1, 8))
+def test_what_a_killed_hunt_had_started_is_what_runs_after(tmp_path_factory, seed, kills, parallel):
+    folder = tmp_path_factory.mktemp("hunt")
+    path, started = killed_again_and_again(folder, settings(parallel=parallel), random.Random(seed), kills)
+    ran = {spec.number: spec for spec in specs(path)}
+    assert sorted(ran) == list(range(TRIALS))
+    for run in started:
+        assert all(ran[spec.number] == spec for spec in run)
+    # Whoever reads the ledger knows what was told when: one that is told that proposes all of it again.
+    with closing(Ledger(path)) as ledger:
+        sampler: Sampler = Climber(settings().space)
+        for turn in ledger.turns():
+            for number in turn.told:
+                sampler.tell(ledger.result(number))
+            assert turn.spec.origin.split()[1] == str(sampler._told)
+            assert turn.spec == ran[turn.spec.number]
+
+
+def test_with_one_worker_nothing_depends_on_time(tmp_path):
+    """Which runs one trial after the other, whether the next is asked for at once or two at a time."""
+
+    class First:
+        choice = staticmethod(lambda ready: ready[0])
+
+    path = tmp_path / "ledger.sqlite"
+    hunt(path, settings(parallel=1), First())
+    with closing(Ledger(path)) as ledger:
+        turns = list(ledger.turns())
+    assert [turn.told for turn in turns] == [(n - 2,) if n > 1 else () for n in range(TRIALS)]
+
+
+def test_a_trial_that_hangs_keeps_nobody_from_learning(tmp_path):
+    path, slow = tmp_path / "ledger.sqlite", frozenset({7})
+    hunt(path, settings(parallel=2), random.Random(1), slow=slow)
+    with closing(Ledger(path)) as ledger:
+        turns = list(ledger.turns())
+    told = [number for turn in turns for number in turn.told]
+    assert len(told) > TRIALS - 8
+    assert 7 not in told  # it ended last
+    assert {8, 20, 40} <= set(told)
+    # A deterministic one waits for it.
+    log: list = []
+    with pytest.raises(Killed):
+        hunt(tmp_path / "other.sqlite", settings(deterministic=True), random.Random(1), lag=8, slow=slow,
+             log=log, kill_after=6)  # fmt: skip
+    assert max(spec.number for spec in log) <= 7 + 8
+
+
+def test_a_trial_that_is_run_again_is_what_was_proposed(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    hunt(path, settings(deterministic=True), random.Random(1), lag=8)
+    before = specs(path)
+    with closing(Ledger(path, writable=True)) as ledger:
+        assert ledger.replace([5, 30]) == 2
+    hunt(path, settings(deterministic=True, trials=TRIALS + 9), random.Random(1), lag=8)
+    after = specs(path)
+    assert after[:TRIALS] == before
+    assert len(after) == TRIALS + 9
+
+
+def test_one_that_does_not_learn_needs_no_row(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    hunt(path, settings("random"), random.Random(1))
+    with closing(sqlite3.connect(path)) as database:
+        assert database.execute("SELECT count(*) FROM proposals").fetchone() == (0,)
+        assert database.execute("SELECT count(*) FROM hunt WHERE key = 'origins'").fetchone() == (0,)
+    chosen = settings("climber:Old")
+    hunt(tmp_path / "old.sqlite", chosen, random.Random(2))
+    assert specs(tmp_path / "old.sqlite") == specs(path)  # its arguments, and the seeds of the hunt
+    assert not NamedSampler("climber:Old", chosen.space, points=1).independent  # it does not say so
+    assert NamedSampler("random", chosen.space, points=1).independent
+    assert not NamedSampler("grid", chosen.space, points=1).independent
+
+
+def test_what_a_later_class_draws_in_another_way_is_not_independent_by_inheritance():
+    class Stratified(RandomSampler):
+        def ask(self, number, rng):
+            return super().ask(number // 2, rng)
+
+    assert RandomSampler({}).independent
+    assert not Stratified({}).independent
+
+
+def test_a_ledger_of_before_goes_on_with_a_sampler_that_learns(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    chosen = settings(deterministic=True)
+    hunt(path, settings(deterministic=True, trials=20), random.Random(1), lag=8)
+    with closing(sqlite3.connect(path)) as database, database:  # as version 2 was
+        database.execute("DROP TABLE proposals")
+        database.execute("DELETE FROM hunt")
+        database.execute("PRAGMA user_version = 2")
+    hunt(path, chosen, random.Random(1), lag=8)
+    assert [spec.number for spec in specs(path)] == list(range(TRIALS))
+    with closing(Ledger(path)) as ledger:
+        turns = list(ledger.turns())
+    assert [turn.spec.number for turn in turns] == list(range(20, TRIALS))
+    assert turns[0].told == tuple(range(20 - 8 + 1))
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        ("unmade", "cannot be made: KeyError: 'nothing to sample'"),
+        ("independent", "says that it learns, and that its draws are independent"),
+        ("raises", "fails when it is asked for trial 0: ZeroDivisionError: division by zero"),
+        ("list", "proposes for trial 0 list, not arguments"),
+        ("missing", "proposes for trial 0 no value for missing"),
+        ("more", "proposes for trial 0 a value for ego.other"),
+        ("infinite", "proposes for trial 0 ego.speed = inf, not a finite number"),
+        ("object", "proposes for trial 0 ego.speed = <class 'object'>, not a plain bool, int, float or str"),
+        ("seed", "proposes for trial 0 the seed -1, not one from 0 to 2147483647"),
+        ("parent", "proposes for trial 0 the parent 'first', not the number of a trial"),
+        ("origin", "proposes for trial 0 the origin None, not a word"),
+    ],
+)
+def test_a_sampler_that_is_none_is_one_clear_line(tmp_path, argument, says):
+    with pytest.raises(PluginError) as refused:
+        hunt(tmp_path / "ledger.sqlite", settings("climber:Bad", argument=argument), random.Random(1))
+    assert f"the sampler 'climber:Bad' {says}" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert refused.value.fix
+
+
+@pytest.mark.parametrize(
+    ("sampler", "says"), [("builtins:int", "cannot be made: TypeError"), ("builtins:dict", "has no 'learns'")]
+)
+def test_what_is_no_sampler_is_told_before_anything_runs(sampler, says):
+    with pytest.raises(PluginError, match=says):
+        NamedSampler(sampler, settings().space, points=3)
