@@ -1,4 +1,4 @@
-"""``crashhunt agents`` and ``crashhunt scenarios``."""
+"""``crashhunt agents``, ``crashhunt oracles`` and ``crashhunt scenarios``."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def add_lists(commands: Any) -> None:
     """Add the commands."""
     for name, command, text in (
         ("agents", _agents, "list the agents that come with crashhunt or are installed, with their arguments"),
+        ("oracles", _oracles, "list the oracles that come with crashhunt or are installed, with their arguments"),
         ("scenarios", _scenarios, "list the scenarios that come with crashhunt, with their arguments"),
     ):
         listing = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
@@ -30,6 +31,12 @@ def _agents(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import list_agents
 
     return _print_listing("agents", list_agents(), as_json=options.json)
+
+
+def _oracles(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.report import list_oracles
+
+    return _print_listing("oracles", list_oracles(), as_json=options.json)
 
 
 def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:

@@ -42,13 +42,14 @@ def add_trials(commands: Any) -> None:
 def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.files import whole_file
     from crashhunt.hunts import HuntResults, write_parquet, write_text
-    from crashhunt.trial import Outcome
+    from crashhunt.trial import Outcome, in_order
 
+    hunt = HuntResults(options.directory)
+    known = in_order([*Outcome, *hunt.settings.crash_on])  # an oracle may have brought some
     outcomes = [name for name in options.outcome.split(",") if name]
     for name in outcomes:
-        if name not in list(Outcome):
-            raise UsageError(f"--outcome {name!r} is none", fix=one_of(name, Outcome, give="give some of"))
-    hunt = HuntResults(options.directory)
+        if name not in known:
+            raise UsageError(f"--outcome {name!r} is none", fix=one_of(name, known, give="give some of"))
     if options.out is None:
         if options.format == "parquet":
             raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")

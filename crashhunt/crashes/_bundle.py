@@ -16,7 +16,7 @@ from crashhunt.base.integrity import FILES, changed_file, describe_files, digest
 from crashhunt.base.names import listed, near_path, one_of
 from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
 from crashhunt.snapshots import versions
-from crashhunt.trial import Collision, Escape, Failure, Outcome, TrialResult, TrialSpec, check_parts
+from crashhunt.trial import Collision, Escape, Failure, TrialResult, TrialSpec, check_parts, outcome_of
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
     )
     result = TrialResult(
         spec,
-        Outcome(data["outcome"]),
+        outcome_of(data),
         steps=data["step"],
         sim_time_s=data["sim_time_s"],
         digest=data["digest"],

@@ -7,6 +7,7 @@ from xml.parsers import expat
 
 from crashhunt.base.errors import ScenarioError, UsageError
 from crashhunt.base.plugins import registered
+from crashhunt.oracles import oracle_name
 from crashhunt.scenario.backends.sumo import (
     ATTRIBUTES,
     ELEMENTS,
@@ -43,7 +44,7 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
         UsageError: with what it would do.
     """
     names: list[tuple[Group, str]] = [("simulators", scenario.simulator)]
-    names += [("oracles", name) for name in settings.oracles]
+    names += [("oracles", oracle_name(text)) for text in settings.oracles]
     for group, name in names:
         if name not in registered(group):
             raise _refusal(f"it would import {name!r}")

@@ -13,6 +13,7 @@ from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.episode._episode import seed_everything
+from crashhunt.oracles import parse_oracle
 from crashhunt.trial import signature_of
 
 if TYPE_CHECKING:
@@ -39,7 +40,11 @@ class Parts:
         if settings.code:
             # What the snapshot does not have may come from where the hunt was started, as it did then.
             sys.path[:0] = [*settings.code, str(Path.cwd())]
-        self.oracles: list[Oracle] = [locate("oracles", name)() for name in settings.oracles]
+        self._oracles = [parse_oracle(text) for text in settings.oracles]
+
+    def oracles(self) -> list[Oracle]:
+        """Make the oracles of a trial; what one remembers of a trial is nobody's business in the next."""
+        return [choice.make() for choice in self._oracles]
 
     def load(self) -> None:
         """Import everything that trials need, always in the same order.

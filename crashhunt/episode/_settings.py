@@ -33,7 +33,7 @@ class WorkerSettings:
 
     Args:
         scenario: where the trials take place.
-        oracles: names of registered oracles, or ``module:attribute``.
+        oracles: who looks for crashes, each as ``--oracle`` names it.
         crash_on: the outcomes that end a trial as a crash.
         scratch: the folder in which workers keep black boxes and output while trials run.
         code: folders whose modules win over installed ones, the first one first: the snapshot. Empty for none.

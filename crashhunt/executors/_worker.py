@@ -129,7 +129,7 @@ class Worker:
                 simulator=simulator,
                 make_agent=self._parts.agent if spec.overruled is None else partial(self._overruled, spec.overruled),
                 box=box,
-                oracles=self._parts.oracles,
+                oracles=self._parts.oracles(),
                 crash_on=self._settings.crash_on,
             )
         finally:

@@ -2,6 +2,7 @@ from ._choice import (
     DEFAULT_ORACLES as DEFAULT_ORACLES,
     OracleChoice as OracleChoice,
     chosen_oracles as chosen_oracles,
+    modules_of as modules_of,
     oracle_name as oracle_name,
     outcomes_brought as outcomes_brought,
     parse_oracle as parse_oracle,

@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from crashhunt.oracles._protocol import Oracle
     from crashhunt.trial import Value
 
-__all__ = ["DEFAULT_ORACLES", "OracleChoice", "chosen_oracles", "oracle_name", "outcomes_brought", "parse_oracle"]
+__all__ = [
+    "DEFAULT_ORACLES",
+    "OracleChoice",
+    "chosen_oracles",
+    "modules_of",
+    "oracle_name",
+    "outcomes_brought",
+    "parse_oracle",
+]
 
 DEFAULT_ORACLES = ("reported-collision", "overlap", "off-road")
 """Who looks at every hunt, unless ``none`` is among those that are chosen."""
@@ -74,6 +82,11 @@ def oracle_name(text: str) -> str:
     """Return the name in a choice; nothing is imported."""
     match = _CHOICE.fullmatch(text)
     return match["name"] if match else text
+
+
+def modules_of(oracles: Iterable[str]) -> list[str]:
+    """Return the modules of the oracles that are chosen as ``module:attribute``; nothing is imported."""
+    return [name.partition(":")[0] for text in oracles if ":" in (name := oracle_name(text))]
 
 
 def parse_oracle(text: str) -> OracleChoice:

@@ -77,6 +77,12 @@ class Subject(_Options):
         help="the same for an argument of the scenario, such as its traffic demand",
         flag="--set", metavar="NAME=SPEC", group="what",
     )  # fmt: skip
+    oracles: Sequence[str] = option(
+        (), "who looks for crashes besides the simulator's report, overlaps and the edge of the road",
+        help="have an oracle look for crashes as well, with its arguments; crashhunt oracles lists them; none drops "
+        "those that look at every hunt; may be repeated",
+        flag="--oracle", metavar="NAME[:KEY=VALUE,…]", group="what",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

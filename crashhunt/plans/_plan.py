@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
+from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
@@ -44,7 +45,11 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     )
     hunted = not varies_only_asked(request.sampler)
     signatures = {agent: signature_of(locate("agents", setup.agent)) for agent, setup in scenario.agents.items()}
-    crash_on, limits = parse_crash_on(request.crash_on)
+    oracles = chosen_oracles(request.oracles)
+    brought = outcomes_brought(oracles)
+    crash_on, limits = parse_crash_on(request.crash_on, brought)
+    if crash_on == CRASHES:  # nobody has said otherwise
+        crash_on += tuple(outcome for outcome in brought if outcome not in crash_on)
     options = {name: getattr(request, name) for name in fields_of(TrialOptions)}
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
@@ -56,6 +61,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         scenario_digest=scenario_digest(scenario),
         trials=request.trials,
         max_steps=request.max_steps,
+        oracles=oracles,
         events=limits,
         agents=_agents(request, scenario, signatures, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
@@ -112,7 +118,7 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
     told = TOLD_BY.get(scenario.simulator)
-    never = [kind for kind in crash_on if kind.is_traffic_event and told is not None and kind not in told]
+    never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
     if not never:
         return scenario
     names = ",".join(never)
@@ -122,13 +128,20 @@ def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     return replace(scenario, notes=(*scenario.notes, f"the simulator {scenario.simulator!r} never tells {names}"))
 
 
-def parse_crash_on(words: Sequence[str]) -> tuple[tuple[Outcome, ...], dict[str, float]]:
+def parse_crash_on(
+    words: Sequence[str], brought: Sequence[Outcome] = ()
+) -> tuple[tuple[Outcome, ...], dict[str, float]]:
     """Return the outcomes that ``--crash-on`` names, and the limits that it gives.
+
+    Args:
+        words: what it was given.
+        brought: the outcomes of the oracles that were chosen, which may be named as well.
 
     Raises:
         UsageError: there is no such outcome or limit.
     """
-    crashes = [str(outcome) for outcome in (*CRASHES, *EVENTS)]
+    known = tuple(dict.fromkeys((*CRASHES, *EVENTS, *brought)))
+    crashes = [str(outcome) for outcome in known]
     names, limits = [], {}
     for word in words:
         name, colon, limit = str(word).partition(":")
@@ -139,7 +152,7 @@ def parse_crash_on(words: Sequence[str]) -> tuple[tuple[Outcome, ...], dict[str,
         names.append(name)
     if not names:
         raise UsageError("--crash-on names no outcome", fix=f"give some of {','.join(crashes)}")
-    return tuple(outcome for outcome in (*CRASHES, *EVENTS) if outcome in names), limits
+    return tuple(outcome for outcome in known if outcome in names), limits
 
 
 def _limit(name: str, text: str) -> float:

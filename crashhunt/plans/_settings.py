@@ -12,6 +12,7 @@ from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.names import near_path
+from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
@@ -82,7 +83,7 @@ class HuntSettings(TrialOptions):
         max_steps: the bound on each, in steps.
         seed: of the hunt; with a trial's number it determines the trial.
         crash_on: the outcomes that count as a crash.
-        oracles: names of registered oracles, or ``module:attribute``.
+        oracles: who looks for crashes, each as ``--oracle`` names it.
         agents: agent id to who drives it.
         scenario_arguments: what is tried for the scenario's arguments.
         events: limits of traffic events that were asked for, such as ``not_moving`` in s.
@@ -96,7 +97,7 @@ class HuntSettings(TrialOptions):
     max_steps: int
     seed: int
     crash_on: tuple[Outcome, ...] = CRASHES
-    oracles: tuple[str, ...] = ("reported-collision", "overlap", "off-road")
+    oracles: tuple[str, ...] = DEFAULT_ORACLES
     agents: dict[str, AgentSettings] = field(default_factory=dict)
     scenario_arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
     events: dict[str, float] = field(default_factory=dict)

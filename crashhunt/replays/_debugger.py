@@ -289,7 +289,7 @@ def main() -> None:
             simulator=simulator,
             make_agent=make_agent,
             box=box,
-            oracles=parts.oracles,
+            oracles=parts.oracles(),
             crash_on=settings.crash_on,
         )
         if job["window"] is not None:

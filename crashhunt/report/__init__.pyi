@@ -1,5 +1,10 @@
 from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
-from ._listing import describe as describe, list_agents as list_agents, list_scenarios as list_scenarios
+from ._listing import (
+    describe as describe,
+    list_agents as list_agents,
+    list_oracles as list_oracles,
+    list_scenarios as list_scenarios,
+)
 from ._page import report_data as report_data, write_report as write_report
 from ._screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
 from ._show import Story as Story

@@ -14,7 +14,7 @@ from crashhunt.base.text import in_lines
 from crashhunt.hunts import FACTS, HuntResults, columns_of
 from crashhunt.report._table import aligned
 from crashhunt.report._units import argument_units
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, in_order
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -122,7 +122,7 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
 
 
 def _outcomes(hunts: Sequence[HuntFigures]) -> str:
-    kinds = [str(kind) for kind in Outcome if any(hunt.outcomes.get(kind) for hunt in hunts)]
+    kinds = [str(kind) for kind in in_order(kind for hunt in hunts for kind, count in hunt.outcomes.items() if count)]
     head = "".join(f"<th>{kind}</th>" for kind in kinds)
     rows = "".join(
         f"<tr><th>{html.escape(hunt.dir)}</th>{''.join(f'<td>{hunt.outcomes.get(k, 0)}</td>' for k in kinds)}</tr>"

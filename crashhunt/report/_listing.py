@@ -13,18 +13,28 @@ from crashhunt.trial import signature_of, without_folder
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from crashhunt.base.plugins import Group
     from crashhunt.trial import Argument
 
-__all__ = ["describe", "list_agents", "list_scenarios"]
+__all__ = ["describe", "list_agents", "list_oracles", "list_scenarios"]
 
 
 def list_agents() -> list[dict[str, Any]]:
     """Return the registered agents. One that cannot be imported is listed with a warning: nobody asked for it."""
+    return _list("agents")
+
+
+def list_oracles() -> list[dict[str, Any]]:
+    """Return the registered oracles, likewise."""
+    return _list("oracles")
+
+
+def _list(group: Group) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
-    for name, point in registered("agents").items():
+    for name, point in registered(group).items():
         entry: dict[str, Any] = {"name": name, "locator": point.value}
         try:
-            factory = locate("agents", name)
+            factory = locate(group, name)
             entry["title"] = (inspect.getdoc(factory) or "").partition("\n")[0]
             entry["arguments"] = _arguments(signature_of(factory).arguments.values())
         except CrashhuntError as error:

@@ -21,6 +21,7 @@ from crashhunt.recording import read_lanes
 from crashhunt.report._screen import format_arguments
 from crashhunt.report._show import Story
 from crashhunt.report._units import argument_units
+from crashhunt.trial import Outcome
 from crashhunt.world import approaches
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def _trials(directory: Path) -> dict[str, Any]:
     """Outcomes, and what was tried against how it went."""
     path = directory / layout.LEDGER
     if not has_begun(path):
-        return {"outcomes": {}, "steps": 0, "trials": [], "thinned": False}
+        return {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "thinned": False}
     ledger = Ledger(path)
     try:
         outcomes = ledger.outcomes()
@@ -121,7 +122,13 @@ def _trials(directory: Path) -> dict[str, Any]:
                         "ttc": round(time_s, 3) if math.isfinite(time_s) else None,
                     }
                 )
-        return {"outcomes": outcomes, "steps": ledger.steps_total(), "trials": trials, "thinned": every > 1}
+        return {
+            "outcomes": outcomes,
+            "categories": {name: Outcome(name).category for name in outcomes},
+            "steps": ledger.steps_total(),
+            "trials": trials,
+            "thinned": every > 1,
+        }
     finally:
         ledger.close()
 

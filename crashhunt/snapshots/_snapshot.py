@@ -24,6 +24,7 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
+from crashhunt.oracles import modules_of
 from crashhunt.plans import HuntSettings, SnapshotChoices, read_settings, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described, load_scenario
 from crashhunt.scenario.backends.sumo import movable
@@ -260,7 +261,8 @@ def take_snapshot(
     found = Sources(paths=[])
     if options.code:
         locators = [setup.agent for setup in scenario.agents.values()]
-        found = find_sources(locators, scenario.modules(), roots=options.roots, without=snapshots.parent)
+        modules = [*scenario.modules(), *modules_of(settings.oracles)]
+        found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
     argument_files = _argument_files(settings) if options.code else {}
     files = found.files | {argument_files[value]: Path(value) for value in argument_files}
     _check_size(files, options.limit_mb)

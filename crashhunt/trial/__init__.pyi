@@ -5,6 +5,7 @@ from ._outcome import (
     Category as Category,
     Outcome as Outcome,
     in_order as in_order,
+    outcome_of as outcome_of,
 )
 from ._plain import check_parts as check_parts, check_plain as check_plain
 from ._result import TrialResult as TrialResult

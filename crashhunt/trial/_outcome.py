@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from enum import StrEnum
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from crashhunt.world import EVENT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
-__all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order"]
+__all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order", "outcome_of"]
 
 Category = Literal["traffic crash", "traffic event", "software fault", "no crash"]
 """What a report calls an outcome."""
@@ -110,6 +110,16 @@ _CATEGORIES: dict[str, Category] = {
     **dict.fromkeys(("agent_error", "simulator_error", "process_died", "hang"), "software fault"),
 }
 """By outcome; what oracles declare is added. It says how a name is to be read and never changes what a trial does."""
+
+
+def outcome_of(data: Mapping[str, Any]) -> Outcome:
+    """Return what plain data calls ``outcome``, and an oracle's own with what it calls ``category``.
+
+    Raises:
+        ValueError: it is none.
+    """
+    outcome = Outcome(data["outcome"])
+    return Outcome.own(outcome.value, data["category"]) if outcome.is_own and "category" in data else outcome
 
 
 def in_order(outcomes: Iterable[str]) -> list[Outcome]:

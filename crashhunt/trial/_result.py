@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.trial._evidence import Collision, Escape, Failure, finite
-from crashhunt.trial._outcome import Outcome
+from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
@@ -60,6 +60,7 @@ class TrialResult:
         return {
             **data,
             "outcome": str(self.outcome),
+            **({"category": self.outcome.category} if self.outcome.is_own else {}),
             "spec": self.spec.to_json(),
             "closest": self.closest.to_json(),
             "collision": finite(asdict(self.collision)) if self.collision else None,
@@ -75,7 +76,7 @@ class TrialResult:
         hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
-            outcome=Outcome(data["outcome"]),
+            outcome=outcome_of(data),
             closest=ClosestApproach.from_json(data["closest"]),
             collision=Collision.from_json(hit) if hit else None,
             failure=Failure(**failure) if failure else None,
