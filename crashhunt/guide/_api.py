@@ -1,12 +1,14 @@
 """The reference of the Python interface, made from signatures and docstrings.
 
 The sources are read and not imported: a page is there at once, and no package has to be installed that only some need.
+Only functions whose arguments are made from a list when they are imported are asked themselves.
 """
 
 from __future__ import annotations
 
 import ast
 import functools
+import importlib
 import inspect
 import re
 from pathlib import Path
@@ -40,8 +42,8 @@ _OFFERED = {
 }
 """The modules that users import, and what of each is for them; empty for everything."""
 
-_SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):$")
-_WORDS = {"Args": "Arguments", "Attributes": "Attributes", "Returns": "Returns", "Yields": "Yields", "Raises": "Raises"}
+_SECTION = re.compile(r"^(Args|Attributes|Example|Returns|Yields|Raises):$")
+_WORDS = {name: name for name in ("Attributes", "Returns", "Yields", "Raises")} | {"Args": "Arguments"}
 _Definition = ast.ClassDef | ast.FunctionDef
 
 
@@ -63,21 +65,62 @@ def _module(name: str, names: list[str]) -> Iterator[str]:
 
 def _described(name: str, found: _Definition) -> Iterator[str]:
     yield f"### {name}\n"
-    if isinstance(found, ast.FunctionDef):
-        yield f"```python\n{found.name}{_signature(found, bound=False)}\n```\n"
-        yield from _docstring(ast.get_docstring(found))
-        return
-    made = _made_with(found)
+    if any("called_with" in ast.unparse(decorator) for decorator in found.decorator_list):
+        made, text = _asked(name)
+    else:
+        made = _signature(found) if isinstance(found, ast.FunctionDef) else _made_with(found)
+        text = ast.get_docstring(found)
     if made:
         yield f"```python\n{found.name}{made}\n```\n"
-    yield from _docstring(ast.get_docstring(found))
+    yield from _docstring(text)
+    if isinstance(found, ast.ClassDef):
+        if not made:
+            yield from _attributes(found)
+        yield from _methods(found)
+
+
+def _asked(name: str) -> tuple[str, str | None]:
+    """Signature and docstring as the function itself has them."""
+    module, _, attribute = name.rpartition(".")
+    function = getattr(importlib.import_module(module), attribute)
+    known = inspect.signature(function)
+    parts = []
+    for parameter in known.parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
+            parts.append("*")
+        default = "" if parameter.default is parameter.empty else f" = {_value(parameter.default)}"
+        parts.append(f"{parameter.name}: {_type(parameter.annotation)}{default}")
+    return f"{_call(parts)} -> {_type(known.return_annotation)}", inspect.getdoc(function)
+
+
+def _type(annotation: object) -> str:
+    said = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return re.sub(r"\b(collections\.abc|pathlib|typing)\.", "", said)
+
+
+def _value(value: object) -> str:
+    """A default as one would write it: members of an enumeration by their values."""
+    return re.sub(r"<\w+\.\w+: ('\w+')>", r"\1", repr(value))
+
+
+def _attributes(found: ast.ClassDef) -> Iterator[str]:
+    """Those of a protocol, each with the string below it."""
+    for item, after in zip(found.body, [*found.body[1:], ast.Pass()], strict=True):
+        if isinstance(item, ast.AnnAssign):
+            yield f"**`{ast.unparse(item.target)}: {ast.unparse(item.annotation)}`**\n"
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            yield from _docstring(str(ast.literal_eval(after.value)) if is_text else "")  # type: ignore[attr-defined]
+
+
+def _methods(found: ast.ClassDef) -> Iterator[str]:
     for method in found.body:
         if isinstance(method, ast.FunctionDef) and not method.name.startswith("_"):
             decorators = {ast.unparse(decorator) for decorator in method.decorator_list}
-            bound = "staticmethod" not in decorators
-            is_value = bool({"property", "cached_property"} & decorators)
-            shown = f": {ast.unparse(method.returns)}" if is_value and method.returns else _signature(method, bound)
-            yield f"**`{method.name}{'' if is_value and not method.returns else shown}`**\n"
+            if {"property", "cached_property"} & decorators:
+                shown = f": {ast.unparse(method.returns)}" if method.returns else ""
+            else:
+                shown = _signature(method, bound="staticmethod" not in decorators)
+            yield f"**`{method.name}{shown}`**\n"
             yield from _docstring(ast.get_docstring(method))
 
 
@@ -88,8 +131,12 @@ def _made_with(found: ast.ClassDef) -> str:
             return _signature(method, bound=True).removesuffix(" -> None")
     if not any("dataclass" in ast.unparse(decorator) for decorator in found.decorator_list):
         return ""
-    fields = [item for item in found.body if isinstance(item, ast.AnnAssign)]
+    fields = [item for item in found.body if isinstance(item, ast.AnnAssign) and not _is_private(item)]
     return _call([f"{ast.unparse(item.target)}: {ast.unparse(item.annotation)}{_default(item)}" for item in fields])
+
+
+def _is_private(field: ast.AnnAssign) -> bool:
+    return ast.unparse(field.target).startswith("_")
 
 
 def _default(field: ast.AnnAssign) -> str:
@@ -100,7 +147,7 @@ def _default(field: ast.AnnAssign) -> str:
     return f" = {made[1]}()" if made else f" = {said}"
 
 
-def _signature(function: ast.FunctionDef, bound: bool = False) -> str:
+def _signature(function: ast.FunctionDef, *, bound: bool = False) -> str:
     given = function.args
     if bound:
         given = ast.arguments(**{name: getattr(given, name) for name in given._fields} | {"args": given.args[1:]})
@@ -134,27 +181,34 @@ def _call(parts: list[str]) -> str:
 
 
 def _docstring(text: str | None) -> Iterator[str]:
-    """A docstring in Google's style as Markdown: prose stays, its sections become lists."""
-    in_section = False
+    """A docstring in Google's style as Markdown: prose stays, its sections become lists, examples are code."""
+    section = ""
     for line in inspect.cleandoc(text or "").splitlines():
-        section = _SECTION.match(line)
-        if section:
-            in_section = True
-            yield f"*{_WORDS[section[1]]}*:\n"
-        elif in_section and line.startswith("    "):
-            named = re.match(r" {4}(\*{0,2}\w+): (.*)", line)
-            if named:
-                yield f"- `{named[1]}`: {_prose(named[2])}"
-            else:
-                yield f"  {_prose(line.strip())}"
+        begun = _SECTION.match(line)
+        if begun or (section and line and not line.startswith("    ")):
+            if section == "Example":
+                yield "```\n"
+            section = begun[1] if begun else ""
+        if begun:
+            yield "```python" if section == "Example" else f"*{_WORDS[section]}*:\n"
+        elif section == "Example":
+            yield line[4:]
+        elif section:
+            yield _item(line)
         else:
-            in_section = in_section and not line
-            yield _prose(line) if not line.startswith("    ") else line
-    yield ""
+            yield line if line.startswith("    ") else _prose(line)
+    yield "```\n" if section == "Example" else ""
+
+
+def _item(line: str) -> str:
+    """A line of a section: the entry of a name, or what goes on with one."""
+    named = re.match(r" {4}(\*{0,2}\w+): (.*)", line)
+    return f"- `{named[1]}`: {_prose(named[2])}" if named else f"  {_prose(line.strip())}".rstrip()
 
 
 def _prose(line: str) -> str:
-    return re.sub(r"``([^`]+)``", r"`\1`", line)
+    """Prose with the marks of Markdown; what two colons announce is indented, which is enough."""
+    return re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"^::$|:(?=:$)", "", line))
 
 
 def _door(module: str) -> dict[str, tuple[str, str]]:

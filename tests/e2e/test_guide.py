@@ -108,6 +108,8 @@ def test_the_python_reference_has_what_users_import():
         assert {public for module, public in described if module == name} == set(offered)
     assert ("crashhunt.hunts", "HuntResults") in described
     assert "run(\n    directory: Path | str," in text
+    assert "    snapshot_limit_mb: float = 500.0,\n" in text
+    assert "'process_died', 'hang')" in text
     assert "- `parallel`: trials at a time; 0 for one per core." in text
     assert "**`act(observation: Any) -> Any`**" in text
     assert "(observation: Any, self" not in text
