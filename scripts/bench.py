@@ -79,7 +79,7 @@ def child_step(scenario: str) -> dict[str, float]:
     import libsumo
 
     from crashhunt.agents import KeepLaneWithSpeed
-    from crashhunt.episode import _episode as episode
+    from crashhunt.episode import Episode, Recorder, run_episode
     from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
@@ -112,7 +112,7 @@ def child_step(scenario: str) -> dict[str, float]:
 
         def whole() -> float:
             box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
-            result = episode.run_episode(
+            result = run_episode(
                 spec,
                 simulator=simulator,
                 make_agent=lambda *_: KeepLaneWithSpeed(speed),
@@ -142,20 +142,20 @@ def child_step(scenario: str) -> dict[str, float]:
             (libsumo, "simulationStep", "simulate"),
             (SumoSimulator, "_look", "look"),
             (SumoSimulator, "_observe", "observe"),
-            (episode._Run, "_check", "oracles"),
-            (episode._Scribe, "scene", "record"),
+            (Episode, "_find", "oracles"),
+            (Recorder, "scene", "record"),
             (KeepLaneWithSpeed, "act", "agent"),
             (ApproachMeter, "measure", "closest approach"),
         ):
             timed(owner, name, label)
-        set_up = episode._Run.set_up
+        start = Episode.start
 
-        def then_forget(*arguments: object) -> object:
-            result = set_up(*arguments)  # type: ignore[arg-type]
+        def then_forget(episode: Episode) -> object:
+            result = start(episode)
             spent.clear()  # the warm-up is no part of a step
             return result
 
-        episode._Run.set_up = then_forget  # type: ignore[assignment, method-assign]
+        Episode.start = then_forget  # type: ignore[assignment, method-assign]
         total = whole() * steps
     found = {f"part {label}": 1e6 * seconds / steps for label, seconds in spent.items()}
     found["part everything else"] = 1e6 * total / steps - sum(found.values())

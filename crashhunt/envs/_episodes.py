@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections import deque
 from pathlib import Path
@@ -9,11 +10,13 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import KeepLaneWithSpeed
-from crashhunt.base.errors import UsageError
+from crashhunt.base.errors import SimulatorError, UsageError
 from crashhunt.base.names import one_of
+from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.scenario import argument_values, load_scenario, with_action
 from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,13 +24,14 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-    from crashhunt.agents import Agent
+    from crashhunt.simulators import Simulator
     from crashhunt.world import Scene
 
 __all__ = ["Episodes"]
 
 _SIZE = (960, 540)  # of the picture, in pixels
 _TRAIL_S = 4.0  # of where the agent has been
+_OTHERS_SPEED = 10.0  # m/s
 
 
 class Episodes:
@@ -60,50 +64,49 @@ class Episodes:
         self._simulator = SumoSimulator(chosen, Path(self._stage.name))
         self._form = self._simulator.actions[self.agent]
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
-        self._others: dict[str, Agent] = {
-            other: KeepLaneWithSpeed(10.0, self._simulator.actions[other].space)
-            for other in chosen.agents
-            if other != self.agent
-        }
+        self._episode: Episode | None = None
         self.observation_space: Space[Any] = self._simulator.observation_spaces[self.agent]
         self.action_space: Space[Any] = self._form.space
         self.step_length_s = self._simulator.step_length_s
-        self._scenes: deque[Scene] = deque(maxlen=round(_TRAIL_S / self.step_length_s) + 1)
-        self._steps = 0
+        self._trail = _Trail(round(_TRAIL_S / self.step_length_s) + 1)
         self._crash_step = -1
         self._borders: Any = None
 
     def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
         """Begin an episode; return the observation and the info."""
+        if self._episode is not None:
+            self._episode.close()
         given = {**self._arguments, **arguments}
-        self._observations, _ = self._simulator.reset(seed=seed, options={"arguments": given})
-        self._steps, self._crash_step, self._borders = 0, -1, None
-        self._scenes.clear()
-        self._scenes.append(self._simulator.scene())
-        return self._observations[self.agent], {"sim_time_s": self._simulator.scene().time_s}
+        # Whoever steps the environment decides how long an episode is.
+        spec = TrialSpec(0, seed, {}, given, max_steps=sys.maxsize)
+        self._episode = Episode(spec, simulator=self._simulator, make_agent=_make_agent, observers=(self._trail,))
+        self._episode.start()
+        _raise_error(self._episode)
+        self._crash_step, self._borders = -1, None
+        return self._episode.observations[self.agent], {"sim_time_s": self._trail.scenes[-1].time_s}
 
     def step(self, action: Any) -> tuple[NDArray[Any], float, bool, dict[str, Any]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""
-        actions = {self.agent: self._form.encode(action)}
-        for other, driver in self._others.items():
-            if other in self._simulator.agents:
-                actions[other] = self._simulator.actions[other].encode(driver.act(self._observations[other]))
-        before = self._simulator.scene()
-        self._observations, rewards, terminations, _, _ = self._simulator.step(actions)
-        scene = self._simulator.scene()
-        scene.follow(before)
-        self._scenes.append(scene)
-        self._steps += 1
+        encoded = self._form.encode(action)  # here, where it is an error of the caller's, and the episode goes on
+        episode = self._episode
+        if episode is None:
+            raise SimulatorError("no episode has begun", fix="call reset")
+        _raise_error(episode)
+        if episode.result is not None or self.agent not in self._simulator.agents:
+            raise SimulatorError("the episode has ended", fix="call reset")
+        episode.step({self.agent: encoded})
+        _raise_error(episode)
+        scene = self._trail.scenes[-1]
         finding = merge_findings([found for oracle in self._oracles for found in oracle.check(scene, (self.agent,))])
         if finding is not None:
-            self._crash_step = self._steps
-        terminated = terminations[self.agent] or finding is not None
+            self._crash_step = episode.steps
+        terminated = episode.terminations[self.agent] or finding is not None
         info: dict[str, Any] = {"sim_time_s": scene.time_s}
         if scene.events:
             info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
-        return self._observations[self.agent], rewards[self.agent], terminated, info
+        return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
 
     def picture(self) -> NDArray[Any]:
         """Return the scene from above, uint8, shape (540, 960, 3)."""
@@ -112,22 +115,51 @@ class Episodes:
 
         if self._borders is None:
             self._borders = lane_borders(self._simulator.lanes())
-        first = self._steps - len(self._scenes) + 1
+        scenes, steps = self._trail.scenes, self._episode.steps if self._episode is not None else 0
+        first = steps - len(scenes) + 1
         seen = SimpleNamespace(
-            agents=(self.agent, *self._others),
-            actors=self._scenes[-1].roster.actors,
+            agents=(self.agent, *(other for other in self._simulator.actions if other != self.agent)),
+            actors=scenes[-1].roster.actors,
             prologue=SimpleNamespace(step_length_s=self.step_length_s),
             # A trail that is longer than what is remembered ends there.
-            scene=lambda step: self._scenes[max(0, step - first)],
+            scene=lambda step: scenes[max(0, step - first)],
         )
         view: Any = SceneView
         width, height = _SIZE
         drawn: NDArray[Any] = view(
             seen, self._borders, agent=self.agent, width=width, height=height, crash_step=self._crash_step
-        ).draw(self._steps)
+        ).draw(steps)
         return drawn
 
     def close(self) -> None:
         """End the simulation and remove its files."""
+        if self._episode is not None:
+            self._episode.close()
         self._simulator.close()
         self._stage.cleanup()
+
+
+class _Trail(Observer):
+    """Remembers the last scenes, for the picture.
+
+    Args:
+        length: how many.
+    """
+
+    def __init__(self, length: int) -> None:
+        self.scenes: deque[Scene] = deque(maxlen=length)
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        if step == 0:
+            self.scenes.clear()
+        self.scenes.append(scene)
+
+
+def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Any]) -> KeepLaneWithSpeed:
+    """Who drives where nobody else does; that of the environment's own vehicle is never asked."""
+    return KeepLaneWithSpeed(_OTHERS_SPEED, simulator.actions[agent].space)
+
+
+def _raise_error(episode: Episode) -> None:
+    if episode.error is not None:
+        raise episode.error

@@ -1,116 +1,321 @@
-"""One episode: the only place where agent, simulator, oracle and recorder meet."""
+"""One episode: the only place where agent, simulator and oracle meet."""
 
 from __future__ import annotations
 
-import itertools
 import random
 import sys
 import time
 import traceback
-from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
+from crashhunt.agents import Closes
+from crashhunt.base.errors import RecorderError
+from crashhunt.base.faculties import offers
+from crashhunt.episode._failures import failure_of
+from crashhunt.episode._nearness import Nearness
+from crashhunt.episode._observer import Observer
+from crashhunt.episode._recorder import Recorder
 from crashhunt.oracles import Finding, Oracle, TrafficEvents, merge_findings
-from crashhunt.recording import (
-    AgentChannel,
-    BlackBox,
-    Phase,
-    Prologue,
-    Tag,
-    digest_of,
-    encode_actors,
-    encode_events,
-    encode_heights,
-    encode_notes,
-    encode_spines,
-)
+from crashhunt.simulators import FlattensObservations
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
-from crashhunt.world import ApproachMeter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
+    from types import TracebackType
+
+    from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.simulators import Simulator
-    from crashhunt.world import Actor, Roster, Scene
+    from crashhunt.recording import BlackBox
+    from crashhunt.simulators import Observations, Simulator
+    from crashhunt.world import Scene
 
-__all__ = ["run_episode", "seed_everything", "words_of"]
+__all__ = ["Episode", "MakeAgent", "run_episode", "seed_everything"]
+
+MakeAgent = Callable[[str, "Simulator", "Mapping[str, Any]"], "Agent"]
+"""Called with agent id, simulator and arguments; returns the agent at the wheel."""
+
+_ASK_ALL: Mapping[str, Any] = {}  # nobody writes to it
 
 
-_MEASURE_EVERY = 256
-"""Steps; how near to a crash it was is measured over many at a time, which costs a tenth of one at a time."""
+class Episode:
+    """One trial, a step at a time; between two steps, everything about it can be looked at.
 
+    Whatever agent, simulator, oracles or observers raise ends the episode, and is in its result. Of a simulator that
+    is one for the process, only one episode runs at a time. The random generators of the process are left alone.
 
-@dataclass(slots=True)
-class _Scribe:
-    """Turns what happens into records."""
+    Args:
+        spec: which trial.
+        simulator: where.
+        make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
+        oracles: what decides whether a step is a crash.
+        crash_on: what ends the episode; a traffic crash or event of another kind is passed over, and it goes on.
+        observers: told of everything that happens, in this order.
 
-    box: BlackBox
-    numbers: dict[Actor, int] = field(default_factory=dict)
-    roster: Roster | None = None
-    events: Counter[str] = field(default_factory=Counter)
+    Attributes:
+        spec: which trial.
+        simulator: where.
+        names: everybody who takes part, in the order of their numbers; empty before the start.
+        agents: by name; one that is replaced between two steps is asked from the next one on.
+        observations: what the agents will be shown in the next step, by name.
+        rewards: of those that acted in the last step, by name.
+        terminations: whether these have arrived or crashed.
+        acting: the numbers of those that act in the next step.
+        scene: after the last step; None before the start.
+        steps: how many are complete.
+        result: None while it goes on.
+        error: the exception that ended it, where one did; until it is closed.
+        setup_s: wall time that `start` took, in s.
+    """
 
-    def begin(self, simulator: Simulator) -> tuple[str, ...]:
-        """Record who takes part; return the agents in the order of their numbers."""
-        agents = tuple(simulator.agents)
-        channels = []
-        for agent in agents:
-            space, form = simulator.observation_spaces[agent], simulator.actions[agent]
-            sample = form.encode(_any_action(form.space))
-            channels.append(
-                AgentChannel(
-                    agent,
-                    np.dtype(space.dtype).str,
-                    tuple(space.shape or ()),
-                    sample.dtype.str,
-                    sample.shape,
-                    tuple(form.names),
-                    tuple(getattr(simulator, "observation_names", ())),
-                )
-            )
-        self.box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(agents))
-        return agents
+    def __init__(
+        self,
+        spec: TrialSpec,
+        *,
+        simulator: Simulator,
+        make_agent: MakeAgent,
+        oracles: Sequence[Oracle] = (),
+        crash_on: Sequence[Outcome] = CRASHES,
+        observers: Sequence[Observer] = (),
+    ) -> None:
+        self.spec = spec
+        self.simulator = simulator
+        self.names: tuple[str, ...] = ()
+        self.agents: dict[str, Agent] = {}
+        self.observations: Observations = {}
+        self.rewards: Mapping[str, float] = {}
+        self.terminations: Mapping[str, bool] = {}
+        self.acting: tuple[int, ...] = ()
+        self.scene: Scene | None = None
+        self.steps = 0
+        self.result: TrialResult | None = None
+        self.error: BaseException | None = None
+        self.setup_s = 0.0
+        self._make_agent = make_agent
+        self._crash_on = frozenset(crash_on)
+        self._oracles = tuple(oracles)
+        if any(outcome.is_traffic_event for outcome in crash_on):
+            self._oracles += (TrafficEvents(),)
+        self._checks: list[Callable[[Scene, Sequence[str]], Sequence[Finding]]] = []
+        self._max_steps = spec.max_steps
+        self._nothing: tuple[float, ...] = ()
+        self._encoders: list[Callable[[Any], NDArray[Any]]] = []
+        self._unflatten: dict[str, Callable[[Any], Any]] = {}
+        # Only those that want to be told are called: this is done several times a step.
+        self._on_begin = [one.begin for one in observers if type(one).begin is not Observer.begin]
+        self._on_observation = [
+            one.observation for one in observers if type(one).observation is not Observer.observation
+        ]
+        self._on_action = [one.action for one in observers if type(one).action is not Observer.action]
+        self._on_scene = [one.scene for one in observers if type(one).scene is not Observer.scene]
+        self._on_end = [one.end for one in reversed(observers) if type(one).end is not Observer.end]
 
-    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
-        """Record a scene, and before it whatever is new about it."""
-        if scene.roster is not self.roster:
-            fresh = [actor for actor in scene.roster.actors if actor not in self.numbers]
-            if fresh:
-                self.numbers.update(zip(fresh, itertools.count(len(self.numbers)), strict=False))
-                self.box.append(Tag.ACTORS, 0, encode_actors(fresh))
-            numbers = np.array([self.numbers[actor] for actor in scene.roster.actors], "<u4")
-            self.box.append(Tag.ROSTER, 0, numbers.tobytes())
-            self.roster = scene.roster
-        if scene.lanes:
-            self.box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
-        if scene.contacts or scene.off_road:
-            self.box.append(Tag.EVENTS, 0, encode_events(scene))
-        if scene.heights:
-            self.box.append(Tag.HEIGHTS, 0, encode_heights(scene))
-        if scene.spines:
-            self.box.append(Tag.SPINES, 0, encode_spines(scene))
-        if scene.events:
-            self.box.note(encode_notes(scene.events))
-            self.events.update([event.kind for event in scene.events])
-        self.box.step(step, scene, rewards)
+    def start(self) -> TrialResult | None:
+        """Reset the simulator and make the agents.
+
+        Returns:
+            None where the first step can be taken, the result where not.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        began = time.monotonic()
+        try:
+            self._set_up()
+        except RecorderError:
+            raise
+        except BaseException as error:
+            self._break(error)
+        self.setup_s = time.monotonic() - began
+        return self.result
+
+    def step(self, given: Mapping[str, NDArray[Any]] = _ASK_ALL) -> TrialResult | None:
+        """Ask the agents, advance the simulator by one step, and judge what has come of it.
+
+        Args:
+            given: by name, the encoded actions of agents that are not asked in this step.
+
+        Returns:
+            None where the next step can be taken, the result where not.
+
+        Raises:
+            RecorderError: the disk is full.
+            RuntimeError: it is over, or has not been started.
+        """
+        if self.result is not None or self.scene is None:
+            raise RuntimeError("the episode is over" if self.result is not None else "the episode has not been started")
+        # This runs a million times a hunt: it is one function, looks up little, and does nothing twice.
+        try:
+            names, agents, observations, unflatten = self.names, self.agents, self.observations, self._unflatten
+            actions: dict[str, NDArray[Any]] = {}
+            for number in self.acting:
+                name = names[number]
+                observation: Any = observations[name]
+                for show in self._on_observation:
+                    show(number, observation)
+                if name in given:
+                    action = given[name]
+                else:
+                    try:
+                        if name in unflatten:
+                            observation = unflatten[name](observation)
+                        action = self._encoders[number](agents[name].act(observation))
+                    except BaseException as error:
+                        return self._fail(Outcome.AGENT_ERROR, error, name)
+                for tell in self._on_action:
+                    tell(number, action)
+                actions[name] = action
+            simulator = self.simulator
+            try:
+                self.observations, rewards, self.terminations, truncations, _ = simulator.step(actions)
+                scene = simulator.scene()
+                scene.follow(self.scene)
+                self.scene = scene
+            except RecorderError:
+                raise
+            except BaseException as error:  # an environment of a user's may exit as well as an agent
+                return self._fail(Outcome.SIMULATOR_ERROR, error)
+            self.rewards = rewards
+            step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
+            for show_scene in self._on_scene:
+                show_scene(step, scene, each)
+                self.steps = step  # whatever fails from here on, the step is recorded
+            self.steps = step
+            finding = self._find(scene)
+            if (
+                finding is None
+                and step < self._max_steps
+                and len(simulator.agents) == len(self.acting)
+                and True not in truncations.values()
+            ):
+                return None
+            return self._judge(finding, actions, truncations)
+        except RecorderError:
+            raise
+        except BaseException as error:
+            return self._break(error)
+
+    def close(self) -> None:
+        """Close the agents; may be called twice. What `result` says stays."""
+        # An exception holds the frames that it came through, and with them this episode and all that agents had open.
+        self.error = None
+        agents, self.agents = self.agents, {}
+        for agent in agents.values():
+            _quietly(agent)
+        for told in (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_end):
+            told.clear()  # observers may hold the episode
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _set_up(self) -> TrialResult | None:
+        spec, simulator = self.spec, self.simulator
+        agent = ""
+        try:
+            options = {"arguments": spec.scenario_arguments}
+            self.observations, _ = simulator.reset(seed=spec.seed, options=options)
+            self.names = tuple(simulator.agents)
+            self._nothing = (0.0,) * len(self.names)
+            for tell in self._on_begin:
+                tell(self)
+            for number, agent in enumerate(self.names):
+                self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
+                self.agents[agent].reset(_agent_seed(spec.seed, number))
+            agent = ""
+            self.scene = scene = simulator.scene()
+            for show in self._on_scene:
+                show(0, scene, self._nothing)
+        except RecorderError:
+            raise
+        except BaseException as error:
+            return self._fail(Outcome.INVALID, error, agent)
+        self._checks = [oracle.check for oracle in self._oracles]
+        finding = self._find(scene)
+        if finding is not None:
+            hit = finding.collision
+            what = f"{hit.collider} and {hit.victim} overlap" if hit else finding.event.what if finding.event else ""
+            failure = Failure("invalid", f"{what} before the first step")
+            return self._end(Outcome.INVALID, collision=hit, failure=failure)
+        self.acting = tuple(range(len(self.names)))
+        self._encoders = [simulator.actions[name].encode for name in self.names]
+        if offers(simulator, FlattensObservations):
+            self._unflatten = {name: _unflattener(space) for name, space in simulator.shown_spaces.items()}
+        return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
+
+    def _judge(
+        self, finding: Finding | None, actions: Mapping[str, Any], truncations: Mapping[str, bool]
+    ) -> TrialResult | None:
+        """Say whether a step was the last one, and note who goes on."""
+        if finding is not None:
+            return self._end(finding.outcome, collision=finding.collision, event=finding.event)
+        if len(self.simulator.agents) != len(self.acting) or True in truncations.values():
+            present, over = set(self.simulator.agents), self.terminations
+            self.acting = tuple([number for number, name in enumerate(self.names) if name in present])
+            if not self.acting or all(over.get(name) or truncations.get(name) for name in actions):
+                return self._end(Outcome.FINISHED)
+        return self._end(Outcome.SURVIVED) if self.steps >= self._max_steps else None
+
+    def _find(self, scene: Scene) -> Finding | None:
+        """What the oracles find in a scene, of what ends the episode."""
+        findings: list[Finding] = []
+        for check in self._checks:
+            if found := check(scene, self.names):
+                findings += found
+        if not findings:
+            return None
+        return merge_findings([finding for finding in findings if finding.outcome in self._crash_on])
+
+    def _fail(self, outcome: Outcome, error: BaseException, agent: str = "") -> TrialResult:
+        """End with an exception of an agent's, or of the simulator's."""
+        self.error = error
+        return self._end(outcome, failure=failure_of(error, agent))
+
+    def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
+        """End, and let everybody who has looked on add what they have found out."""
+        time_s = self.simulator.scene().time_s if self.scene is not None else 0.0
+        return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
+
+    def _add(self, result: TrialResult) -> TrialResult:
+        for tell in self._on_end:
+            result = tell(result)
+        self.result = result
+        return result
+
+    def _break(self, error: BaseException) -> TrialResult:
+        """End where it cannot go on, and neither agent nor simulator has said why.
+
+        An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
+        """
+        self.error = error
+        outcome = Outcome.AGENT_ERROR if isinstance(error, OSError | MemoryError) else Outcome.SIMULATOR_ERROR
+        self.result = TrialResult(self.spec, outcome, steps=self.steps, failure=failure_of(error, ""))
+        with suppress(BaseException):
+            self._add(self.result)
+        return self.result
 
 
 def run_episode(
     spec: TrialSpec,
     *,
     simulator: Simulator,
-    make_agent: Callable[[str, Simulator, Mapping[str, Any]], Agent],
+    make_agent: MakeAgent,
     box: BlackBox,
     oracles: Sequence[Oracle],
     crash_on: Sequence[Outcome] = CRASHES,
+    observers: Sequence[Observer] = (),
 ) -> TrialResult:
-    """Run one trial from its specification.
+    """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
     Args:
         spec: which trial.
@@ -119,6 +324,7 @@ def run_episode(
         box: what records it; `BlackBox.begin` has been called.
         oracles: what decides whether a step is a crash.
         crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
+        observers: who else is told; after the recorder.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -127,26 +333,15 @@ def run_episode(
         RecorderError: the disk is full.
     """
     began = time.monotonic()
-    setup_s = 0.0
     seed_everything(spec.seed)
-    agents: dict[str, Agent] = {}
-    if any(outcome.is_traffic_event for outcome in crash_on):
-        oracles = [*oracles, TrafficEvents()]
-    run = _Run(spec, simulator, box, tuple(oracles), frozenset(crash_on))
-    try:
-        result = run.set_up(make_agent, agents)
-        setup_s = time.monotonic() - began
-        if result is None:
-            result = run.drive(agents)
-        result = run.finish(result)
-    except RecorderError:
-        raise
-    except BaseException as error:  # of an oracle, or of what the agent has damaged, such as our own files
-        result = run.failed(error)
-    finally:
-        for agent in agents.values():
-            _quietly(agent)
-    return replace(result, setup_s=setup_s, wall_s=time.monotonic() - began)
+    everybody = (Recorder(box, simulator), Nearness(box.take_frames), *observers)
+    with Episode(
+        spec, simulator=simulator, make_agent=make_agent, oracles=oracles, crash_on=crash_on, observers=everybody
+    ) as episode:
+        result = episode.start()
+        while result is None:
+            result = episode.step()
+    return replace(result, setup_s=episode.setup_s, wall_s=time.monotonic() - began)
 
 
 def seed_everything(seed: int) -> None:
@@ -158,179 +353,23 @@ def seed_everything(seed: int) -> None:
         torch.manual_seed(seed)
 
 
-class _Run:
-    def __init__(
-        self,
-        spec: TrialSpec,
-        simulator: Simulator,
-        box: BlackBox,
-        oracles: tuple[Oracle, ...],
-        crash_on: frozenset[Outcome],
-    ) -> None:
-        self.spec = spec
-        self.simulator = simulator
-        self.box = box
-        self.oracles = oracles
-        self.crash_on = crash_on
-        self.scribe = _Scribe(box)
-        self.meter = ApproachMeter(())
-        self.names: tuple[str, ...] = ()
-        self.observations: dict[str, Any] = {}
-        self.step = 0
-
-    def set_up(
-        self, make_agent: Callable[[str, Simulator, Mapping[str, Any]], Agent], agents: dict[str, Agent]
-    ) -> TrialResult | None:
-        """Begin the episode; return a result where that fails."""
-        agent = ""
-        try:
-            options = {"arguments": self.spec.scenario_arguments}
-            self.observations, _ = self.simulator.reset(seed=self.spec.seed, options=options)
-            self.names = self.scribe.begin(self.simulator)
-            self.meter = ApproachMeter(self.names)
-            for number, agent in enumerate(self.names):
-                agents[agent] = make_agent(agent, self.simulator, self.spec.arguments.get(agent, {}))
-                agents[agent].reset(_agent_seed(self.spec.seed, number))
-            agent = ""
-            scene = self.simulator.scene()
-            self.scribe.scene(0, scene, (0.0,) * len(self.names))
-        except RecorderError:
-            raise
-        except BaseException as error:
-            return self._result(Outcome.INVALID, failure=_failure(error, agent))
-        finding = self._check(scene)
-        if finding is not None:
-            hit = finding.collision
-            what = f"{hit.collider} and {hit.victim} overlap" if hit else finding.event.what if finding.event else ""
-            failure = Failure("invalid", f"{what} before the first step")
-            return self._result(Outcome.INVALID, collision=hit, failure=failure)
-        return None
-
-    def drive(self, agents: dict[str, Agent]) -> TrialResult:
-        """Step until something ends the episode."""
-        simulator, box, scribe, names = self.simulator, self.box, self.scribe, self.names
-        forms = [simulator.actions[name].encode for name in names]
-        restored = {name: _restorer(space) for name, space in getattr(simulator, "shown_spaces", {}).items()}
-        observations = self.observations
-        everybody = tuple(range(len(names)))
-        active = everybody
-        before = simulator.scene()
-        for step in range(1, self.spec.max_steps + 1):
-            actions: dict[str, Any] = {}
-            for number in active:
-                name = names[number]
-                observation = observations[name]
-                box.observation(number, observation)
-                try:
-                    if name in restored:
-                        observation = restored[name](observation)
-                    action = forms[number](agents[name].act(observation))
-                except BaseException as error:
-                    return self._result(Outcome.AGENT_ERROR, failure=_failure(error, name))
-                box.action(number, action)
-                actions[name] = action
-            try:
-                observations, rewards, terminations, truncations, _ = simulator.step(actions)
-                scene = simulator.scene()
-                scene.follow(before)
-                before = scene
-            except RecorderError:
-                raise
-            except BaseException as error:  # an environment of a user's may exit as well as an agent
-                return self._result(Outcome.SIMULATOR_ERROR, failure=_failure(error, ""))
-            scribe.scene(step, scene, tuple([rewards.get(name, 0.0) for name in names]))
-            self.step = step
-            if step % _MEASURE_EVERY == 0:
-                self.meter.measure(box.take_frames())
-            finding = self._check(scene)
-            if finding is not None:
-                return self._result(finding.outcome, collision=finding.collision, event=finding.event)
-            if len(simulator.agents) != len(active) or True in truncations.values():
-                present = set(simulator.agents)
-                active = tuple(number for number in everybody if names[number] in present)
-                if not active or all(terminations.get(name) or truncations.get(name) for name in actions):
-                    return self._result(Outcome.FINISHED)
-        return self._result(Outcome.SURVIVED)
-
-    def finish(self, result: TrialResult) -> TrialResult:
-        """Add what is measured over the whole recording."""
-        self.meter.measure(self.box.take_frames())
-        self.box.mark(Phase.DONE)
-        digest = digest_of(*self.box.evidence()) if result.outcome is not Outcome.INVALID else ""
-        closest = self.meter.closest
-        if result.collision is not None and "overlap" in result.collision.seen_by:
-            closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
-        events = dict(self.scribe.events) if hasattr(self.simulator, "told_events") else None
-        return replace(result, digest=digest, closest=closest, events=events)
-
-    def failed(self, error: BaseException) -> TrialResult:
-        """What comes of an episode that could not go on, and neither agent nor simulator said why."""
-        outcome = Outcome.AGENT_ERROR if isinstance(error, OSError | MemoryError) else Outcome.SIMULATOR_ERROR
-        result = TrialResult(self.spec, outcome, steps=self.step, failure=_failure(error, ""))
-        try:
-            return self.finish(result)
-        except BaseException:
-            return result
-
-    def _check(self, scene: Scene) -> Finding | None:
-        findings: list[Finding] = []
-        for oracle in self.oracles:
-            findings += oracle.check(scene, self.names)
-        if not findings:
-            return None
-        return merge_findings([finding for finding in findings if finding.outcome in self.crash_on])
-
-    def _result(self, outcome: Outcome, **evidence: Any) -> TrialResult:
-        scene_time = 0.0
-        if self.scribe.roster is not None:
-            scene_time = self.simulator.scene().time_s
-        return TrialResult(self.spec, outcome, steps=self.step, sim_time_s=scene_time, **evidence)
-
-
 def _agent_seed(seed: int, number: int) -> int:
     """A seed of each agent's own, which differs from the simulator's."""
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 
-def _restorer(space: Any) -> Callable[[Any], Any]:
+def _unflattener(space: Any) -> Callable[[Any], Any]:
     """What makes a Dict or Tuple observation again of the flattened array, which is recorded."""
     from gymnasium.spaces import unflatten
 
     return partial(unflatten, space)
 
 
-def _any_action(space: Any) -> Any:
-    # Only the shape and type of the encoded action matter.
-    space.seed(0)
-    return space.sample()
-
-
-def _failure(error: BaseException, agent: str) -> Failure:
-    # A message of our own says everything; where in our code it was raised is nobody's business.
-    text = "" if isinstance(error, InvalidEpisodeError) else "".join(traceback.format_exception(error))
-    message = words_of(error) if isinstance(error, EpisodeError) else " ".join(words_of(error).split())
-    kinds: dict[type[BaseException], str] = {
-        ActionError: "bad action",
-        InvalidEpisodeError: "invalid",
-        SimulatorError: "simulator error",
-    }
-    return Failure(kinds.get(type(error), type(error).__name__), message, text, agent)
-
-
-def words_of(error: BaseException) -> str:
-    """Return the message of an exception, which may be of a class that cannot even say it."""
-    try:
-        return str(error)
-    except BaseException as other:  # in a ``__str__`` of somebody else's
-        return f"(its message cannot be had: {type(other).__name__})"
-
-
 def _quietly(agent: Agent) -> None:
     """Close an agent; whatever comes of that, the episode is over."""
     try:
-        close = getattr(agent, "close", None)
-        if close is not None:
-            close()
+        if offers(agent, Closes):
+            agent.close()
     except BaseException:
         with suppress(BaseException):
             traceback.print_exc()

@@ -9,11 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.agents import Closes, NeedsLibraries
 from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
+from crashhunt.base.faculties import offers
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.episode._episode import seed_everything
 from crashhunt.oracles import parse_oracle
+from crashhunt.simulators import BrakesFully, FlattensObservations
 from crashhunt.trial import signature_of
 
 if TYPE_CHECKING:
@@ -63,7 +66,8 @@ class Parts:
             import_module(module)
         for agent in scenario.agents:
             factory, _ = self._factory(agent)
-            for library in getattr(factory, "libraries", ()):  # PyTorch takes longer than a short trial may
+            # PyTorch takes longer than a short trial may.
+            for library in factory.libraries if offers(factory, NeedsLibraries) else ():
                 with suppress(ImportError):  # which the agent itself will tell
                     importlib.import_module(library)
 
@@ -84,7 +88,7 @@ class Parts:
         factory, wanted = self._factory(agent)
         given: dict[str, Any] = {}
         if "observation_space" in wanted:
-            shown = getattr(simulator, "shown_spaces", {})
+            shown = simulator.shown_spaces if offers(simulator, FlattensObservations) else {}
             given["observation_space"] = shown.get(agent) or simulator.observation_spaces[agent]
         if "action_space" in wanted:
             given["action_space"] = simulator.actions[agent].space
@@ -121,7 +125,7 @@ class Braking:
     """
 
     def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int) -> None:
-        braking = simulator.full_braking(agent) if hasattr(simulator, "full_braking") else None
+        braking = simulator.full_braking(agent) if offers(simulator, BrakesFully) else None
         if braking is None:
             raise InvalidEpisodeError(f"nobody knows how {agent} brakes as hard as it can")
         self._driver, self._after = driver, after
@@ -140,9 +144,8 @@ class Braking:
 
     def close(self) -> None:
         """Close the driver."""
-        close = getattr(self._driver, "close", None)
-        if close is not None:
-            close()
+        if offers(self._driver, Closes):
+            self._driver.close()
 
 
 def seal(settings: WorkerSettings) -> None:

@@ -20,11 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.errors import RecorderError
+from crashhunt.base.faculties import offers
 from crashhunt.base.files import whole_file
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors._baseline import Baseline
 from crashhunt.recording import DISK, BlackBox
+from crashhunt.simulators import BrakesFully, HasMap, TellsNotices, Tidies
 from crashhunt.trial import Outcome
 from crashhunt.world import Lane
 
@@ -145,7 +147,7 @@ class Worker:
 
     def _tell(self, simulator: Simulator) -> None:
         """Write down what the simulator wants people to know, for the hunt to tell them once."""
-        for notice in getattr(simulator, "notices", ()):
+        for notice in simulator.notices if offers(simulator, TellsNotices) else ():
             if notice not in self._noticed:
                 self._noticed.add(notice)
                 with (self._settings.scratch / layout.NOTICES).open("a", encoding="utf-8") as file:
@@ -183,9 +185,7 @@ class Worker:
 
     def full_braking(self, agent: str) -> FullBraking | None:
         """Return how a vehicle of the last trial brakes as hard as it can, where its simulator says."""
-        offered = getattr(self._simulator, "full_braking", None)
-        found: FullBraking | None = offered(agent) if offered is not None else None
-        return found
+        return self._simulator.full_braking(agent) if offers(self._simulator, BrakesFully) else None
 
     def _overruled(self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
         made = self._parts.agent(agent, simulator, arguments)
@@ -194,10 +194,9 @@ class Worker:
     def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
         """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""
         path = self._settings.scratch / layout.MAP
-        draw = getattr(simulator, "lanes", None)
-        if draw is None or (path.exists() and kept is None):
+        if not offers(simulator, HasMap) or (path.exists() and kept is None):
             return
-        lanes = draw()
+        lanes = simulator.lanes()
         if lanes is self._lanes:  # of a simulator whose map is always the same
             return
         text = json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes])
@@ -272,9 +271,8 @@ def loaded(settings: WorkerSettings) -> Parts:
 
 def _tidy(simulator: Simulator) -> None:
     """Have a simulator undo what its episodes change beyond itself, where it can."""
-    tidy = getattr(simulator, "tidy", None)
-    if tidy is not None:
-        tidy()
+    if offers(simulator, Tidies):
+        simulator.tidy()
 
 
 @contextmanager

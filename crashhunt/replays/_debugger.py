@@ -13,22 +13,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.faculties import offers
 from crashhunt.base.keeper import Kept
-from crashhunt.episode import Parts, WorkerSettings, run_episode, seal
+from crashhunt.episode import Observer, Parts, WorkerSettings, run_episode, seal
 from crashhunt.executors import fresh_environment
 from crashhunt.panels import labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
-from crashhunt.trial import TrialResult, TrialSpec
+from crashhunt.simulators import HasMeanings, HasWindow
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from crashhunt.agents import Agent
+    from crashhunt.episode import Episode
     from crashhunt.replays._replay import Rerun
     from crashhunt.simulators import Simulator
+    from crashhunt.world import Scene
 
 __all__ = ["Look", "debug", "main"]
 
@@ -115,130 +122,138 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / layout.BLACK_BOX))
 
 
-class _Accompanied:
-    """An agent, and which step it is in.
+class _Stop(Observer):
+    """Has the debugger drive in place of an agent, for one step.
+
+    Args:
+        name: of the vehicle.
+        step: the step in which to stop; 0 for none.
+    """
+
+    def __init__(self, name: str, step: int) -> None:
+        self._name = name
+        self._step = step
+
+    def begin(self, episode: Episode) -> None:
+        self._episode = episode
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        agents = self._episode.agents
+        if step + 1 == self._step and self._name in agents:
+            agents[self._name] = _Stopped(agents[self._name], self._name, self._step, scene)
+        elif step == self._step and isinstance(stopped := agents.get(self._name), _Stopped):
+            agents[self._name] = stopped.agent
+
+    def end(self, result: TrialResult) -> TrialResult:
+        if isinstance(stopped := self._episode.agents.get(self._name), _Stopped):
+            self._episode.agents[self._name] = stopped.agent  # which is closed now
+        return result
+
+
+class _Stopped:
+    """An agent in whose next ``act`` the debugger stops.
 
     Args:
         agent: who drives.
         name: of the vehicle.
+        step: which one it is.
+        scene: before it.
     """
 
-    def __init__(self, agent: Agent, name: str) -> None:
-        self._agent = agent
+    def __init__(self, agent: Agent, name: str, step: int, scene: Scene) -> None:
+        self.agent = agent
         self._name = name
-        self._step = 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._agent, name)  # whatever else it has, such as close()
+        self._step = step
+        self._scene = scene
 
     def reset(self, seed: int) -> None:
-        self._step = 0
-        self._agent.reset(seed)
+        self.agent.reset(seed)
 
     def act(self, observation: Any) -> Any:
-        self._step += 1
-        return self._agent.act(observation)
-
-
-class _Watched(_Accompanied):
-    """An agent that is looked into at one step.
-
-    Args:
-        agent: who drives.
-        name: of the vehicle.
-        step: the step in which to stop.
-        simulator: for the scene.
-    """
-
-    def __init__(self, agent: Agent, name: str, step: int, simulator: Simulator) -> None:
-        super().__init__(agent, name)
-        self._stop_at = step
-        self._simulator = simulator
-
-    def act(self, observation: Any) -> Any:
-        if self._step + 1 != self._stop_at:
-            return super().act(observation)
-        self._step += 1
         # At hand in the debugger, whatever the agent calls its own.
         for name, value in (
-            ("agent", self._agent), ("observation", observation), ("scene", self._simulator.scene()),
-            ("step", self._step),
+            ("agent", self.agent), ("observation", observation), ("scene", self._scene), ("step", self._step),
         ):  # fmt: skip
             setattr(builtins, name, value)
         print(f"step {self._step}, {self._name}: at hand are agent, observation, scene and step", flush=True)
-        return _Debugger().runcall(self._agent.act, observation)
+        return _Debugger().runcall(self.agent.act, observation)
 
 
-class _Drawn(_Accompanied):
-    """An agent whose panels are drawn after every step.
+class _Panels(Observer):
+    """Draws the agents' panels after every answer.
 
     Args:
-        agent: who drives; it has panels.
-        name: of the vehicle.
         first: the first step to draw.
         folder: for the pictures.
     """
 
-    def __init__(self, agent: Agent, name: str, first: int, folder: Path) -> None:
-        super().__init__(agent, name)
+    def __init__(self, first: int, folder: Path) -> None:
         self._first = first
         self._folder = folder
 
-    def act(self, observation: Any) -> Any:
-        action = super().act(observation)
-        if self._step >= self._first:
-            with scope(self._name):
-                try:
-                    panels = labelled(self.panels())
-                except Exception as error:  # a picture that fails is no crash of the agent
-                    panels = labelled({"panels": explanation(error)})
-            save_panels(self._folder, self._step, panels)
-        return action
+    def begin(self, episode: Episode) -> None:
+        self._episode = episode
+        for name in episode.names:
+            space = episode.simulator.actions[name].space
+            save_meanings(self._folder, name, space.meanings if offers(space, HasMeanings) else ())
+
+    def action(self, number: int, action: NDArray[Any]) -> None:
+        name, step = self._episode.names[number], self._episode.steps + 1
+        agent = self._episode.agents[name]
+        agent = agent.agent if isinstance(agent, _Stopped) else agent
+        if step < self._first or not offers(agent, DrawsPanels):
+            return
+        with scope(name):
+            try:
+                panels = labelled(agent.panels())
+            except Exception as error:  # a picture that fails is no crash of the agent
+                panels = labelled({"panels": explanation(error)})
+        save_panels(self._folder, step, panels)
 
 
-class _Windowed:
-    """A simulator in a window of its own, slowed down.
+class _Window(Observer):
+    """Slows a simulator down that shows what happens in a window of its own, and follows who crashes.
 
     Args:
         simulator: what is simulated.
         job: who is followed, how long a step takes, and before which step to pause.
     """
 
-    def __init__(self, simulator: Simulator, job: Mapping[str, Any]) -> None:
-        self._simulator: Any = simulator
-        open_window = getattr(simulator, "open_window", None)
-        if open_window is None:
-            raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
-        open_window()
+    def __init__(self, simulator: HasWindow, job: Mapping[str, Any]) -> None:
+        self._simulator = simulator
         self._job = job
-        self._step = 0
+        simulator.open_window()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._simulator, name)
+    def begin(self, episode: Episode) -> None:
+        self._follow()
 
-    def reset(self, **options: Any) -> Any:
-        began = self._simulator.reset(**options)
-        self._simulator.follow(self._job["agent"], self._job["other"])
-        return began
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        if step:
+            self._follow()
+            time.sleep(self._job["window"])
+        if step + 1 == self._job["pause_before"]:
+            self._pause(f"step {step + 1} is next. Press Enter to see what happens: ")
 
-    def step(self, actions: Any) -> Any:
-        self._step += 1
-        if self._step == self._job["pause_before"]:
-            self._pause(f"step {self._step} is next. Press Enter to see what happens: ")
-        try:
-            done = self._simulator.step(actions)
-            self._simulator.follow(self._job["agent"], self._job["other"])
-        except Exception:
-            if not self._simulator.window_open:
-                print("the window was closed", file=sys.stderr, flush=True)
-                os._exit(_LEFT)
-            raise
-        time.sleep(self._job["window"])
-        return done
+    def end(self, result: TrialResult) -> TrialResult:
+        if result.outcome is Outcome.SIMULATOR_ERROR and not self._simulator.window_open:
+            self._closed()
+        return result
 
     def leave(self) -> None:
         """Wait until everything has been looked at."""
         self._pause("Press Enter to close the window: ")
+
+    def _follow(self) -> None:
+        try:
+            self._simulator.follow(self._job["agent"], self._job["other"])
+        except Exception:
+            if not self._simulator.window_open:
+                self._closed()
+            raise
+
+    def _closed(self) -> None:
+        print("the window was closed", file=sys.stderr, flush=True)
+        os._exit(_LEFT)
 
     def _pause(self, prompt: str) -> None:
         print(prompt, end="", flush=True)
@@ -267,34 +282,33 @@ def main() -> None:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
         seal(settings)
         parts = Parts(settings)
-
-        def make_agent(name: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
-            made = parts.agent(name, simulator, arguments)
-            if name == job["agent"]:
-                made = _Watched(made, name, job["stop_at"], simulator)
-            if job["panels"] is not None:
-                meanings = getattr(simulator.actions[name].space, "meanings", ())
-                save_meanings(Path(job["panels"][1]), name, meanings)
-            if job["panels"] is not None and callable(getattr(made, "panels", None)):
-                made = _Drawn(made, name, job["panels"][0], Path(job["panels"][1]))
-            return made
-
-        simulator: Any = parts.simulator()
-        if job["window"] is not None:
-            simulator = _Windowed(simulator, job)
+        simulator = parts.simulator()
+        observers: list[Observer] = [_Stop(job["agent"], job["stop_at"])]
+        if job["panels"] is not None:
+            observers.append(_Panels(job["panels"][0], Path(job["panels"][1])))
+        window = _opened(simulator, job) if job["window"] is not None else None
+        if window is not None:
+            observers.append(window)
         box = BlackBox(folder / layout.BLACK_BOX)
         box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
         result = run_episode(
             spec,
             simulator=simulator,
-            make_agent=make_agent,
+            make_agent=parts.agent,
             box=box,
             oracles=parts.oracles(),
             crash_on=settings.crash_on,
+            observers=observers,
         )
-        if job["window"] is not None:
-            simulator.leave()
+        if window is not None:
+            window.leave()
         answer = {"result": result.to_json()}
     except CrashhuntError as error:
         answer = error.to_json()
     (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
+
+
+def _opened(simulator: Simulator, job: Mapping[str, Any]) -> _Window:
+    if not offers(simulator, HasWindow):
+        raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
+    return _Window(simulator, job)

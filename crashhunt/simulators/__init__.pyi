@@ -6,10 +6,20 @@ from ._actions import (
 )
 from ._kinematics import Kinematics as Kinematics
 from ._protocol import (
+    FACULTIES as FACULTIES,
     ActionForm as ActionForm,
+    BrakesFully as BrakesFully,
+    FlattensObservations as FlattensObservations,
     FullBraking as FullBraking,
+    HasMap as HasMap,
+    HasMeanings as HasMeanings,
+    HasWindow as HasWindow,
+    NamesObservations as NamesObservations,
     Observations as Observations,
     Simulator as Simulator,
     StepResult as StepResult,
+    TellsEvents as TellsEvents,
+    TellsNotices as TellsNotices,
+    Tidies as Tidies,
 )
 from ._spaces import action_form as action_form, native as native

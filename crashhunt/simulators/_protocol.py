@@ -8,14 +8,30 @@ from typing import TYPE_CHECKING, Any, Protocol
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     import numpy as np
     from gymnasium import Space
 
-    from crashhunt.world import Scene
+    from crashhunt.world import Lane, Scene
 
-__all__ = ["ActionForm", "FullBraking", "Observations", "Simulator", "StepResult"]
+__all__ = [
+    "FACULTIES",
+    "ActionForm",
+    "BrakesFully",
+    "FlattensObservations",
+    "FullBraking",
+    "HasMap",
+    "HasMeanings",
+    "HasWindow",
+    "NamesObservations",
+    "Observations",
+    "Simulator",
+    "StepResult",
+    "TellsEvents",
+    "TellsNotices",
+    "Tidies",
+]
 
 Observations = dict[str, NDArray[Any]]
 StepResult = tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
@@ -60,15 +76,9 @@ class Simulator(Protocol):
 
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
-    A simulator that wants people to know something about what it runs offers ``notices``, lines of text; a hunt tells
-    each once. One whose observations are structured hands out flattened arrays, and offers ``shown_spaces``: for each
-    such agent the Dict or Tuple space into which its observations are unflattened before the agent is shown them.
-    One that looks for traffic events offers ``told_events``, their kinds, and puts them into its scenes.
-    A simulator that has a map offers ``lanes() -> Sequence[Lane]`` as well, callable after the first `reset`. One that
-    has a window of its own offers ``open_window()``, called before the first `reset`, ``follow(agent, other)``, which
-    marks the two and keeps the agent in view, and ``window_open``; none of them changes what is simulated. One that
-    knows how a vehicle brakes as hard as it can offers ``full_braking(agent) -> FullBraking | None``, callable after
-    `reset`: with it, a hunt finds out until when a crash could have been avoided.
+    What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
+    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully` and `Tidies`.
+    Nothing is registered: whoever has the methods and attributes of one offers it.
     """
 
     @property
@@ -117,3 +127,105 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Let go of everything. May be called twice."""
+
+
+class TellsNotices(Protocol):
+    """A simulator that wants people to know something about what it runs."""
+
+    @property
+    def notices(self) -> Iterable[str]:
+        """Lines of text, looked at after each episode; a hunt tells each once."""
+
+
+class FlattensObservations(Protocol):
+    """A simulator whose observations are structured, and that hands out flattened arrays, which can be recorded."""
+
+    @property
+    def shown_spaces(self) -> Mapping[str, Space[Any]]:
+        """The Dict or Tuple space into which an agent's observations are unflattened before it is shown them.
+
+        Only of agents for which that is so; callable after `Simulator.reset`.
+        """
+
+
+class NamesObservations(Protocol):
+    """A simulator whose observations are tables: one row an actor, and columns that have names."""
+
+    @property
+    def observation_names(self) -> Sequence[str]:
+        """What the last axis of every observation holds, for people who read recordings; empty where nobody knows."""
+
+
+class TellsEvents(Protocol):
+    """A simulator that looks for traffic events, such as red lights, and puts them into its scenes."""
+
+    @property
+    def told_events(self) -> Sequence[str]:
+        """The kinds that it looks for: of those and no others, a result says how often they happened."""
+
+
+class HasMap(Protocol):
+    """A simulator whose actors drive on lanes."""
+
+    def lanes(self) -> Sequence[Lane]:
+        """Return all lanes; called after the first `Simulator.reset`.
+
+        A simulator whose map is always the same returns the same object each time, so that nobody reads it twice.
+        """
+
+
+class HasWindow(Protocol):
+    """A simulator with a window of its own, for people to watch. None of this changes what is simulated."""
+
+    def open_window(self) -> None:
+        """Show the episodes from now on; called before the first `Simulator.reset`."""
+
+    def follow(self, agent: str, other: str) -> None:
+        """Mark two actors, and keep the agent in view.
+
+        Args:
+            agent: a controlled vehicle; it may have left.
+            other: any actor, or empty for none; it may have left as well, or not yet entered.
+        """
+
+    @property
+    def window_open(self) -> bool:
+        """Whether nobody has closed the window."""
+
+
+class BrakesFully(Protocol):
+    """A simulator that knows how a vehicle brakes as hard as it can.
+
+    With it, a hunt finds out until when a crash could have been avoided.
+    """
+
+    def full_braking(self, agent: str) -> FullBraking | None:
+        """Return how; None where this vehicle's actions do not keep it in its lane. Called after `Simulator.reset`."""
+
+
+class Tidies(Protocol):
+    """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
+
+    def tidy(self) -> None:
+        """Put it back as it was before the first episode. Called after each, and before the first; the next follows."""
+
+
+class HasMeanings(Protocol):
+    """A discrete action space whose numbers stand for something."""
+
+    @property
+    def meanings(self) -> Sequence[str]:
+        """A word for each number, from 0, such as ``SLOWER``."""
+
+
+FACULTIES: tuple[type, ...] = (
+    TellsNotices,
+    FlattensObservations,
+    NamesObservations,
+    TellsEvents,
+    HasMap,
+    HasWindow,
+    BrakesFully,
+    Tidies,
+)
+"""Everything that a simulator may offer."""

@@ -1,0 +1,56 @@
+"""The observer that measures how near to a crash an episode comes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from crashhunt.episode._observer import Observer
+from crashhunt.world import ApproachMeter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.episode._episode import Episode
+    from crashhunt.trial import TrialResult
+    from crashhunt.world import ClosestApproach, Frame, Scene
+
+__all__ = ["Nearness"]
+
+_EVERY = 256
+"""Steps; how near to a crash it was is measured over many at a time, which costs a tenth of one at a time."""
+
+
+class Nearness(Observer):
+    """Measures the closest approach, and adds it to the result.
+
+    Args:
+        take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
+            columns already.
+    """
+
+    def __init__(self, take_frames: Callable[[], Sequence[Frame]]) -> None:
+        self._take_frames = take_frames
+        self._meter = ApproachMeter(())
+
+    @property
+    def closest(self) -> ClosestApproach:
+        """The closest approach so far, up to the last complete step."""
+        self._meter.measure(self._take_frames())
+        return self._meter.closest
+
+    def begin(self, episode: Episode) -> None:
+        """Note who is controlled."""
+        self._meter = ApproachMeter(episode.names)
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Measure, now and then."""
+        if step and step % _EVERY == 0:
+            self._meter.measure(self._take_frames())
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """Add the closest approach."""
+        closest = self.closest
+        if result.collision is not None and "overlap" in result.collision.seen_by:
+            closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
+        return replace(result, closest=closest)

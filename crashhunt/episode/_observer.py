@@ -1,0 +1,57 @@
+"""What looks on while an episode runs: it is told of everything, and changes nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.episode._episode import Episode
+    from crashhunt.trial import TrialResult
+    from crashhunt.world import Scene
+
+__all__ = ["Observer"]
+
+
+class Observer:
+    """Is told what happens in an episode; override what you want to be told. What is not overridden costs nothing.
+
+    Observers are told in their order, and of the end in the opposite one. Whatever one raises ends the episode, as
+    everything does that is neither the agent's nor the simulator's.
+    """
+
+    def begin(self, episode: Episode) -> None:
+        """The simulator has been reset, and `Episode.names` says who takes part; no agent has been made yet."""
+
+    def observation(self, number: int, observation: NDArray[Any]) -> None:
+        """An agent is about to be shown something.
+
+        Args:
+            number: of the agent, in `Episode.names`.
+            observation: as it is recorded: flattened, where the agent is shown something structured.
+        """
+
+    def action(self, number: int, action: NDArray[Any]) -> None:
+        """An agent has answered.
+
+        Args:
+            number: of the agent, in `Episode.names`.
+            action: encoded.
+        """
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """A step is complete.
+
+        Args:
+            step: its number; 0 for the scene before the first step.
+            scene: as it is now.
+            rewards: of every agent, in the order of `Episode.names`; 0 of those that did not act.
+        """
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """The episode is over; return its result, with what this observer has found out about it.
+
+        It is told again, with another result, where an observer has failed at the end.
+        """
+        return result

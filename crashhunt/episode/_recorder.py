@@ -1,0 +1,115 @@
+"""The observer that records an episode in the black box."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.base.faculties import offers
+from crashhunt.episode._observer import Observer
+from crashhunt.recording import (
+    AgentChannel,
+    BlackBox,
+    Phase,
+    Prologue,
+    Tag,
+    digest_of,
+    encode_actors,
+    encode_events,
+    encode_heights,
+    encode_notes,
+    encode_spines,
+)
+from crashhunt.simulators import NamesObservations, TellsEvents
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.episode._episode import Episode
+    from crashhunt.simulators import Simulator
+    from crashhunt.trial import TrialResult
+    from crashhunt.world import Actor, Roster, Scene
+
+__all__ = ["Recorder"]
+
+
+class Recorder(Observer):
+    """Turns what happens into records; adds the digest to the result, and how often which event happened.
+
+    It comes first of all observers: a step is complete when it is recorded.
+
+    Args:
+        box: what to write into; `BlackBox.begin` has been called.
+        simulator: whose episode it is.
+    """
+
+    def __init__(self, box: BlackBox, simulator: Simulator) -> None:
+        self._box = box
+        self._numbers: dict[Actor, int] = {}
+        self._roster: Roster | None = None
+        # Where nobody looks for events, none having happened says nothing.
+        self._events: Counter[str] | None = Counter() if offers(simulator, TellsEvents) else None
+        # Called in every step: without a call in between.
+        self.observation = box.observation  # type: ignore[assignment, method-assign]
+        self.action = box.action  # type: ignore[assignment, method-assign]
+
+    def begin(self, episode: Episode) -> None:
+        """Record who takes part."""
+        simulator = episode.simulator
+        columns = tuple(simulator.observation_names) if offers(simulator, NamesObservations) else ()
+        channels = []
+        for agent in episode.names:
+            space, form = simulator.observation_spaces[agent], simulator.actions[agent]
+            sample = form.encode(_any_action(form.space))
+            shown = np.dtype(space.dtype).str, tuple(space.shape or ())
+            channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
+        self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
+
+    def observation(self, number: int, observation: NDArray[Any]) -> None:
+        """Record what an agent is about to be shown."""
+        self._box.observation(number, observation)
+
+    def action(self, number: int, action: NDArray[Any]) -> None:
+        """Record what an agent answered."""
+        self._box.action(number, action)
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Record a scene, and before it whatever is new about it."""
+        if scene.roster is not self._roster:
+            fresh = [actor for actor in scene.roster.actors if actor not in self._numbers]
+            if fresh:
+                self._numbers.update(zip(fresh, itertools.count(len(self._numbers)), strict=False))
+                self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
+            numbers = np.array([self._numbers[actor] for actor in scene.roster.actors], "<u4")
+            self._box.append(Tag.ROSTER, 0, numbers.tobytes())
+            self._roster = scene.roster
+        if scene.lanes:
+            self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
+        if scene.contacts or scene.off_road:
+            self._box.append(Tag.EVENTS, 0, encode_events(scene))
+        if scene.heights:
+            self._box.append(Tag.HEIGHTS, 0, encode_heights(scene))
+        if scene.spines:
+            self._box.append(Tag.SPINES, 0, encode_spines(scene))
+        if scene.events:
+            self._box.note(encode_notes(scene.events))
+            if self._events is not None:
+                self._events.update([event.kind for event in scene.events])
+        self._box.step(step, scene, rewards)
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """Say so, and add the digest of what has been recorded."""
+        self._box.mark(Phase.DONE)
+        digest = digest_of(*self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
+        return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
+
+
+def _any_action(space: Any) -> Any:
+    # Only the shape and type of the encoded action matter.
+    space.seed(0)
+    return space.sample()
