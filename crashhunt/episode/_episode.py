@@ -17,7 +17,7 @@ import numpy as np
 from crashhunt.agents import Closes
 from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
-from crashhunt.episode._failures import failure_of
+from crashhunt.episode._failures import failure_of, is_emptied
 from crashhunt.episode._nearness import Nearness
 from crashhunt.episode._observer import Observer
 from crashhunt.episode._recorder import Recorder
@@ -180,7 +180,7 @@ class Episode:
             except RecorderError:
                 raise
             except BaseException as error:  # an environment of a user's may exit as well as an agent
-                return self._fail(Outcome.SIMULATOR_ERROR, error)
+                return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, error)
             self.rewards = rewards
             step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
             for show_scene in self._on_scene:
@@ -298,7 +298,8 @@ class Episode:
         An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
         """
         self.error = error
-        outcome = Outcome.AGENT_ERROR if isinstance(error, OSError | MemoryError) else Outcome.SIMULATOR_ERROR
+        agents = isinstance(error, OSError | MemoryError) or is_emptied()
+        outcome = Outcome.AGENT_ERROR if agents else Outcome.SIMULATOR_ERROR
         self.result = TrialResult(self.spec, outcome, steps=self.steps, failure=failure_of(error, ""))
         with suppress(BaseException):
             self._add(self.result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from crashhunt.trial import Failure
 if TYPE_CHECKING:
     from typing import Final
 
-__all__ = ["failure_of", "words_of"]
+__all__ = ["failure_of", "is_emptied", "words_of"]
 
 # Whatever is longer nobody reads, and everybody would have to carry: from the worker to the hunt, into the ledger, into
 # every bundle and page. Fifty megabytes of it take longer than a trial may.
@@ -39,7 +40,17 @@ def failure_of(error: BaseException, agent: str) -> Failure:
     if len(words) > _MESSAGE:
         words = f"{words[:_MESSAGE]}… ({len(words) - _MESSAGE} more characters are left out)"
     message = words if isinstance(error, EpisodeError) else " ".join(words.split())
+    if is_emptied():
+        message = f"somebody has emptied sys.modules, upon which this fails: {message}"
     return Failure(_KINDS.get(type(error), type(error).__name__[:_NAME]), message, _shortened(text), agent)
+
+
+def is_emptied() -> bool:
+    """Whether somebody has removed from ``sys.modules`` what Python had imported.
+
+    No simulator does that. What fails next is whatever imports something next, such as NumPy itself.
+    """
+    return __name__ not in sys.modules
 
 
 def words_of(error: BaseException) -> str:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.base.faculties import offers
 from crashhunt.crashes import partner
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import read_log
 from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.simulators import HasMeanings
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
@@ -61,8 +63,8 @@ class RecordedThenBrakes:
     def __init__(self, log: str, agent: str, after: int, action_space: Any) -> None:
         self._actions = read_log(Path(log)).actions(agent)
         self._after = after
-        meanings = getattr(action_space, "meanings", None)
-        self._brake: Any = (0.0, 0) if meanings is None else meanings.index("SLOWER")
+        meta = offers(action_space, HasMeanings)
+        self._brake: Any = tuple(action_space.meanings).index("SLOWER") if meta else (0.0, 0)
         self._step = 0
 
     def reset(self, seed: int) -> None:

@@ -65,6 +65,9 @@ class Agent:
     def surrogate(self):
         raise ValueError("half \udcff a letter")
 
+    def shouts(self):
+        raise ValueError("no! " * 12_500_000)
+
     def interrupts(self):
         raise KeyboardInterrupt
 

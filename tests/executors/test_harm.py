@@ -26,6 +26,7 @@ HARM = {
     "mute": "agent_error",
     "leaving": "agent_error",
     "surrogate": "agent_error",
+    "shouts": "agent_error",
     "interrupts": "agent_error",
     "exits": "agent_error",
     "leaks": UNHARMED,
@@ -35,7 +36,7 @@ HARM = {
     "leaves_folder": UNHARMED,
     "no_open": UNHARMED,
     "no_length": None,
-    "no_modules": None,  # what fails first is Python's
+    "no_modules": "agent_error",
     "no_output": UNHARMED,
     "no_json": "agent_error",
     "no_random": UNHARMED,
