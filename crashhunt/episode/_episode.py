@@ -21,8 +21,8 @@ from crashhunt.episode._failures import failure_of, is_emptied
 from crashhunt.episode._nearness import Nearness
 from crashhunt.episode._observer import Observer
 from crashhunt.episode._recorder import Recorder
-from crashhunt.oracles import Finding, Oracle, TrafficEvents, merge_findings
-from crashhunt.simulators import FlattensObservations
+from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
+from crashhunt.simulators import FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -240,6 +240,9 @@ class Episode:
             raise
         except BaseException as error:
             return self._fail(Outcome.INVALID, error, agent)
+        for oracle in self._oracles:
+            if isinstance(oracle, SeesMap):
+                oracle.see_map(simulator.lanes() if offers(simulator, HasMap) else ())
         self._checks = [oracle.check for oracle in self._oracles]
         finding = self._find(scene)
         if finding is not None:

@@ -1,0 +1,353 @@
+"""An episode, a step at a time: who is told what, what can be looked at, and whose fault it is."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+
+import numpy as np
+import pytest
+
+from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.episode import Episode, Nearness, Observer, Recorder, failure_of, run_episode
+from crashhunt.errors import RecorderError, SimulatorError
+from crashhunt.oracles import Overlap, ReportedCollision
+from crashhunt.recording import BlackBox
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.simulators.toy import ToySimulator
+from crashhunt.trial import Outcome, TrialSpec
+
+TWO = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
+ONE = Scenario(simulator="toy", agents={"ego": AgentSetup()})
+ORACLES = (ReportedCollision(), Overlap())
+
+
+class Teller(Observer):
+    """Writes down what it is told."""
+
+    def __init__(self, log=None, name=""):
+        self.log = [] if log is None else log
+        self.name = name
+
+    def begin(self, episode):
+        self.log.append((f"begin{self.name}", episode.names, dict(episode.agents)))
+
+    def observation(self, number, observation):
+        self.log.append((f"observation{self.name}", number, observation.tobytes()))
+
+    def action(self, number, action):
+        self.log.append((f"action{self.name}", number, action.tolist()))
+
+    def scene(self, step, scene, rewards):
+        self.log.append((f"scene{self.name}", step, scene.time_s, rewards))
+
+    def end(self, result):
+        self.log.append((f"end{self.name}", result.outcome))
+        return result
+
+
+class Driver:
+    """Drives at a speed, and fails as told."""
+
+    def __init__(self, speed=5.0, fail_at=0, error=None):
+        self.speed, self.fail_at, self.error = speed, fail_at, error
+        self.steps = self.closed = 0
+
+    def reset(self, seed):
+        self.seed = seed
+
+    def act(self, observation):
+        self.steps += 1
+        if self.steps == self.fail_at:
+            raise self.error
+        return self.speed, 0
+
+    def close(self):
+        self.closed += 1
+
+
+def spec(steps=10, **arguments):
+    return TrialSpec(0, 1, {}, arguments, steps)
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Makes and starts an episode on the toy."""
+    made = []
+
+    def start(*, scenario=ONE, agent=None, observers=(), steps=10, oracles=ORACLES, **arguments):
+        simulator = ToySimulator(scenario, tmp_path)
+        episode = Episode(
+            spec(steps, **arguments),
+            simulator=simulator,
+            make_agent=lambda name, *_: agent or KeepLaneWithSpeed(5.0, simulator.actions[name].space),
+            oracles=oracles,
+            observers=observers,
+        )
+        made.append(episode)
+        episode.start()
+        return episode
+
+    yield start
+    for episode in made:
+        episode.close()
+
+
+def drive(episode):
+    while episode.result is None:
+        episode.step()
+    return episode.result
+
+
+def test_observers_are_told_everything_in_order(begin):
+    log = []
+    episode = begin(scenario=TWO, observers=(Teller(log, " 1"), Teller(log, " 2")), steps=1)
+    assert [entry[0] for entry in log] == ["begin 1", "begin 2", "scene 1", "scene 2"]
+    assert log[0][1:] == (("ego", "second"), {})  # nobody drives yet
+    assert log[2][1:] == (0, 0.0, (0.0, 0.0))
+    shown = {name: observation.tobytes() for name, observation in episode.observations.items()}
+    log.clear()
+    episode.step()
+    told = [entry[0] for entry in log]
+    each = ["observation 1", "observation 2", "action 1", "action 2"]
+    assert told == [*each, *each, "scene 1", "scene 2", "end 2", "end 1"]
+    assert log[0][1:] == (0, shown["ego"])
+    assert log[4][1:] == (1, shown["second"])
+    assert log[2][2] == [5.0, 0.0]
+    assert log[-4][1] == 1
+    assert log[-4][3] == (episode.rewards["ego"], episode.rewards["second"])
+
+
+def test_what_is_not_overridden_is_not_called(begin, monkeypatch):
+    class Quiet(Observer):
+        pass
+
+    def called(*_):
+        raise AssertionError("called for nothing")
+
+    for name in ("begin", "observation", "action", "scene", "end"):
+        monkeypatch.setattr(Observer, name, called)
+    assert drive(begin(observers=(Quiet(),))).outcome is Outcome.SURVIVED
+
+
+def test_between_two_steps_everything_can_be_seen_and_agents_replaced(begin):
+    episode = begin(steps=4)
+    assert (episode.steps, episode.acting, episode.result, episode.error) == (0, (0,), None, None)
+    assert episode.scene.time_s == 0.0
+    before = episode.scene
+    assert episode.step() is None
+    assert (episode.steps, episode.scene.previous) == (1, before)
+    assert episode.terminations == {"ego": False}
+    assert set(episode.observations) == set(episode.rewards) == {"ego"}
+    episode.agents["ego"] = stand_in = Driver(3.0)
+    episode.step()
+    episode.step({"ego": np.array([9.0, 0.0])})  # who is not asked has no say
+    assert stand_in.steps == 1
+    assert episode.step().outcome is Outcome.SURVIVED
+    assert stand_in.steps == 2
+    with pytest.raises(RuntimeError, match="over"):
+        episode.step()
+    episode.close()
+    assert stand_in.closed == 1
+    episode.close()
+    assert stand_in.closed == 1
+    assert episode.result.steps == 4
+
+
+def test_it_has_to_be_started(tmp_path):
+    episode = Episode(spec(), simulator=ToySimulator(ONE, tmp_path), make_agent=lambda *_: Driver())
+    with pytest.raises(RuntimeError, match="started"):
+        episode.step()
+
+
+def test_given_actions_are_recorded_as_those_of_agents(begin):
+    asked, given = Teller(), Teller()
+    drive(begin(observers=(asked,), agent=Driver(7.0)))
+    episode = begin(observers=(given,), agent=Driver(fail_at=1, error=ValueError()))
+    while episode.result is None:
+        episode.step({"ego": np.array([7.0, 0.0])})
+    assert given.log[1:] == asked.log[1:]
+
+
+def run(tmp_path, simulator=None, agent=None, **options):
+    box = BlackBox(tmp_path / "box")
+    box.begin(pid=0, trial=0, started=0.0)
+    simulator = simulator or ToySimulator(ONE, tmp_path)
+    given = {"oracles": ORACLES, "make_agent": lambda *_: agent or Driver(30.0), **options}
+    arguments = given.pop("arguments", {})
+    return run_episode(spec(given.pop("steps", 600), **arguments), simulator=simulator, box=box, **given)
+
+
+def test_stepping_by_hand_gives_what_running_gives(begin, tmp_path):
+    whole = run(tmp_path)
+    assert whole.outcome is Outcome.COLLISION
+    box = BlackBox(tmp_path / "other")
+    box.begin(pid=0, trial=0, started=0.0)
+    nearness = Nearness(box.take_frames)
+    simulator = ToySimulator(ONE, tmp_path)
+    episode = Episode(
+        spec(600), simulator=simulator, make_agent=lambda *_: Driver(30.0), oracles=ORACLES,
+        observers=(Recorder(box, simulator), nearness),
+    )  # fmt: skip
+    episode.start()
+    gaps = []
+    while episode.result is None:
+        gaps.append(nearness.closest.gap_m)  # asking does not change what comes out
+        episode.step()
+    assert gaps == sorted(gaps, reverse=True)
+    assert gaps[0] == pytest.approx(30.0)
+    assert (episode.result.digest, episode.result.steps) == (whole.digest, whole.steps)
+    assert episode.result.closest == whole.closest
+    assert whole.closest.gap_m == 0.0
+    assert whole.events is None  # the toy looks for none
+
+
+def test_a_running_episode_can_be_forked(begin):
+    """Both copies end the same, as they would have without."""
+    expected = drive(begin(agent=Driver(20.0), steps=200))
+    episode = begin(agent=Driver(20.0), steps=200)
+    for _ in range(15):
+        episode.step()
+    receive, send = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.write(send, pickle.dumps(drive(episode).to_json()))
+        finally:
+            os._exit(0)
+    os.close(send)
+    with os.fdopen(receive, "rb") as pipe:
+        theirs = pickle.load(pipe)
+    os.waitpid(child, 0)
+    assert theirs == drive(episode).to_json() == expected.to_json()
+
+
+class Failing(Observer):
+    def __init__(self, what, error):
+        self.what, self.error = what, error
+
+    def _fail(self, what, step=0):
+        if what == self.what:
+            raise self.error
+
+    def observation(self, number, observation):
+        self._fail("observation")
+
+    def scene(self, step, scene, rewards):
+        self._fail(f"scene {step}")
+
+    def end(self, result):
+        self._fail("end")
+        return result
+
+
+class FailingOracle:
+    name = "failing"
+
+    def __init__(self, at, error):
+        self.at, self.error = at, error
+
+    def check(self, scene, agents):
+        if round(scene.time_s * 10) == self.at:
+            raise self.error
+        return []
+
+
+@pytest.mark.parametrize(
+    ("options", "outcome", "steps", "kind", "agent"),
+    [
+        ({"agent": Driver(fail_at=3, error=ValueError("mine"))}, "agent_error", 2, "ValueError", "ego"),
+        ({"agent": Driver(fail_at=3, error=SystemExit(4))}, "agent_error", 2, "SystemExit", "ego"),
+        ({"agent": Driver("fast")}, "agent_error", 0, "bad action", "ego"),
+        ({"arguments": {"fail_at_step": 3}}, "simulator_error", 2, "simulator error", ""),
+        ({"arguments": {"fail_reset": True}}, "invalid", 0, "invalid", ""),
+        ({"make_agent": lambda *_: 1 / 0}, "invalid", 0, "ZeroDivisionError", "ego"),
+        ({"oracles": [FailingOracle(2, KeyError("x"))]}, "simulator_error", 2, "KeyError", ""),
+        ({"oracles": [FailingOracle(0, KeyError("x"))]}, "simulator_error", 0, "KeyError", ""),
+        ({"oracles": [FailingOracle(2, OSError("files"))]}, "agent_error", 2, "OSError", ""),
+        ({"observers": [Failing("observation", KeyError("x"))]}, "simulator_error", 0, "KeyError", ""),
+        ({"observers": [Failing("scene 0", KeyError("x"))]}, "invalid", 0, "KeyError", ""),
+        ({"observers": [Failing("scene 2", KeyError("x"))]}, "simulator_error", 2, "KeyError", ""),
+        ({"observers": [Failing("end", MemoryError())], "steps": 4}, "agent_error", 4, "MemoryError", ""),
+    ],
+)  # fmt: skip
+def test_every_error_is_somebodys(tmp_path, options, outcome, steps, kind, agent):
+    result = run(tmp_path, **options)
+    assert (str(result.outcome), result.steps, result.failure.kind, result.failure.agent) == (
+        outcome, steps, kind, agent
+    )  # fmt: skip
+    assert bool(result.digest) == (outcome != "invalid" and "end" not in [o.what for o in options.get("observers", ())])
+
+
+def test_the_error_itself_is_at_hand_until_it_is_closed(begin):
+    error = SimulatorError("mine")
+    episode = begin(agent=Driver(fail_at=2, error=error))
+    assert drive(episode).outcome is Outcome.AGENT_ERROR
+    assert episode.error is error
+    episode.close()
+    assert episode.error is None
+
+
+def test_a_full_disk_is_nobodys_fault_and_agents_are_closed_all_the_same(tmp_path):
+    agent = Driver()
+    with pytest.raises(RecorderError):
+        run(tmp_path, agent=agent, observers=[Failing("scene 2", RecorderError("full"))])
+    assert agent.closed == 1
+    with pytest.raises(RecorderError):
+        run(tmp_path, agent=agent, observers=[Failing("scene 0", RecorderError("full"))])
+    assert agent.closed == 2
+
+
+def test_an_episode_leaves_the_generators_of_the_process_alone(begin):
+    import random
+
+    random.seed(5)
+    state = random.getstate()
+    drive(begin())
+    assert random.getstate() == state
+
+
+def test_what_is_told_of_an_exception_is_bounded():
+    def fail(message):
+        try:
+            raise ValueError(message)
+        except ValueError as error:
+            return failure_of(error, "ego")
+
+    short = fail("no")
+    assert (short.message, short.kind) == ("no", "ValueError")
+    assert short.traceback.startswith("Traceback") and short.traceback.endswith("ValueError: no\n")  # noqa: PT018
+    assert fail("x" * 10_000).message == "x" * 10_000
+    long = fail("x" * 5_000_000)
+    assert long.message == "x" * 10_000 + "… (4990000 more characters are left out)"
+    assert len(long.traceback) < 101_000
+    assert long.traceback.startswith("Traceback")
+    assert "characters are left out) …" in long.traceback
+    assert long.traceback.endswith("xxx\n")
+
+
+def test_who_empties_sys_modules_is_to_blame_for_what_fails_next(tmp_path):
+    """In a copy of this process, which will not do for anything else."""
+
+    class Empties(Driver):
+        def act(self, observation):
+            if self.steps == 3:
+                sys.modules.clear()
+            return super().act(observation)
+
+    receive, send = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            result = run(tmp_path, agent=Empties(), arguments={"fail_at_step": 5})
+            failure = result.failure
+            os.write(send, f"{result.outcome}|{result.steps}|{failure.message if failure else ''}".encode())
+        finally:
+            os._exit(0)
+    os.close(send)
+    with os.fdopen(receive) as pipe:
+        outcome, steps, message = pipe.read().split("|")
+    os.waitpid(child, 0)
+    assert (outcome, steps) == ("agent_error", "4")
+    assert message.startswith("somebody has emptied sys.modules, upon which this fails: the toy was told to fail")
