@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.faculties import offers
+from crashhunt.simulators import HasMeanings
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from gymnasium import Space
 
@@ -27,12 +30,15 @@ def meta_actions(space: Space[Any] | None) -> Mapping[str, int] | None:
     Raises:
         ValueError: its actions are neither.
     """
-    count = getattr(space, "n", None)
-    if count is None:
-        if space is not None and not hasattr(space, "spaces"):
-            raise ValueError(f"drives by (target speed, lane change) or meta-actions, not by {space}")
+    if space is None:
         return None
-    meanings = getattr(space, "meanings", _ALL if count == len(_ALL) else ())
+    from gymnasium.spaces import Dict, Discrete, Tuple
+
+    if isinstance(space, Tuple | Dict):
+        return None
+    meanings: Sequence[str] = ()
+    if isinstance(space, Discrete):
+        meanings = space.meanings if offers(space, HasMeanings) else _ALL if space.n == len(_ALL) else ()
     numbers = {name: number for number, name in enumerate(meanings)}
     if "IDLE" not in numbers:
         raise ValueError(f"drives by (target speed, lane change) or meta-actions, not by {space}")

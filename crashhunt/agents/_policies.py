@@ -115,7 +115,7 @@ class _Network(ABC):
         except Exception as error:
             why = f"{type(error).__name__}: {_line(error)}"
             raise ValueError(f"{path!r} does not take observations of the shape {batch.shape} ({why})") from error
-        wanted = int(getattr(self._space, "n", 0)) or math.prod(getattr(self._space, "shape", None) or ())
+        wanted = _count(self._space)
         if values.shape[:1] != (1,) or (wanted and values[0].size != wanted):
             raise ValueError(
                 f"{path!r} answers one observation with the shape {values.shape}; (1, {wanted}) is needed for actions "
@@ -138,10 +138,12 @@ class _Network(ABC):
         """Return the action of the network's answer."""
         seen = np.array(observation, np.float32)
         values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
-        low, high = getattr(self._space, "low", None), getattr(self._space, "high", None)
-        if low is None or high is None:
-            return int(np.argmax(values) + getattr(self._space, "start", 0))
-        return np.clip(values.reshape(low.shape), low, high).astype(low.dtype)
+        from gymnasium.spaces import Box, Discrete
+
+        space = self._space
+        if isinstance(space, Box):
+            return np.clip(values.reshape(space.shape), space.low, space.high).astype(space.dtype)
+        return int(np.argmax(values) + (space.start if isinstance(space, Discrete) else 0))
 
 
 class TorchPolicy(_Network):
@@ -235,9 +237,24 @@ def _line(error: BaseException) -> str:
 
 def _choices(space: Any) -> Any:
     """What tells spaces of actions apart as far as a policy's answers go: kind, shape and number."""
-    sizes = getattr(space, "n", None) if hasattr(space, "n") else getattr(space, "nvec", ())
-    return type(space).__name__, _shape(space), np.asarray(sizes).tolist()
+    from gymnasium.spaces import Discrete, MultiDiscrete
+
+    sizes = (
+        space.nvec.tolist() if isinstance(space, MultiDiscrete) else int(space.n) if isinstance(space, Discrete) else []
+    )
+    return type(space).__name__, _shape(space), sizes
+
+
+def _count(space: Space[Any] | None) -> int:
+    """How many numbers a network answers with: one for each discrete action, or the continuous action itself."""
+    from gymnasium.spaces import Discrete
+
+    return int(space.n) if isinstance(space, Discrete) else math.prod(space.shape or () if space is not None else ())
 
 
 def _shape(space: Any) -> Any:
-    return {name: _shape(inner) for name, inner in space.spaces.items()} if hasattr(space, "spaces") else space.shape
+    from gymnasium.spaces import Dict, Tuple
+
+    if isinstance(space, Dict):
+        return {name: _shape(inner) for name, inner in space.spaces.items()}
+    return [_shape(inner) for inner in space.spaces] if isinstance(space, Tuple) else space.shape

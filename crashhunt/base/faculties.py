@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import TypeGuard
+
+    from typing_extensions import TypeIs
 
 __all__ = ["members", "offers"]
 
 T = TypeVar("T")
 
 
-def offers(thing: object, faculty: Callable[..., T]) -> TypeGuard[T]:
+def offers(thing: object, faculty: Callable[..., T]) -> TypeIs[T]:
     """Whether an object has everything that a protocol names; what is None counts as not there.
 
     Unlike `isinstance` with a runtime-checkable protocol, this finds what an object gets through ``__getattr__``, in

@@ -100,7 +100,7 @@ def _main() -> None:
         processes.die_with(keeper)
         sys.argv = [module, *arguments]
         found = importlib.import_module(module)
-        if hasattr(found, "main"):
+        if "main" in vars(found):
             found.main()
         else:  # the debugger of older versions
             del sys.modules[module]

@@ -111,12 +111,12 @@ def _outcomes(*, crashes: bool) -> list[str]:
 
 
 def _crashes(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    folder = getattr(parsed_args, "directory", None)
+    folder = vars(parsed_args).get("directory")
     return sorted(path.parent.name for path in Path(folder).glob("crashes/*/crash.json")) if folder else []
 
 
 def _runs(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    folder = getattr(parsed_args, "directory", None)
+    folder = vars(parsed_args).get("directory")
     if not folder:
         return []
     return sorted(path.parent.relative_to(folder).as_posix() for path in Path(folder).glob("*/*/hunt.toml"))
@@ -126,7 +126,7 @@ def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]
     """What the scenario says of arguments; it is only read, as a shell does not wait."""
     from crashhunt.scenario import shipped_folder
 
-    name = getattr(parsed_args, "scenario", None) or "loop"
+    name = vars(parsed_args).get("scenario") or "loop"
     for file in (shipped_folder() / name / layout.SCENARIO, Path(name) / layout.SCENARIO, Path(name)):
         try:
             said = tomllib.loads(file.read_text(encoding="utf-8"))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from crashhunt.agents import Agent
+from crashhunt.agents import Agent, Closes, DrawsPanels, NeedsLibraries
+from crashhunt.base.faculties import offers
+from crashhunt.panels import labelled
 
 if TYPE_CHECKING:
     from crashhunt.simulators import ActionForm
@@ -19,7 +21,7 @@ Make = Callable[[], Agent]
 
 
 class AgentContract:
-    """Checks `crashhunt.agents.Agent`.
+    """Checks `crashhunt.agents.Agent`, and the faculties that an agent offers.
 
     The fixture ``make`` returns a function that makes an agent, ``form`` how its actions are written, and
     ``observations`` what it is shown, in order.
@@ -63,3 +65,46 @@ class AgentContract:
             before = observation.copy()
             agent.act(observation)
             assert np.array_equal(observation, before)
+
+    def test_panels_are_pictures_and_change_nothing(
+        self, make: Make, form: ActionForm, observations: list[np.ndarray[Any, Any]]
+    ) -> None:
+        """`DrawsPanels`: it acts as it does when nobody looks, and what it shows can be drawn and told apart."""
+
+        def drive(*, looked_at: bool) -> list[bytes]:
+            agent = make()
+            agent.reset(1)
+            answers = []
+            for observation in observations:
+                answers.append(form.encode(agent.act(observation)).tobytes())
+                if looked_at and offers(agent, DrawsPanels):
+                    panels = labelled(agent.panels())
+                    assert len(panels) == len({label for label, _ in panels})
+                    for label, panel in panels:
+                        assert panel.draw(label=label).dtype == np.uint8
+            return answers
+
+        assert drive(looked_at=True) == drive(looked_at=False)
+
+    def test_it_can_be_closed_whenever_a_trial_may_end(
+        self, make: Make, observations: list[np.ndarray[Any, Any]]
+    ) -> None:
+        """`Closes`: before its reset, after it, and after it has acted; and another one drives all the same."""
+        for ends_after in (-1, 0, 1):
+            agent = make()
+            if ends_after >= 0:
+                agent.reset(1)
+            for observation in observations[: max(0, ends_after)]:
+                agent.act(observation)
+            if offers(agent, Closes):
+                agent.close()
+        agent = make()
+        agent.reset(1)
+        agent.act(observations[0])
+
+    def test_the_libraries_that_it_needs_are_names(self, make: Make) -> None:
+        """`NeedsLibraries`: a sequence of names of modules, and not one text."""
+        kind = type(make())
+        libraries: Sequence[str] = kind.libraries if offers(kind, NeedsLibraries) else ()
+        assert not isinstance(libraries, str)
+        assert all(part.isidentifier() for name in libraries for part in name.split("."))

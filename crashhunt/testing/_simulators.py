@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from crashhunt.base.errors import ActionError
-from crashhunt.simulators import Simulator
+from crashhunt.base.faculties import members, offers
+from crashhunt.simulators import (
+    FACULTIES,
+    BrakesFully,
+    FlattensObservations,
+    FullBraking,
+    HasMap,
+    NamesObservations,
+    Simulator,
+    TellsEvents,
+    TellsNotices,
+    Tidies,
+)
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from crashhunt.world import Event
 
 __all__ = ["SimulatorContract"]
 
@@ -17,7 +34,7 @@ Make = Callable[[], Simulator]
 
 
 class SimulatorContract:
-    """Checks `crashhunt.simulators.Simulator`.
+    """Checks `crashhunt.simulators.Simulator`, and the faculties that a simulator offers.
 
     The fixture ``make`` returns a function that makes a simulator; ``steps`` is how far an episode must get with the
     action that each agent's space samples first.
@@ -63,6 +80,20 @@ class SimulatorContract:
             seen,
             sorted(rewards.items()),
         )
+
+    def _events(self, simulator: Simulator) -> list[Event]:
+        """What happens in an episode, besides crashes."""
+        simulator.reset(seed=1)
+        found = list(simulator.scene().events)
+        for agent in simulator.agents:
+            simulator.actions[agent].space.seed(3)
+        for _ in range(self.steps):
+            if not simulator.agents:
+                break
+            forms = {agent: simulator.actions[agent] for agent in simulator.agents}
+            simulator.step({agent: form.encode(form.space.sample()) for agent, form in forms.items()})
+            found += simulator.scene().events
+        return found
 
     def test_an_episode_depends_on_its_seed_alone(self, make: Make) -> None:
         """Equal seeds give equal episodes, whatever ran before, and another seed another one."""
@@ -121,26 +152,110 @@ class SimulatorContract:
                     form.encode(nonsense)
         simulator.close()
 
-    def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
-        """Where a simulator offers ``full_braking``, its action is inside the space, and slows the vehicle down."""
+    def test_it_offers_faculties_as_a_whole(self, make: Make) -> None:
+        """Who has one part of a faculty has all of it: half a window would be taken for none."""
         simulator = make()
         simulator.reset(seed=1)
-        offered: Callable[[str], Any] = getattr(simulator, "full_braking", lambda _: None)
-        for agent in simulator.agents:
-            braking = offered(agent)
-            if any(offered(other) is None for other in simulator.agents):
-                continue
+        for faculty in FACULTIES:
+            there = [name for name in members(faculty) if getattr(simulator, name, None) is not None]
+            assert there in ([], [*members(faculty)]), f"{faculty.__name__} is offered in part: {there}"
+        simulator.close()
+
+    def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
+        """The action of `BrakesFully` is inside the space, and slows the vehicle down."""
+        simulator = make()
+        simulator.reset(seed=1)
+        names = tuple(simulator.agents)
+        brakes: dict[str, FullBraking] = {}
+        if offers(simulator, BrakesFully):
+            for name in names:
+                braking = simulator.full_braking(name)
+                if braking is not None:
+                    assert braking.how
+                    assert braking.deceleration is None or braking.deceleration > 0
+                    brakes[name] = braking
+        actions = {name: simulator.actions[name].encode(braking.action) for name, braking in brakes.items()}
+        for agent in names if len(brakes) == len(names) else ():
             simulator.reset(seed=1)
             before = simulator.scene().speeds[simulator.scene().roster.index[agent]]
             for _ in range(3):
                 if agent in simulator.agents:
-                    actions = {a: simulator.actions[a].encode(offered(a).action) for a in simulator.agents}
-                    simulator.step(actions)
+                    simulator.step({other: actions[other] for other in simulator.agents})
             scene = simulator.scene()
             row = scene.roster.index.get(agent)
             assert row is None or scene.speeds[row] <= before + 1e-6
-            assert braking.deceleration is None or braking.deceleration > 0
         simulator.close()
+
+    def test_the_map_has_every_lane_once(self, make: Make) -> None:
+        """`HasMap`: lanes have a name of their own, a width and at least two points; and they stay the same."""
+        simulator = make()
+        simulator.reset(seed=1)
+        if offers(simulator, HasMap):
+            lanes = list(simulator.lanes())
+            assert len({lane.id for lane in lanes}) == len(lanes)
+            for lane in lanes:
+                assert lane.width > 0
+                assert np.shape(lane.shape)[1:] == (2,)
+                assert len(lane.shape) > 1
+                assert np.isfinite(lane.shape).all()
+            assert list(simulator.lanes()) == lanes
+        simulator.close()
+
+    def test_structured_observations_can_be_had_back(self, make: Make) -> None:
+        """`FlattensObservations`: what an agent is shown is unflattened from what is recorded, and flattens to it."""
+        simulator = make()
+        observations, _ = simulator.reset(seed=1)
+        shown = simulator.shown_spaces if offers(simulator, FlattensObservations) else {}
+        assert set(shown) <= set(observations)
+        for agent, space in shown.items():
+            seen: Any = spaces.unflatten(space, observations[agent])
+            again = np.asarray(spaces.flatten(space, seen))
+            assert np.array_equal(again, observations[agent], equal_nan=True)
+        simulator.close()
+
+    def test_columns_have_a_name_each(self, make: Make) -> None:
+        """`NamesObservations`: as many names as the last axis is long, where there are any."""
+        simulator = make()
+        observations, _ = simulator.reset(seed=1)
+        names = tuple(simulator.observation_names) if offers(simulator, NamesObservations) else ()
+        assert all(isinstance(name, str) for name in names)
+        assert len(set(names)) == len(names)
+        assert not names or all(observation.shape[-1] == len(names) for observation in observations.values())
+        simulator.close()
+
+    def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
+        """`TellsEvents`: its scenes have events of those kinds only, and none without it."""
+        simulator = make()
+        kinds = tuple(simulator.told_events) if offers(simulator, TellsEvents) else ()
+        assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
+        assert {event.kind for event in self._events(simulator)} <= set(kinds)
+        simulator.close()
+
+    def test_notices_are_lines(self, make: Make) -> None:
+        """`TellsNotices`: each is one line of text."""
+        simulator = make()
+        if offers(simulator, TellsNotices):
+            self._drive(simulator, 1)
+            for notice in simulator.notices:
+                assert isinstance(notice, str)
+                assert len(notice.splitlines()) == 1
+        simulator.close()
+
+    def test_tidying_changes_no_episode(self, make: Make) -> None:
+        """`Tidies`: before the first episode, and between two."""
+        simulator = make()
+        if not offers(simulator, Tidies):
+            simulator.close()
+            return
+        first = self._drive(simulator, 1)
+        simulator.tidy()
+        assert self._drive(simulator, 1) == first
+        simulator.close()
+        fresh = make()
+        assert offers(fresh, Tidies)
+        fresh.tidy()
+        assert self._drive(fresh, 1) == first
+        fresh.close()
 
     def test_closing_twice_is_fine(self, make: Make) -> None:
         """Closing lets go of everything, once."""
