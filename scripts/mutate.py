@@ -110,11 +110,10 @@ def nearest_tests(file: Path) -> tuple[Path, ...]:
 
 
 def targets_of(name: str, tests: Sequence[Path] | None = None) -> list[Target]:
-    """Return the modules of a package that have tests nearby, or those that are given."""
+    """Return the modules of a package with the tests nearest to each, or with those that are given."""
     return [
         Target(name, file, (ROOT / file).read_text(encoding="utf-8"), tests or nearest_tests(file))
         for file in modules_of(name)
-        if tests or nearest_tests(file)
     ]
 
 
@@ -131,6 +130,8 @@ def survey(slot: Slot, targets: list[Target]) -> None:
         SystemExit: they fail.
     """
     files = sorted({str(path) for target in targets for path in target.tests})
+    if not files:
+        return
     watcher = Watcher([str(slot.tree / target.file) for target in targets])
     slot.start(files, seconds=300, watcher=watcher)
     if slot.wait() != "passed":

@@ -1,0 +1,365 @@
+"""The ledger, fact by fact: what is counted, ranked, sealed, restored and refused."""
+
+from __future__ import annotations
+
+import math
+import os
+import sqlite3
+import stat
+import time
+from contextlib import closing
+
+import pytest
+
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import Ledger, has_begun
+from crashhunt.hunts._ledger_reader import Turn
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
+
+
+def result(number, outcome=Outcome.SURVIVED, *, ttc=3.0, steps=10, events=None):
+    spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5}}, {"vehicles": 3}, max_steps=20)
+    return TrialResult(spec, outcome, steps=steps, wall_s=0.25, closest=ClosestApproach(ttc, 1.5, 2.5), events=events)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "ledger.sqlite"
+
+
+@pytest.fixture
+def ledger(path):
+    ledger = Ledger(path, writable=True)
+    yield ledger
+    ledger.close()
+
+
+def raw(path, query):
+    with closing(sqlite3.connect(path)) as database, database:
+        return database.execute(query).fetchall()
+
+
+def test_a_row_has_what_ranks_it_beside_its_text(ledger, path):
+    ledger.record(result(3, Outcome.COLLISION, ttc=math.inf, steps=4), snapshot="abc")
+    columns = "number, seed, outcome, steps, time_to_collision_s, gap_m, required_deceleration, wall_s, snapshot"
+    (row,) = raw(path, f"SELECT {columns} FROM trials")
+    assert row == (3, 21, "collision", 4, None, 1.5, 2.5, 0.25, "abc")
+    assert ledger.snapshot_of(3) == "abc"
+    assert ledger.snapshot_of(4) == ""
+    assert ledger.result_text(4) is None
+    assert ledger.result(3).closest.time_to_collision_s == math.inf
+    (plain,) = ledger.plain_results()
+    assert plain["outcome"] == "collision"
+    assert list(ledger.table()) == [(3, 21, "collision", 4, None)]
+
+
+def test_counts_are_of_what_is_there(ledger):
+    assert (ledger.outcomes(), ledger.steps_total(), ledger.finished(), ledger.last_ended_at()) == ({}, 0, set(), None)
+    for number, outcome in enumerate([Outcome.SURVIVED, Outcome.HANG, Outcome.SURVIVED, Outcome.COLLISION]):
+        ledger.record(result(number, outcome, steps=number + 1), snapshot="")
+    assert ledger.outcomes() == {"collision": 1, "hang": 1, "survived": 2}
+    assert list(ledger.outcomes()) == ["collision", "hang", "survived"]
+    assert ledger.steps_total() == 10
+    assert ledger.finished() == {0, 1, 2, 3}
+    assert [found.spec.number for found in ledger.results(outcomes=("survived", "hang"))] == [0, 1, 2]
+    assert list(ledger.results(outcomes=("invalid",))) == []
+    assert ledger.last_ended_at() == pytest.approx(time.time(), abs=60)
+
+
+def test_traffic_events_are_counted_with_their_trials(ledger):
+    assert ledger.traffic_events() == {}
+    for number, events in enumerate([{"red_light": 2, "teleport": 1}, {}, None, {"red_light": 1}]):
+        ledger.record(result(number, events=events), snapshot="")
+    assert ledger.traffic_events() == {"red_light": (3, 2), "teleport": (1, 1)}
+
+
+def test_the_nearest_miss_is_the_least_of_both_ways_to_survive(ledger):
+    for number, (outcome, ttc) in enumerate(
+        [(Outcome.FINISHED, 2.0), (Outcome.SURVIVED, 2.5), (Outcome.COLLISION, 0.0), (Outcome.SURVIVED, math.inf)]
+    ):
+        ledger.record(result(number, outcome, ttc=ttc), snapshot="")
+    assert ledger.nearest_miss().spec.number == 0
+    ledger.record(result(9, Outcome.SURVIVED, ttc=2.0), snapshot="")
+    assert ledger.nearest_miss().spec.number == 0  # of two that are equal, the first
+    ledger.record(result(8, Outcome.SURVIVED, ttc=1.9), snapshot="")
+    assert ledger.nearest_miss().spec.number == 8
+
+
+def test_what_is_replaced_is_moved_once(ledger):
+    for number in range(3):
+        ledger.record(result(number), snapshot="")
+    assert ledger.replace([1]) == 1
+    assert ledger.replace([1]) == 0
+    assert ledger.replaced() == [result(1)]
+    assert ledger.result(1) is None
+    ledger.record(result(1, Outcome.HANG), snapshot="")
+    assert ledger.replace([0, 1, 2]) == 3
+    assert [found.spec.number for found in ledger.replaced()] == [1, 0, 1, 2]
+
+
+def test_states_and_remarks_have_their_times(ledger):
+    ledger.enter("running")
+    ledger.remark("a worker died")
+    ledger.enter("all_trials", "done", trials=4)
+    found = ledger.events()
+    assert [event[1:] for event in found] == [("running", ""), ("remark", "a worker died"), ("all_trials", "done")]
+    assert found[0][0] <= found[1][0] <= found[2][0]
+    assert ledger.facts() == {"state": "all_trials", "detail": "done", "trials": 4}
+    ledger.note(trials=None, state="x")
+    assert ledger.facts() == {"state": "x", "detail": "done"}
+
+
+def test_a_ledger_is_sealed_where_its_writer_has_closed_it(path):
+    writer = Ledger(path, writable=True)
+    writer.record(result(0), snapshot="")
+    reader = Ledger(path)
+    assert (reader.sealed, reader.protected) == (False, True)
+    writer.close()
+    writer.close()  # twice is once
+    assert reader.sealed
+    assert "seal" not in reader.facts()
+    reader.close()
+    with closing(Ledger(path)) as reader:
+        assert reader.sealed
+    again = Ledger(path, writable=True)
+    assert not again.sealed
+    again.close()
+    with closing(Ledger(path)) as reader:
+        assert reader.sealed
+
+
+@pytest.mark.parametrize(
+    ("statement", "reads"),
+    [
+        ("DELETE FROM trials WHERE number = 1", ("outcomes", "steps_total", "table", "plain_results", "results")),
+        ("DELETE FROM events", ("events",)),
+        ("DELETE FROM replaced", ("replaced",)),
+        ("DELETE FROM hunt WHERE key = 'note'", ("facts",)),
+        ("UPDATE trials SET steps = 99 WHERE number = 1", ("steps_total", "table", "plain_results")),
+        ("UPDATE trials SET seed = 99 WHERE number = 1", ("table", "plain_results")),
+        ("UPDATE trials SET outcome = 'hang' WHERE number = 1", ("outcomes", "table", "plain_results")),
+    ],
+)
+def test_what_is_gone_from_a_sealed_ledger_is_missed(path, statement, reads):
+    writer = Ledger(path, writable=True)
+    for number in range(4):
+        writer.record(result(number, Outcome.COLLISION if number == 1 else Outcome.SURVIVED), snapshot="")
+    writer.replace([3])
+    writer.record(result(3), snapshot="")
+    writer.enter("running", note="x")
+    writer.close()
+    right = {}
+    with closing(Ledger(path)) as reader:
+        for name in ("outcomes", "steps_total", "table", "events", "replaced", "facts"):
+            found = getattr(reader, name)()
+            right[name] = sorted(found) if name == "table" else found
+        assert reader.result(9) is None
+    raw(path, statement)
+    with closing(Ledger(path)) as reader:
+        for name in reads:
+            with pytest.raises(HuntDirectoryError, match="the ledger is damaged"):
+                list(getattr(reader, name)()) if name != "steps_total" else reader.steps_total()
+        for name, value in right.items():
+            if name not in reads and "trials" not in statement:
+                found = getattr(reader, name)()
+                assert (sorted(found) if name == "table" else found) == value
+        if statement.startswith("DELETE FROM trials"):
+            with pytest.raises(HuntDirectoryError, match="damaged"):
+                reader.result(1)
+            with pytest.raises(HuntDirectoryError, match="damaged"):
+                list(reader.results(outcomes=("collision",)))
+            assert len(list(reader.results(outcomes=("survived",)))) == 3
+    with pytest.raises(HuntDirectoryError, match="damaged"):
+        Ledger(path, writable=True)
+
+
+def test_without_a_seal_whole_rows_say_it(path):
+    writer = Ledger(path, writable=True)
+    for number in range(3):
+        writer.record(result(number), snapshot="")
+    raw(path, "UPDATE trials SET seed = 99 WHERE number = 1")
+    with closing(Ledger(path)) as reader:
+        assert reader.result(0) == result(0)
+        rows = reader.table()
+        assert next(rows)[0] == 0
+        with pytest.raises(HuntDirectoryError, match="trial 1 is not as it was written"):
+            next(rows)
+        assert [number for number, row in reader.intact_rows(range(5)) if row is not None] == [0, 2]
+        assert [number for number, row in reader.intact_rows(range(5)) if row is None] == [1]
+        (row,) = [row for _, row in reader.intact_rows([2])]
+        assert len(row) == 11
+        reader.check_pages()
+    with closing(Ledger(path.with_name("other.sqlite"), writable=True)) as other:
+        other.copy(row)
+        assert other.result(2) == result(2)
+    with pytest.raises(HuntDirectoryError, match="trial 1 is not"):
+        Ledger(path, writable=True)
+    writer.close()
+
+
+def test_a_ledger_that_was_removed_is_written_anew(path, tmp_path):
+    writer = Ledger(path, writable=True)
+    writer.record(result(0), snapshot="")
+    assert writer.restore() is False
+    path.unlink()
+    assert writer.restore() is True
+    assert writer.restore() is False
+    writer.record(result(1), snapshot="")
+    with closing(Ledger(path)) as reader:
+        assert reader.finished() == {0, 1}
+    path.unlink()
+    path.write_text("another")
+    with pytest.raises(HuntDirectoryError, match="another file was put in the place"):
+        writer.restore()
+    path.unlink()
+    moved = tmp_path.rename(f"{tmp_path}-moved")
+    try:
+        with pytest.raises(HuntDirectoryError, match=r"the folder does not exist|cannot be written anew"):
+            writer.restore()
+    finally:
+        moved.rename(tmp_path)
+    writer.close()
+
+
+@pytest.mark.parametrize("change", ["seed = 99", "steps = 99", "outcome = 'hang'", "wall_s = 9.0", "gap_m = 0.5"])
+def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(path, change):
+    with closing(Ledger(path, writable=True)) as writer:
+        writer.record(result(0), snapshot="")
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("DELETE FROM hunt")
+        database.execute("DROP TABLE proposals")
+        for table in ("trials", "replaced", "events", "hunt"):
+            database.execute(f"ALTER TABLE {table} DROP COLUMN digest")
+        database.execute("PRAGMA user_version = 1")
+        database.execute(f"UPDATE trials SET {change}")
+    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="its columns say something else"):
+        list(reader.results())
+    with pytest.raises(HuntDirectoryError, match="its columns say something else"):
+        Ledger(path, writable=True)
+
+
+def test_what_sqlite_says_is_said_in_our_words(path, tmp_path):
+    with pytest.raises(HuntDirectoryError, match="is not the directory of a hunt") as caught:
+        Ledger(path)
+    assert "give the directory" in caught.value.fix
+    assert not has_begun(path)
+    with pytest.raises(HuntDirectoryError, match="the folder does not exist"):
+        Ledger(tmp_path / "gone" / "ledger.sqlite", writable=True)
+    path.mkdir()
+    for writable in (False, True):
+        with pytest.raises(HuntDirectoryError, match="a folder is where the file should be"):
+            Ledger(path, writable=writable)
+    path.rmdir()
+    Ledger(path, writable=True).close()
+    assert has_begun(path)
+    with closing(sqlite3.connect(path, isolation_level=None)) as busy:
+        ledger = Ledger(path, writable=True)
+        ledger._database.execute("PRAGMA busy_timeout = 1")
+        ledger.record(result(0), snapshot="")
+        busy.execute("BEGIN IMMEDIATE")
+        for act in (
+            lambda: ledger.record(result(0), snapshot=""),
+            lambda: ledger.note(x=1),
+            lambda: ledger.remark("x"),
+            lambda: ledger.replace([0]),
+        ):
+            with pytest.raises(HuntDirectoryError, match="another program keeps it busy"):
+                act()
+        busy.execute("ROLLBACK")
+        ledger.close()
+    if os.getuid():
+        path.chmod(0)
+        with pytest.raises(HuntDirectoryError, match="may not be read"):
+            Ledger(path)
+        path.chmod(stat.S_IRUSR | stat.S_IWUSR)
+
+
+def test_reads_are_the_same_in_pieces(path, monkeypatch):
+    with closing(Ledger(path, writable=True)) as writer:
+        for number in range(10):
+            writer.record(
+                result(number, Outcome.COLLISION if number % 3 else Outcome.FINISHED, ttc=5.0 - number / 3), snapshot=""
+            )
+    with closing(Ledger(path)) as reader:
+        whole = list(reader.table())
+        monkeypatch.setattr("crashhunt.hunts._ledger_reader._CHUNK", 3)
+        assert list(reader.table()) == whole
+        assert sorted(whole)[4] == (4, 28, "collision", 10, 5.0 - 4 / 3)
+
+
+def test_a_full_disk_is_told_of_and_what_was_written_stays(path):
+    ledger = Ledger(path, writable=True)
+    ledger.record(result(0), snapshot="")
+    pages = ledger._database.execute("PRAGMA page_count").fetchone()[0]
+    ledger._database.execute(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(HuntDirectoryError, match="the disk is full") as caught:
+        ledger.record(result(1), snapshot="x" * 100_000)
+    assert "free some space" in caught.value.fix
+    with pytest.raises(HuntDirectoryError, match="the disk is full"):
+        ledger.note(long="x" * 100_000)
+    ledger._database.execute("PRAGMA max_page_count = 100000")
+    ledger.note(state="error")
+    ledger.close()
+    with closing(Ledger(path)) as reader:
+        assert reader.result(0) == result(0)
+        assert reader.facts() == {"state": "error"}
+
+
+def test_how_lasting_it_is(path):
+    ledger = Ledger(path, writable=True)
+
+    def pragma(name):
+        return ledger._database.execute(f"PRAGMA {name}").fetchone()[0]
+
+    assert (pragma("journal_mode"), pragma("synchronous")) == ("wal", 1)
+    ledger.note(a=1)
+    ledger.enter("running")
+    assert pragma("synchronous") == 1  # as cheap as before, once it has waited for the disk
+    ledger.close()
+    # A log of what was there before is none of the new file's.
+    path.unlink()
+    path.with_name(f"{path.name}-wal").write_bytes(b"x" * 4096)
+    with closing(Ledger(path, writable=True)) as again:
+        assert again.facts() == {}
+
+
+def test_damaged_pages_are_found(path):
+    with closing(Ledger(path, writable=True)) as writer:
+        for number in range(200):
+            writer.record(result(number), snapshot="")
+    with closing(Ledger(path)) as reader:
+        reader.check_pages()
+    data = bytearray(path.read_bytes())
+    page = 4096 * (len(data) // 4096 // 2)
+    data[page : page + 200] = bytes(200)
+    path.write_bytes(data)
+    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="the ledger is damaged"):
+        reader.check_pages()
+
+
+def test_turns_with_a_sampler_are_kept_in_their_order(path):
+    ledger = Ledger(path, writable=True)
+    turns = [Turn((), result(4).spec), Turn((4,), result(2).spec), Turn((), result(7).spec)]
+    assert list(ledger.turns()) == []
+    ledger.propose(turns[:2])
+    ledger.propose([])
+    assert list(ledger.turns()) == turns[:2]
+    with pytest.raises(HuntDirectoryError):
+        ledger.propose([Turn((2,), result(8).spec), Turn((), result(4).spec)])  # a trial is proposed once
+    ledger.close()
+    with closing(Ledger(path, writable=True)) as again:
+        assert list(again.turns()) == turns[:2]  # all of a call or nothing
+        again.propose(turns[2:])
+        assert list(again.turns()) == again.intact_turns() == turns
+    assert raw(path, "SELECT turn, number FROM proposals ORDER BY turn") == [(1, 4), (2, 2), (3, 7)]
+    raw(path, "UPDATE proposals SET told = '[5]' WHERE turn = 2")
+    with closing(Ledger(path)) as reader:
+        with pytest.raises(HuntDirectoryError, match="damaged"):
+            list(reader.turns())
+        assert reader.intact_turns() == [turns[0], turns[2]]
+    raw(path, "DELETE FROM proposals WHERE turn = 3")
+    with closing(Ledger(path)) as reader, pytest.raises(HuntDirectoryError, match="damaged"):
+        list(reader.turns())
+    with pytest.raises(HuntDirectoryError, match="damaged"):
+        Ledger(path, writable=True)
