@@ -51,6 +51,10 @@ class Parser(argparse.ArgumentParser):
             what = f"there is no command {value!r}" if name == "COMMAND" else f"{name} {value!r} is none of its choices"
             raise UsageError(what, fix=one_of(str(value), choices))
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if message and file is not None:
+            file.write(message)  # argparse would hide that the disk is full
+
     def error(self, message: str) -> NoReturn:
         """Refuse a command line.
 

@@ -62,6 +62,7 @@ def _attach(parser: argparse.ArgumentParser) -> None:
         "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(".toml", ".sumocfg")(prefix)],
         "--agent": lambda **_: _registered("agents"),
         "--sampler": lambda **_: _registered("samplers"),
+        "--executor": lambda **_: _registered("executors"),
         "--crash-on": _several(lambda **_: _outcomes(crashes=True)),
         "--outcome": _several(lambda **_: _outcomes(crashes=False)),
         "--print": _several(lambda **_: _FIELDS),

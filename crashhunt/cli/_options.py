@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import HuntOption
 
-__all__ = ["add_options", "chosen_options"]
+__all__ = ["add_options", "add_options_of_machine", "chosen_of_machine", "chosen_options"]
 
 
 def add_options(groups: Mapping[str, argparse._ArgumentGroup]) -> None:
@@ -33,7 +33,21 @@ def chosen_options(given: argparse.Namespace) -> dict[str, Any]:
     return {option.name: _value(option, getattr(given, option.name)) for option in hunt_options() if option.about.flag}
 
 
-def _add(group: argparse._ArgumentGroup, option: HuntOption) -> None:
+def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where all the hunts of a command run, whatever each of them says."""
+    for option in hunt_options():
+        if option.about.anywhere:
+            _add(parser, option)
+    parser.set_defaults(**{option.name: None for option in hunt_options() if option.about.anywhere})
+
+
+def chosen_of_machine(given: argparse.Namespace) -> dict[str, Any]:
+    """Return those of them that were given."""
+    found = {option.name: getattr(given, option.name) for option in hunt_options() if option.about.anywhere}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _add(group: argparse._ActionsContainer, option: HuntOption) -> None:
     about = option.about
     if option.form == "flag":
         action = "store_false" if option.default else "store_true"
@@ -53,4 +67,4 @@ def _value(option: HuntOption, given: Any) -> Any:
         return pairs(given, about.flag, named=about.named)
     if about.separator and isinstance(given, str):
         return tuple(word for word in given.split(about.separator) if word)
-    return given
+    return (given or option.default) if option.form == "list" else given

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json, chosen_runs, integer, pairs, say
+from crashhunt.cli._options import add_options_of_machine, chosen_of_machine
 from crashhunt.cli._status import show_states, states_console, states_table
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ def add_suite(commands: Any) -> None:
     run.add_argument("directory", metavar="DIR", type=Path, help="made if it is not there")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
                      help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+    add_options_of_machine(run)
     add_json(run)
     run.set_defaults(command=_run)
     defaults = verbs.add_parser(
@@ -67,6 +69,7 @@ def add_rerun(commands: Any) -> None:
     rerun.add_argument("--to", metavar="DIR", type=Path, help="leave DIR as it is, and run there")
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
                        help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
+    add_options_of_machine(rerun)
     add_json(rerun)
     rerun.set_defaults(command=_rerun)
 
@@ -78,7 +81,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     suite = Suite.read(options.file)
     watch, finish = _watcher(as_json=options.json)
     try:
-        states = suite.run(options.directory, options.parallel, watch=watch)
+        states = suite.run(options.directory, options.parallel, watch=watch, machine=chosen_of_machine(options))
     except KeyboardInterrupt:
         finish()
         _tell([hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json)
@@ -109,6 +112,7 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
             to=options.to,
             parallel=options.parallel,
             watch=watch,
+            machine=chosen_of_machine(options),
         )
     finally:
         finish()

@@ -18,6 +18,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._baseline import OPEN_FILES
+from crashhunt.executors._notes import Notes
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._worker import Worker, worker_environment
 from crashhunt.recording import Recording, read_black_box
@@ -26,6 +27,7 @@ from crashhunt.trial import TrialResult, TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import Escape
 
 __all__ = ["FreshProcessExecutor", "fresh_environment"]
@@ -56,7 +58,8 @@ class FreshProcessExecutor:
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1) -> None:
         self._settings = settings
-        self.parallel = parallel
+        self.capacity = parallel
+        self._notes = Notes(settings.scratch)
         self._waiting: deque[Attempt] = deque()
         self._running: dict[int, _Running] = {}
 
@@ -82,20 +85,32 @@ class FreshProcessExecutor:
         for number in [number for number in self._running if number > above]:
             self._running.pop(number).kept.end()
 
+    def where(self) -> dict[int, BlackBoxHeader]:
+        """Return where each running trial is, for people who watch."""
+        found = {number: where_it_is(self._settings.scratch, number) for number in self._running}
+        return {number: header for number, header in found.items() if header is not None}
+
+    def notes(self) -> list[str]:
+        """Return what people should be told that has not been returned before."""
+        return self._notes.fresh()
+
     def close(self) -> None:
         """Kill every process, and everything that it has started."""
         self.cancel()
 
     def _start(self) -> None:
-        while self._waiting and len(self._running) < self.parallel:
+        while self._waiting and len(self._running) < self.capacity:
+            if any(running.attempt.alone for running in self._running.values()):
+                return
+            if self._waiting[0].alone and self._running:
+                return
             attempt = self._waiting.popleft()
             number = attempt.spec.number
             answer = answer_file(self._settings.scratch, number)
             answer.unlink(missing_ok=True)
-            job = self._settings.scratch / f"job-{number:06d}.json"
+            job, log_file = self._job(number), self._log(number)
             content = {"settings": self._settings.to_json(), "spec": attempt.spec.to_json(), "answer": str(answer)}
             job.write_text(json.dumps(content), encoding="utf-8")
-            log_file = self._settings.scratch / f"start-{number:06d}.log"
             with log_file.open("wb") as log, job.open("rb") as described:
                 kept = Kept(
                     "crashhunt.executors._fresh",
@@ -132,7 +147,7 @@ class FreshProcessExecutor:
             answer = json.loads(running.answer.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             if exit_code > 0 and where_it_is(scratch, spec.number) is None:
-                log = scratch / f"start-{spec.number:06d}.log"
+                log = self._log(spec.number)
                 lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
                 raise CrashhuntError(
                     f"the process of trial {spec.number} could not start: {lines[-1] if lines else exit_code}",
@@ -141,13 +156,22 @@ class FreshProcessExecutor:
                 ) from None
             if exit_code == DAMAGED:
                 return damaged(spec, scratch, "")
-            if running.attempt.again(scratch, exit_code):
+            if why := running.attempt.again(scratch, exit_code):
+                self._notes.add(why)
                 self._waiting.appendleft(running.attempt)
                 return None
             return died(spec, scratch, exit_code)
+        for file in (running.answer, self._job(spec.number), self._log(spec.number)):
+            file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
             raise CrashhuntError(**answer["error"])
         return TrialResult.from_json(answer["result"])
+
+    def _job(self, number: int) -> Path:
+        return self._settings.scratch / f"job-{number:06d}.json"
+
+    def _log(self, number: int) -> Path:
+        return self._settings.scratch / f"start-{number:06d}.log"
 
 
 def fresh_environment(settings: WorkerSettings) -> dict[str, str]:

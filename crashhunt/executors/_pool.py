@@ -14,9 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import answer_file
+from crashhunt.executors._notes import Notes
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
@@ -72,14 +72,18 @@ class PoolExecutor:
         self._slots = 0
         self._looked = 0.0
         self._done: queue.SimpleQueue[TrialResult | Exception] = queue.SimpleQueue()
-        self._notes: dict[str, None] = {}  # each is told once
-        self._told = 0
+        self._notes = Notes(settings.scratch)
         self._selector = selectors.DefaultSelector()
         self._link: TemplateLink | None = None
         self._wake_up, self._woken = socket.socketpair()
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._thread: threading.Thread | None = None
         self._closing = False
+
+    @property
+    def capacity(self) -> int:
+        """How many trials run at a time."""
+        return self._parallel
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
@@ -132,12 +136,7 @@ class PoolExecutor:
 
     def notes(self) -> list[str]:
         """Return what people should be told that has not been returned before."""
-        with suppress(OSError):
-            told = (self._settings.scratch / layout.NOTICES).read_text(encoding="utf-8", errors="replace")
-            self._notes |= dict.fromkeys(told.splitlines())
-        fresh = list(self._notes)[self._told :]
-        self._told += len(fresh)
-        return fresh
+        return self._notes.fresh()
 
     def close(self) -> None:
         """Kill every worker, and everything that it has started."""
@@ -258,7 +257,7 @@ class PoolExecutor:
         if self._link is not None:
             self._link.deaths = 0
         if change and isinstance(change, str):
-            self._notes[f"trials change {change}, so that each has a worker of its own: none depends on another"] = None
+            self._notes.add(f"trials change {change}, so that each has a worker of its own: none depends on another")
         if change or (self._recycle_after and worker.trials >= self._recycle_after):
             self._retire(worker)
 
@@ -287,7 +286,7 @@ class PoolExecutor:
         self._waiting = deque(sorted(self._waiting, key=lambda attempt: attempt.spec.number))
         self._selector.unregister(self._link.control)
         if not self._link.unfit:
-            self._notes["the process that starts the workers was killed from outside, and was started again"] = None
+            self._notes.add("the process that starts the workers was killed from outside, and was started again")
         self._link = self._link.anew()
         self._selector.register(self._link.control, selectors.EVENT_READ)
 
@@ -315,7 +314,7 @@ class PoolExecutor:
         """Account for a trial whose process is gone, or run it again."""
         scratch = self._settings.scratch
         if why := attempt.again(scratch, exit_code):
-            self._notes[why] = None
+            self._notes.add(why)
             self._waiting.appendleft(attempt)
         else:
             self._done.put(died(attempt.spec, scratch, exit_code))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from crashhunt.plans import SizesItself
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Executor"]
+__all__ = ["Executor", "ExecutorFactory", "SizesItself"]
 
 
 class Executor(Protocol):
@@ -17,18 +21,54 @@ class Executor(Protocol):
 
     Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
     that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
-    whose process was killed from outside is run again, alone. `notes` says such things, to be told to people; an
-    executor may go without.
+    whose process was killed from outside is run again, alone.
+
+    What a trial has written is wanted only where its result says ``kept``: then, before the result comes back, the
+    folder ``scratch_of(settings.scratch, number)`` of this machine has its black box and output, and it or
+    ``settings.scratch`` the map, where the simulator has one. Whoever runs trials on another machine brings nothing
+    else back.
     """
+
+    @property
+    def capacity(self) -> int:
+        """How many trials run at a time, now. The hunt hands over more than that, so that no worker waits for it."""
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
-        """Yield the trials that have ended since the last call, waiting so long for a first one."""
+        """Yield the trials that have ended since the last call, waiting so long for a first one.
+
+        Raises:
+            CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+        """
 
     def cancel(self, *, above: int = -1) -> None:
         """Give up all trials whose number is greater than ``above``, running or not, at once."""
 
+    def where(self) -> Mapping[int, BlackBoxHeader]:
+        """Return how far running trials are, by number, for people who watch; empty where nobody knows."""
+
+    def notes(self) -> list[str]:
+        """Return what people should be told of how trials were run, and has not been returned before."""
+
     def close(self) -> None:
         """Stop every process, whatever it is doing. May be called twice."""
+
+
+class ExecutorFactory(Protocol):
+    """What ``--executor NAME`` stands for: makes an executor of a hunt.
+
+    With ``--executor NAME:ARG``, it is called with ``argument=ARG`` as well; one that takes none may leave that out.
+    It raises a `CrashhuntError` with the fix where no trial could run, before it has started anything. See also
+    `SizesItself`.
+    """
+
+    def __call__(self, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
+        """Make one.
+
+        Args:
+            settings: of the hunt.
+            parallel: how many trials at a time.
+            recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
+        """

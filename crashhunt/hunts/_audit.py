@@ -101,11 +101,11 @@ class Audit:
     @property
     def parallel(self) -> int:
         """How many trials run at a time."""
-        return self._executor.parallel
+        return self._executor.capacity
 
     @parallel.setter
     def parallel(self, parallel: int) -> None:
-        self._executor.parallel = parallel
+        self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
         """Take over the recording of a trial of the sample; return the trial as the hunt goes on with it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ from crashhunt.base.signals import stop_requests
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import PoolExecutor, read_map
+from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
+    from crashhunt.executors import Executor
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
@@ -201,7 +203,7 @@ class Hunt:
             hunt_seed=settings.seed,
         )
         parallel = min(run.parallel, max(1, settings.trials - len(finished)))
-        executor = PoolExecutor(worker_settings, parallel=parallel, recycle_after=run.recycle_after)
+        executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         preflight = Preflight(
             settings, settings.trials - len(finished), files=snapshot.argument_files, code=snapshot.code
         )
@@ -211,7 +213,7 @@ class Hunt:
         try:
             while True:
                 stopping = bool(progress.found)
-                for spec in [] if stopping else trials.take(self._capacity - len(in_flight)):
+                for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
                     in_flight.add(spec.number)
                 if not in_flight:
@@ -242,7 +244,7 @@ class Hunt:
                 lowest = min(progress.found)
                 self._save(progress.found[lowest], ledger, snapshot, progress)
             executor.close()
-            audit.parallel = run.parallel
+            audit.parallel = self._parallel_here
             while audit.waiting and not bool(self._stops):
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
@@ -262,19 +264,13 @@ class Hunt:
             return "no_valid_trial"
         return "all_trials"
 
-    @property
-    def _capacity(self) -> int:
-        """How many trials are under way at once."""
-        return self.settings.run.parallel * (1 + _QUEUED_PER_WORKER)
-
     def _lag(self, before: Mapping[str, Any]) -> int:
         """By how many trials a sampler that learns is told late."""
-        if not self.settings.run.deterministic:
-            return self._capacity
-        return int(before.get("lag") or max(LAG, self._capacity))
+        under_way = _under_way(self._parallel_here)
+        return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way
 
     def _listen(
-        self, executor: PoolExecutor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
+        self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
         """Write down what people should know about how the trials were run, and whether they are the same again."""
         for note in executor.notes():
@@ -345,15 +341,22 @@ class Hunt:
                     bundle.write()
             return bundle
 
-        with ThreadPoolExecutor(self.settings.run.parallel) as threads:  # which only wait for their process
+        with ThreadPoolExecutor(self._parallel_here) as threads:  # which only wait for their process
             progress.crashes = list(threads.map(confirmed, progress.crashes))
+
+    @property
+    def _parallel_here(self) -> int:
+        """How many trials at a time this machine runs again, whatever else the executor has."""
+        return self.settings.run.parallel or len(os.sched_getaffinity(0))
 
     def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
         enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
         invalid = progress.outcomes[str(Outcome.INVALID)]
         return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
 
-    def _status(self, progress: Progress, phase: str, workers: dict[int, BlackBoxHeader] | None = None) -> HuntStatus:
+    def _status(
+        self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
+    ) -> HuntStatus:
         elapsed = time.monotonic() - progress.began
         return HuntStatus(
             phase,
@@ -363,9 +366,14 @@ class Hunt:
             progress.ended_here / elapsed if elapsed > 0 else 0.0,
             elapsed,
             progress.nearest,
-            workers or {},
+            dict(workers or {}),
             len(progress.crashes) + (1 if progress.found else 0),
         )
+
+
+def _under_way(parallel: int) -> int:
+    """How many trials are handed over, of which so many run."""
+    return parallel * (1 + _QUEUED_PER_WORKER)
 
 
 def _why_invalid(result: TrialResult, scenario: Scenario) -> str:

@@ -1,4 +1,5 @@
 from ._declaration import HuntOption as HuntOption
+from ._executor import SizesItself as SizesItself, executor_of as executor_of
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,
@@ -18,6 +19,7 @@ from ._request import (
     request_of as request_of,
     spec_words as spec_words,
 )
+from ._scope import Owners as Owners, Takes as Takes, takes_of as takes_of
 from ._settings import (
     AgentSettings as AgentSettings,
     ArgumentSpec as ArgumentSpec,

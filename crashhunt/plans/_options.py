@@ -14,17 +14,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self
 
 from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
 from crashhunt.trial import CRASHES
 
 __all__ = [
-    "Driver", "HuntOptions", "RunOptions", "SnapshotChoices", "Spec", "Subject", "TrialOptions", "checked",
+    "Driver", "HuntOptions", "RunOptions", "SnapshotChoices", "Spec", "Subject", "TrialOptions",
     "hunt_options",
 ]  # fmt: skip
-
-P = TypeVar("P", bound="_Options")
 
 Spec = str | int | float | bool
 Driver = str | Callable[..., Any]  # a class is one, too
@@ -39,6 +37,15 @@ class _Options:
             value = getattr(self, item.name)
             if isinstance(value, list):  # what was read from a file is the same as what was given in Python
                 object.__setattr__(self, item.name, tuple(value))
+
+    def checked(self) -> Self:
+        """Return the same with every option in order, and as plain as it can be.
+
+        Raises:
+            UsageError: one is none.
+        """
+        options = hunt_options(type(self))
+        return replace(self, **{known.name: known.checked(getattr(self, known.name)) for known in options})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +149,12 @@ class RunOptions(_Options):
         "the same: 0.02 is one in fifty",
         flag="--audit", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
+    executor: str = option(
+        "pool", "where trials run: its name, and perhaps ``:ARG``",
+        help="where trials run: pool (warm processes on this machine), fresh (a new process for each) or "
+        "module:attribute; ARG is for one that takes an argument",
+        flag="--executor", metavar="NAME[:ARG]", anywhere=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,15 +182,6 @@ class HuntOptions(SnapshotChoices, RunOptions, TrialOptions, Subject):
     """All of them, in the order of the help: what `crashhunt.prepare` takes, and a hunt of a ``suite.toml``."""
 
     agent: Driver | None = option(None, "who drives, where the scenario has one controlled vehicle")
-
-
-def checked(part: P) -> P:
-    """Return a dataclass of the list whose values are in order, as plain as they can be.
-
-    Raises:
-        UsageError: one is none.
-    """
-    return replace(part, **{known.name: known.checked(getattr(part, known.name)) for known in hunt_options(type(part))})
 
 
 def hunt_options(kind: type = HuntOptions) -> tuple[HuntOption, ...]:

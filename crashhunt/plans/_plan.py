@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import secrets
 from dataclasses import replace
 from importlib import metadata
@@ -14,7 +13,8 @@ from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
-from crashhunt.plans._request import fields_of
+from crashhunt.plans._request import fields_of, sized
+from crashhunt.plans._scope import Owners, Takes, agent_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, load_scenario, scenario_digest, with_action
@@ -38,7 +38,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         CrashhuntError: with what is wrong with it.
     """
     request = request.checked()
-    run = replace(request.run, parallel=request.run.parallel or len(os.sched_getaffinity(0)))  # of this machine
+    run = sized(request.run)
     scenario = load_scenario(request.scenario, ego=request.ego)
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
@@ -229,21 +229,19 @@ def _has_default(locator: str, name: str) -> bool:
 
 def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
     """Which agent an ``--arg`` is for."""
-    for agent in sorted(scenario.agents, key=len, reverse=True):
-        if name.startswith(f"{agent}."):
-            argument = name.removeprefix(f"{agent}.")
-            signatures[agent].check([argument], where=f"--arg {name}: {scenario.agents[agent].agent}")
-            return agent, argument
-    takers = [agent for agent, signature in signatures.items() if name in signature.arguments or signature.open]
-    if len(takers) > 1:
-        fix = " or ".join(f"--arg {agent}.{name}=…" for agent in takers)
-        raise ArgumentError(f"--arg {name}: several agents take it", fix=f"write {fix}")
-    if not takers:
-        if name in scenario.arguments:
-            raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
-        agent = next(iter(scenario.agents))
-        signatures[agent].check([name], where=f"--arg: {scenario.agents[agent].agent}")
-    return takers[0], name
+    takes = {agent: Takes(signature.arguments, signature.open) for agent, signature in signatures.items()}
+    owner = Owners(takes).of(name, option="--arg")
+    if owner is not None:
+        return owner
+    agent = agent_of(name, scenario.agents)
+    if agent:
+        where = f"--arg {name}: {scenario.agents[agent].agent}"
+        signatures[agent].check([name.removeprefix(f"{agent}.")], where=where)
+    if name in scenario.arguments:
+        raise ArgumentError(f"--arg {name}: it is an argument of the scenario", fix=f"write --set {name}=SPEC")
+    first = next(iter(scenario.agents))
+    signatures[first].check([name], where=f"--arg: {scenario.agents[first].agent}")
+    raise AssertionError(name)  # whoever takes it is its owner
 
 
 def _spec(
@@ -268,12 +266,15 @@ def _spec(
 
 def _scenario_arguments(request: Request, scenario: Scenario, *, hunted: bool) -> dict[str, ArgumentSpec]:
     known = scenario.scenario_arguments()
-    for name in request.scenario_arguments:
-        if name not in known:
+    wanted: dict[str, str] = {}
+    for name, spec in request.scenario_arguments.items():
+        owner = Owners({}, known).of(name, option="--set")
+        if owner is None:
             raise ArgumentError(f"--set: the scenario has no argument {name!r}", fix=one_of(name, known, give="it has"))
+        wanted[owner[1]] = spec
     specs: dict[str, ArgumentSpec] = {}
     for name, argument in known.items():
-        asked = request.scenario_arguments.get(name)
+        asked = wanted.get(name)
         if asked is not None:
             spec = str(parse_spec(asked, argument.kind, where=f"--set {name}"))
         elif argument.distribution is not None and (hunted or argument.default is None):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import UsageError
 from crashhunt.plans._declaration import at_least
+from crashhunt.plans._executor import executor_of, sizes_itself
 from crashhunt.plans._options import (
     Driver,
     HuntOptions,
@@ -15,14 +17,13 @@ from crashhunt.plans._options import (
     Spec,
     Subject,
     TrialOptions,
-    checked,
 )
 from crashhunt.plans._settings import RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Request", "fields_of", "request_of", "spec_words"]
+__all__ = ["Request", "fields_of", "request_of", "sized", "spec_words"]
 
 _BOUNDS = {  # the numbers of a hunt that are no options: everybody has to give them
     "TRIALS": at_least(1),
@@ -52,7 +53,7 @@ class Request(TrialOptions, Subject):
     scenario_arguments: Mapping[str, str] = field(default_factory=dict)
     run: RunSettings = field(default_factory=RunSettings)
 
-    def checked(self) -> Request:
+    def checked(self) -> Self:
         """Return the same with plain values.
 
         Raises:
@@ -63,7 +64,8 @@ class Request(TrialOptions, Subject):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
-        return replace(checked(self), run=checked(self.run))
+        checked = super().checked()
+        return replace(checked, run=self.run.checked())
 
 
 def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:
@@ -81,6 +83,19 @@ def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int
     }
     run = RunSettings(parallel=parallel, **{name: getattr(asked, name) for name in fields_of(RunOptions)})
     return Request(trials=trials, max_steps=max_steps, run=run, **given)
+
+
+def sized(run: RunSettings) -> RunSettings:
+    """Return what 0 trials at a time means: one per core of this machine, unless the executor knows better.
+
+    Raises:
+        PluginError: there is no such executor.
+        UsageError: it takes no argument.
+    """
+    executor_of(run.executor)  # before anything runs
+    if run.parallel or sizes_itself(run.executor):
+        return run
+    return replace(run, parallel=len(os.sched_getaffinity(0)))
 
 
 def fields_of(kind: type) -> tuple[str, ...]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.errors import ArgumentError, UsageError
-from crashhunt.base.names import did_you_mean, listed
+from crashhunt.base.errors import ArgumentError
+from crashhunt.plans import Owners, Takes
 from crashhunt.trial import Constant, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from crashhunt.plans import ArgumentSpec, HuntSettings
     from crashhunt.trial import TrialSpec
@@ -41,7 +41,11 @@ class Edits:
 
 
 def edited_spec(
-    recorded: TrialSpec, settings: HuntSettings, original: HuntSettings, changes: Mapping[str, str]
+    recorded: TrialSpec,
+    settings: HuntSettings,
+    original: HuntSettings,
+    changes: Mapping[str, str],
+    ask: Callable[[str], Takes] | None = None,
 ) -> tuple[TrialSpec, Edits]:
     """Return the trial as it is to be replayed, and what is not as it was recorded.
 
@@ -50,6 +54,7 @@ def edited_spec(
         settings: ``hunt.toml`` as it is now.
         original: ``hunt.toml`` as it was when the trial ran.
         changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
+        ask: returns what an agent takes by its code, where the record does not say; None where that may not run.
 
     Raises:
         ArgumentError: an argument does not exist, or a range is given where it takes one value.
@@ -71,7 +76,7 @@ def edited_spec(
             longer = name == "max_steps" and now > before_it  # which leaves nothing out
             (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
     for name, text in changes.items():
-        key = _find(name, recorded, settings)
+        key = _find(name, recorded, settings, ask)
         values[key] = _constant(text, after.get(key), f"--set {name}")
     arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
     scenario_arguments = dict(recorded.scenario_arguments)
@@ -106,25 +111,20 @@ def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Any:
     return distribution.value
 
 
-def _find(name: str, recorded: TrialSpec, settings: HuntSettings) -> tuple[str, str]:
-    for agent in sorted(recorded.arguments, key=len, reverse=True):
-        if name.startswith(f"{agent}."):
-            return agent, name.removeprefix(f"{agent}.")
-    takers = [agent for agent, values in recorded.arguments.items() if name in values]
-    if len(takers) > 1:
-        raise UsageError(
-            f"--set {name}: several agents take it", fix="write " + " or ".join(f"{agent}.{name}=…" for agent in takers)
-        )
-    if takers:
-        return takers[0], name
-    if name in recorded.scenario_arguments:
-        return "", name
-    bare = {_name(key): key[1] for key in _specs(settings)}
-    known = list(bare)
-    near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(name, [part]))
-    hint = did_you_mean(name, known) or next(near, "")
-    fix = f"{hint} it has {listed(known)}".lstrip()
-    raise ArgumentError(f"--set: the crash has no argument {name!r}", fix=fix)
+def _find(
+    name: str, recorded: TrialSpec, settings: HuntSettings, ask: Callable[[str], Takes] | None
+) -> tuple[str, str]:
+    specs = _specs(settings)
+    agents = {
+        agent: Takes(tuple(dict.fromkeys([*(known for owner, known in specs if owner == agent), *values])))
+        for agent, values in recorded.arguments.items()
+    }
+    scenario = [*(known for owner, known in specs if not owner), *recorded.scenario_arguments]
+    owners = Owners(agents, tuple(dict.fromkeys(scenario)))
+    owner = owners.of_record(name, ask, option="--set")
+    if owner is None:
+        raise owners.unknown(name, option="--set", whose="the crash")
+    return owner
 
 
 def _name(key: tuple[str, str]) -> str:

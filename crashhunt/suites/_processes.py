@@ -21,17 +21,26 @@ from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError,
 from crashhunt.base.files import whole_file
 from crashhunt.base.signals import stop_requests
 from crashhunt.hunts import HuntDirectory, Ledger
-from crashhunt.plans import Request, RunSettings, SnapshotChoices, fields_of, plan, read_settings, with_settings
+from crashhunt.plans import (
+    Request,
+    RunSettings,
+    SnapshotChoices,
+    executor_of,
+    fields_of,
+    plan,
+    read_settings,
+    with_settings,
+)
 from crashhunt.scenario import load_scenario
 from crashhunt.snapshots import SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
 
-__all__ = ["REQUEST", "RunRequest", "run_all", "set_aside", "slots_of", "write_request"]
+__all__ = ["REQUEST", "RunRequest", "check_machine", "run_all", "set_aside", "slots_of", "write_request"]
 
 REQUEST = layout.REQUEST
 _LOOK_EVERY_S = 0.1  # at processes that may have ended
@@ -92,13 +101,31 @@ def slots_of(parallel: int) -> int:
     return parallel or len(os.sched_getaffinity(0))
 
 
-def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], None] | None = None) -> None:
+def check_machine(parallel: int, machine: Mapping[str, Any] | None) -> None:
+    """Refuse what no hunt could run with, before any of them starts.
+
+    Raises:
+        UsageError: ``parallel`` is negative, or an option is none.
+        PluginError: there is no such executor.
+    """
+    slots_of(parallel)
+    executor_of(RunSettings(**(machine or {})).checked().executor)
+
+
+def run_all(
+    folders: Sequence[Path],
+    parallel: int = 0,
+    *,
+    watch: Callable[[], None] | None = None,
+    machine: Mapping[str, Any] | None = None,
+) -> None:
     """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
 
     Args:
         folders: of the runs, each with its ``request.json``.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second, and at the end.
+        machine: options that hold for all of them, whatever each says.
 
     Raises:
         UsageError: ``parallel`` is negative.
@@ -120,7 +147,7 @@ def run_all(folders: Sequence[Path], parallel: int = 0, *, watch: Callable[[], N
                     width = max(1, free // len(waiting))
                     folder = waiting.popleft()
                     try:
-                        running[_start(folder, width)] = width
+                        running[_start(folder, {**(machine or {}), "parallel": width})] = width
                         free -= width
                     except (CrashhuntError, OSError) as error:
                         _fail(folder, str(error), "")
@@ -155,7 +182,7 @@ def set_aside(folder: Path) -> Path:
     return aside
 
 
-def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
+def _start(folder: Path, run: Mapping[str, Any]) -> subprocess.Popen[bytes]:
     request = RunRequest.read(folder / REQUEST)
     with (folder / layout.RUN_LOG).open("ab") as log:
         return subprocess.Popen(
@@ -165,7 +192,7 @@ def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
                 "-m",
                 "crashhunt.suites._processes",
                 str(folder.resolve()),
-                str(width),
+                json.dumps(run),
                 str(os.getpid()),
             ],
             cwd=request.folder if Path(request.folder).is_dir() else None,
@@ -176,7 +203,7 @@ def _start(folder: Path, width: int) -> subprocess.Popen[bytes]:
         )
 
 
-def _main(folder: Path, parallel: int, parent: int) -> None:
+def _main(folder: Path, run: Mapping[str, Any], parent: int) -> None:
     if sys.platform == "linux":  # a suite that is killed takes its hunts along, and they keep what has finished
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:
@@ -186,7 +213,7 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
 
     try:
         asked = RunRequest.read(folder / REQUEST)
-        scenario, settings = _planned(folder, asked.request, parallel)
+        scenario, settings = _planned(folder, asked.request, run)
         snapshot = SnapshotOptions.of(asked.snapshot)
         hunt = Hunt(folder, scenario, settings, command=["crashhunt", "suite", "run"], snapshot=snapshot)
         deadline = time.monotonic() + _BUSY_S
@@ -206,14 +233,14 @@ def _main(folder: Path, parallel: int, parent: int) -> None:
         _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _planned(folder: Path, request: Request, parallel: int) -> tuple[Scenario, HuntSettings]:
+def _planned(folder: Path, request: Request, run: Mapping[str, Any]) -> tuple[Scenario, HuntSettings]:
     """What to run: what is there already, or what was asked for."""
     if not (folder / layout.HUNT).exists():
-        return plan(replace(request, run=replace(request.run, parallel=parallel)))
+        return plan(replace(request, run=replace(request.run, **run)))
     settings = read_settings(folder / layout.HUNT)
     snapshot = latest_snapshot(folder)
     scenario = load_scenario(request.scenario, ego=request.ego) if snapshot is None else snapshot.scenario()
-    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, parallel=parallel))
+    return with_settings(scenario, settings), replace(settings, run=replace(settings.run, **run))
 
 
 def _fail(folder: Path, message: str, trace: str) -> None:
@@ -226,4 +253,4 @@ def _fail(folder: Path, message: str, trace: str) -> None:
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+    _main(Path(sys.argv[1]), json.loads(sys.argv[2]), int(sys.argv[3]))

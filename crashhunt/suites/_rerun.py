@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.hunts import HuntState, Ledger, hunt_state
-from crashhunt.plans import HuntSettings, Request, TrialOptions, fields_of, read_settings
-from crashhunt.scenario import shipped_scenarios
+from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
+from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
-from crashhunt.suites._processes import REQUEST, RunRequest, run_all, set_aside, slots_of, write_request
+from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, set_aside, write_request
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def rerun(
     to: Path | None = None,
     parallel: int = 0,
     watch: Callable[[list[HuntState]], None] | None = None,
+    machine: Mapping[str, Any] | None = None,
 ) -> tuple[list[HuntState], list[Path]]:
     """Run hunts again; return where they stand now, and where what they replace is kept.
 
@@ -45,15 +47,16 @@ def rerun(
         to: run one hunt in this directory instead, and leave its own as it is.
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second.
+        machine: options such as ``executor`` that hold for all of them, whatever each says.
 
     Raises:
         UsageError: a change cannot be meant.
         HuntDirectoryError: a directory cannot be used.
     """
-    slots_of(parallel)
+    check_machine(parallel, machine)
     changes = changes or {}
     if to is not None:
-        return _elsewhere(hunts, to, changes, parallel, watch), []
+        return _elsewhere(hunts, to, changes, parallel, watch, machine), []
     if changes and not everything:
         raise UsageError(
             f"--set {next(iter(changes))}: other settings make another hunt",
@@ -63,7 +66,7 @@ def rerun(
     if busy:
         raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(busy[0]))
     # First everything that may fail, so that nothing is moved away for nothing.
-    requests = {hunt: _changed(_request(hunt), changes) for hunt in hunts}
+    requests = {hunt: _changed(_request(hunt), changes, hunt) for hunt in hunts}
     again, replaced = [], []
     for hunt in hunts:
         state = hunt_state(hunt)
@@ -75,7 +78,12 @@ def rerun(
             continue
         write_request(hunt, requests[hunt])
         again.append(hunt)
-    run_all(again, parallel, watch=None if watch is None else lambda: watch([hunt_state(hunt) for hunt in hunts]))
+    run_all(
+        again,
+        parallel,
+        watch=None if watch is None else lambda: watch([hunt_state(hunt) for hunt in hunts]),
+        machine=machine,
+    )
     return [hunt_state(hunt) for hunt in hunts], replaced
 
 
@@ -122,33 +130,54 @@ def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
     return replace(asked, request=replace(asked.request, scenario=str(moved)))
 
 
-def _changed(asked: RunRequest, changes: Mapping[str, str]) -> RunRequest:
+def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRequest:
     request = asked.request
     numbers: dict[str, Any] = {}
     arguments, scenario_arguments = dict(request.arguments), dict(request.scenario_arguments)
-    known = _scenario_arguments(request) if changes else ()
+    owners = _Names(asked, hunt) if changes else None
     for name, spec in changes.items():
         if name in _NUMBERS:
             if not spec.isdecimal():
                 raise UsageError(f"--set {name}={spec}", fix="give a whole number")
             numbers[name] = int(spec)
-        elif name in known:
-            scenario_arguments[name] = spec
-        else:
+        elif owners is not None:
+            agent, argument = owners.owner(name)
+            if not agent:
+                scenario_arguments[argument] = spec
+                continue
             # The same argument may have been written with the agent's id, or without.
-            for other in [
-                other for other in arguments if other.rpartition(".")[2] == name or name.endswith(f".{other}")
-            ]:
+            for other in [other for other in arguments if owners.find(other) == (agent, argument)]:
                 del arguments[other]
-            arguments[name] = spec
+            arguments[f"{agent}.{argument}"] = spec
     request = replace(request, arguments=arguments, scenario_arguments=scenario_arguments, **numbers)
     return replace(asked, request=request)
 
 
-def _scenario_arguments(request: Request) -> tuple[str, ...]:
-    from crashhunt.scenario import load_scenario
+class _Names:
+    """Whose arguments names mean in a hunt that has run, or is planned."""
 
-    return tuple(load_scenario(request.scenario, ego=request.ego).scenario_arguments())
+    def __init__(self, asked: RunRequest, hunt: Path) -> None:
+        request = asked.request
+        scenario = load_scenario(request.scenario, ego=request.ego)
+        given = request.agents
+        drivers = {agent: given.get(agent) or given.get("") or setup.agent for agent, setup in scenario.agents.items()}
+        scenario = scenario.with_agents(drivers)
+        known = {agent: dict.fromkeys(scenario.agent_arguments(agent)) for agent in drivers}
+        if (hunt / layout.HUNT).exists():
+            for agent, chosen in read_settings(hunt / layout.HUNT).agents.items():
+                known.get(agent, {}).update(dict.fromkeys(chosen.arguments))
+        takes = {agent: Takes(tuple(names)) for agent, names in known.items()}
+        self._owners = Owners(takes, tuple(scenario.scenario_arguments()))
+        self._ask = cache(lambda agent: takes_of(drivers[agent], folder=Path(asked.folder)))
+
+    def find(self, word: str) -> tuple[str, str] | None:
+        return self._owners.of_record(word, self._ask, option="--set")
+
+    def owner(self, word: str) -> tuple[str, str]:
+        owner = self.find(word)
+        if owner is None:
+            raise self._owners.unknown(word, option="--set", whose="the hunt")
+        return owner
 
 
 def _replace_invalid(hunt: Path, state: HuntState) -> int:
@@ -166,16 +195,17 @@ def _elsewhere(
     changes: Mapping[str, str],
     parallel: int,
     watch: Callable[[list[HuntState]], None] | None,
+    machine: Mapping[str, Any] | None,
 ) -> list[HuntState]:
     if len(hunts) != 1:
         raise UsageError(f"--to takes one hunt, and there are {len(hunts)}", fix="choose one with --run")
     if to.exists():
         raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
-    request = _changed(_request(hunts[0]), changes)
+    request = _changed(_request(hunts[0]), changes, hunts[0])
     try:
         to.mkdir()
         write_request(to, request)
     except OSError as error:
         raise HuntDirectoryError(f"cannot be made: {error.strerror}", fix="choose another", where=str(to)) from error
-    run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]))
+    run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]), machine=machine)
     return [hunt_state(to)]

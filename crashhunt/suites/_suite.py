@@ -19,7 +19,7 @@ from crashhunt.base.validation import validate
 from crashhunt.hunts import HuntState, hunt_state, is_hunt
 from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, request_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
-from crashhunt.suites._processes import REQUEST, RunRequest, run_all, slots_of, write_request
+from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -153,6 +153,7 @@ class Suite:
         parallel: int = 0,
         *,
         watch: Callable[[list[HuntState]], None] | None = None,
+        machine: Mapping[str, Any] | None = None,
     ) -> list[HuntState]:
         """Run what has not ended, whatever becomes of the others; return where each run stands.
 
@@ -160,14 +161,21 @@ class Suite:
             directory: made where it does not exist; what has ended there stays as it is.
             parallel: trials at a time, of all hunts together; 0 for one per core.
             watch: called about once a second.
+            machine: options such as ``executor`` that hold for all of them, whatever each says.
 
         Raises:
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
+            PluginError: there is no such executor.
         """
-        slots_of(parallel)
+        check_machine(parallel, machine)
         folders = self.plan(directory)
         waiting = [folder for folder in folders if hunt_state(folder).state in ("queued", "interrupted", "killed")]
-        run_all(waiting, parallel, watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]))
+        run_all(
+            waiting,
+            parallel,
+            watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]),
+            machine=machine,
+        )
         return [hunt_state(folder) for folder in folders]
 
     def _planned(self, entry: SuiteEntry, number: int, folder: Path) -> RunRequest:

@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from crashhunt.episode import WorkerSettings
+from crashhunt.base import layout
+from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import Executor
+from crashhunt.recording import Recording, read_black_box
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from crashhunt.recording import BlackBoxHeader
 
 __all__ = ["ExecutorContract"]
 
@@ -97,6 +101,37 @@ class ExecutorContract:
         assert time.monotonic() - began < 1.5
         executor.submit(self._spec(9))
         assert set(self._collect(executor, 1)) == {9}
+
+    def test_it_says_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
+        """A trial that runs is somewhere, or nobody knows where; nothing that has not been submitted is anywhere."""
+        assert executor.capacity == 2
+        assert dict(executor.where()) == {}
+        executor.submit(self._spec(3, hang_at_step=5))
+        deadline = time.monotonic() + 60
+        found: dict[int, BlackBoxHeader] = {}
+        while not found and time.monotonic() < deadline and not list(executor.completed(0.05)):
+            found = dict(executor.where())
+        assert set(found) <= {3}
+        assert all(header.trial == 3 and header.step <= 5 for header in found.values())
+        executor.cancel()
+        assert dict(executor.where()) == {}
+
+    def test_what_is_told_is_told_once(self, executor: Executor) -> None:
+        """Notes are lines for people."""
+        executor.submit(self._spec(0))
+        self._collect(executor, 1)
+        told = executor.notes()
+        assert all(isinstance(note, str) and note.strip() and "\n" not in note for note in told)
+        assert executor.notes() == []
+
+    def test_what_is_kept_has_its_black_box_here(self, executor: Executor, tmp_path: Path) -> None:
+        """Before its result comes back."""
+        executor.submit(self._spec(0))
+        executor.submit(self._spec(1, fail_at_step=10))
+        found = self._collect(executor, 2)
+        assert {number: result.kept for number, result in found.items()} == {0: False, 1: True}
+        scratch = tmp_path / "scratch"
+        assert Recording(read_black_box(scratch_of(scratch, 1) / layout.BLACK_BOX)).steps == found[1].steps
 
     def test_closing_twice_is_fine(self, executor: Executor) -> None:
         """Closing ends every process at once, whatever it does."""

@@ -163,8 +163,9 @@ def test_another_version_of_a_hunt_runs_elsewhere(toy):
     assert "is there already" in toy.crashhunt("rerun", "h", "--to", "slower", expect=2).err
     assert "another hunt" in toy.crashhunt("rerun", "h", "--set", "speed=4", expect=2).err
     assert "trials=many" in toy.crashhunt("rerun", "h", "--to", "x", "--set", "trials=many", expect=2).err
-    wrong = toy.crashhunt("rerun", "h", "--to", "x", "--set", "sped=4", expect=1)
-    assert "did you mean" in wrong.out
+    wrong = toy.crashhunt("rerun", "h", "--to", "x", "--set", "sped=4", expect=2)
+    assert "--set: the hunt has no argument 'sped'; did you mean 'ego.speed'?" in wrong.err
+    assert not (toy.folder / "x").exists()
 
 
 def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):

@@ -1,0 +1,180 @@
+"""Where trials run is chosen by name: one of ours, or somebody's own, on every way to a hunt."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+
+import pytest
+
+import crashhunt
+from crashhunt.base.errors import PluginError, UsageError
+
+MINE = '''
+from pathlib import Path
+from crashhunt.executors import PoolExecutor
+
+
+class Logged:
+    """A pool that writes down what it is asked; it knows the protocol and nothing else."""
+
+    def __init__(self, settings, *, parallel, recycle_after, argument=""):
+        self._pool = PoolExecutor(settings, parallel=parallel, recycle_after=recycle_after)
+        self._log = Path("calls.log")
+        self._said = ["an executor of mine was here"]
+        self._write(f"made {parallel} {recycle_after} {argument}")
+
+    def _write(self, line):
+        with self._log.open("a") as file:
+            file.write(f"{line}\\n")
+
+    @property
+    def capacity(self):
+        return self._pool.capacity
+
+    def submit(self, spec):
+        self._write(f"submit {spec.number}")
+        self._pool.submit(spec)
+
+    def completed(self, timeout_s):
+        return self._pool.completed(timeout_s)
+
+    def cancel(self, *, above=-1):
+        self._pool.cancel(above=above)
+
+    def where(self):
+        return self._pool.where()
+
+    def notes(self):
+        said, self._said = self._said, []
+        return [*said, *self._pool.notes()]
+
+    def close(self):
+        self._write("close")
+        self._pool.close()
+
+
+class Everywhere(Logged):
+    """Finds out itself how many trials 0 stands for."""
+
+    sizes_itself = True
+
+    def __init__(self, settings, *, parallel, recycle_after):
+        super().__init__(settings, parallel=parallel or 2, recycle_after=recycle_after, argument=f"asked {parallel}")
+
+
+class Broken:
+    def __init__(self, settings, *, parallel, recycle_after):
+        raise RuntimeError("no cluster\\nhere")
+
+
+class Refuses:
+    def __init__(self, settings, *, parallel, recycle_after):
+        from crashhunt.errors import UsageError
+
+        raise UsageError("nobody answers at 10.0.0.1", fix="start it")
+'''
+WORDS = ("run", "h", "2", "4", "40", "--scenario", "toy", "--seed", "3", "--arg", "speed=5", "--keep-going")
+
+
+@pytest.fixture
+def mine(toy):
+    (toy.folder / "mine.py").write_text(MINE)
+    return toy
+
+
+def calls(shell, name="calls.log"):
+    lines = (shell.folder / name).read_text().splitlines()
+    (shell.folder / name).unlink()
+    return lines
+
+
+def test_an_executor_of_somebodys_own_runs_the_trials(mine):
+    usual = mine.crashhunt(*WORDS, "--json").json
+    done = mine.crashhunt("run", "g", *WORDS[2:], "--executor", "mine:Logged:there:10001", "--json")
+    same = {"dir": "", "wall_s": 0}
+    assert done.json | same == usual | same | {"notes": ["an executor of mine was here"]}
+    found = calls(mine)
+    assert found[0] == "made 2 1000 there:10001"
+    assert found[1:5] == [f"submit {number}" for number in range(4)]
+    assert set(found[5:]) == {"close"}
+    assert "an executor of mine was here" in mine.crashhunt("logs", "g").out
+    assert tomllib.loads((mine.folder / "g" / "hunt.toml").read_text())["run"]["executor"] == "mine:Logged:there:10001"
+    assert "executor" not in (mine.folder / "h" / "hunt.toml").read_text()
+    digests = [
+        [line.split(",")[-1] for line in mine.crashhunt("trials", hunt, "--format", "csv").out.splitlines()]
+        for hunt in "hg"
+    ]
+    assert digests[0] == digests[1]
+
+
+def test_ours_are_chosen_by_name(mine):
+    done = mine.crashhunt(*WORDS[:2], "1", "2", *WORDS[4:], "--executor", "fresh", "--json")
+    assert done.json["outcomes"] == {"survived": 2}
+    # A hunt that goes on may do so elsewhere: what a trial is does not change.
+    mine.crashhunt(*WORDS[:2], "1", "3", *WORDS[4:], "--executor", "mine:Logged")
+    assert calls(mine)[:2] == ["made 1 1000 ", "submit 2"]
+
+
+def test_it_may_know_better_than_this_machine_what_0_stands_for(mine):
+    mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
+    assert calls(mine)[0] == "made 2 1000 asked 0"
+    assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
+    mine.crashhunt("run", "g", "0", *WORDS[3:], "--executor", "mine:Logged")
+    assert calls(mine)[0] == f"made {min(4, len(os.sched_getaffinity(0)))} 1000 "
+
+
+def test_suites_rerun_and_python_choose_it_too(mine, monkeypatch):
+    entry = 'id = "a"\nscenario = "toy"\ntrials = 2\nmax_steps = 20\nseed = 1\narguments.speed = 5\n'
+    (mine.folder / "s.toml").write_text(f"[[hunts]]\n{entry}")
+    (mine.folder / "own.toml").write_text(f'[[hunts]]\n{entry}executor = "mine:Logged:own"\n')
+    mine.crashhunt("suite", "run", "s.toml", "s", "1", "--executor", "mine:Logged:all")
+    assert calls(mine)[0] == "made 1 1000 all"
+    mine.crashhunt("suite", "run", "own.toml", "own", "1")
+    assert calls(mine)[0] == "made 1 1000 own"
+    mine.crashhunt("rerun", "own", "--all", "--parallel", "1")
+    assert calls(mine)[0] == "made 1 1000 own"
+    mine.crashhunt("rerun", "own/a/0", "--to", "again", "--parallel", "1", "--executor", "mine:Logged:else")
+    assert calls(mine)[0] == "made 1 1000 else"
+    monkeypatch.chdir(mine.folder)
+    report = crashhunt.run("p", 1, 1, 20, scenario="toy", arguments={"speed": 5}, executor="mine:Logged", seed=1)
+    assert report.stopped_because == "all_trials"
+    assert calls(mine)[1] == "submit 0"
+    with pytest.raises(PluginError, match="'nope' is not a registered name of executors; give one of"):
+        crashhunt.Suite.read("s.toml").run("t", machine={"executor": "nope"})
+    with pytest.raises(UsageError, match="--executor is 3; give a text"):
+        crashhunt.prepare("q", 1, 1, 1, scenario="toy", executor=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nope", "'nope' is not a registered name of executors; give one of fresh, pool, or module:attribute"),
+        ("pol", "did you mean 'pool'?"),
+        ("pool:3", "--executor pool:3: 'pool' takes no argument; write --executor pool"),
+        ("mine:Nothing", "'mine:Nothing': mine has no attribute 'Nothing'"),
+        ("elsewhere:Pool:3", "No module named 'elsewhere'"),
+        ("mine:Everywhere:x", "'mine:Everywhere' takes no argument"),
+    ],
+)
+def test_what_there_is_not_is_one_line(mine, name, message):
+    commands = [WORDS] if name != "nope" else [WORDS, ("suite", "run", "s.toml", "s"), ("rerun", "made")]
+    (mine.folder / "s.toml").write_text('[[hunts]]\nid = "a"\nscenario = "toy"\n')
+    (mine.folder / "made").mkdir()
+    (mine.folder / "made" / "request.json").write_text("{}")
+    for words in commands:
+        done = mine.crashhunt(*words, "--executor", name, expect=2)
+        assert message in done.err
+        assert done.err.count("\n") == 1
+    assert not (mine.folder / "h").exists()
+    assert not (mine.folder / "s").exists()
+
+
+def test_one_that_cannot_be_made_says_why(mine):
+    done = mine.crashhunt(*WORDS, "--executor", "mine:Broken", "--json", expect=2)
+    assert done.json["error"]["message"] == "the executor 'mine:Broken' cannot be made: RuntimeError: no cluster here"
+    assert "mine.py, line" in done.json["error"]["where"]
+    done = mine.crashhunt(*WORDS, "--executor", "mine:Refuses", expect=2)
+    assert done.err.strip().endswith("crashhunt: nobody answers at 10.0.0.1; start it")
+    assert json.loads(mine.crashhunt("status", "h", "--json").out)["hunts"][0]["state"] == "error"
