@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import answer_file
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, has_hung, hung, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 __all__ = ["PoolExecutor"]
 
 _LOOK_EVERY_S = 0.1  # whether somebody hangs; those who end make themselves heard
-_LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
 _START_UP_S = 60.0  # for a new worker to get ready, before a trial counts as begun
 _RECEIVED = 1 << 16  # bytes at a time; a result is a few hundred
 
@@ -335,8 +334,9 @@ class PoolExecutor:
             if worker.attempt is None or worker.killed or self._link is None:
                 continue
             header = where_it_is(self._settings.scratch, worker.attempt.spec.number)
-            limit = self._settings.timeout_s + _LAST_WORDS_S
+            limit = self._settings.timeout_s
             began, allowed = (header.started, limit) if header else (worker.given_at, limit + _START_UP_S)
-            if now - max(began, worker.given_at) > allowed:
+            over_s = now - max(began, worker.given_at) - allowed
+            if has_hung(self._settings.scratch, worker.attempt.spec.number, over_s):
                 worker.killed = True
                 self._link.kill(worker.slot)
