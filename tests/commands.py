@@ -54,7 +54,11 @@ class Commands:
 
     def fits(self, environment: Mapping[str, str]) -> bool:
         """Whether a process that is started with these variables begins as the forks do."""
-        return _at_start(environment) == self._at_start
+        return _at_start(environment) == self._at_start and not any(
+            Path(place, f"{name}.py").exists() or Path(place, name).exists()
+            for place in _path(environment)
+            for name in ("sitecustomize", "usercustomize", "crashhunt")
+        )
 
     def run(
         self, words: Sequence[str], folder: Path, environment: Mapping[str, str], timeout_s: float
@@ -93,7 +97,13 @@ def _text(data: bytes) -> str:
 
 
 def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    return {name: value for name, value in environment.items() if name.startswith(_AT_START)}
+    found = {name: value for name, value in environment.items() if name.startswith(_AT_START)}
+    found.pop("PYTHONPATH", None)
+    return found
+
+
+def _path(environment: Mapping[str, str]) -> list[str]:
+    return [place for place in environment.get("PYTHONPATH", "").split(os.pathsep) if place]
 
 
 def _serve(control: socket.socket) -> None:
@@ -122,6 +132,7 @@ def _be_command(request: dict, out: int, err: int) -> NoReturn:
         os.environ.clear()
         os.environ.update(request["environment"])
         os.chdir(request["folder"])
+        sys.path[1:1] = [place for place in map(os.path.abspath, _path(os.environ)) if place not in sys.path]
         sys.argv = [str(CRASHHUNT), *request["words"]]
         from crashhunt.cli import main
 

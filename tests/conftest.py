@@ -186,9 +186,14 @@ range = "4:14"
 """
 
 
-@pytest.fixture
-def toy(shell: Shell) -> Shell:
-    """The same with a scenario `toy`, which takes microseconds a step; above 10 m/s it soon crashes."""
+def add_toy(shell: Shell) -> Shell:
+    """Write the scenario `toy` into a folder; it takes microseconds a step, and above 10 m/s it soon crashes."""
     (shell.folder / "toy").mkdir()
     (shell.folder / "toy" / "scenario.toml").write_text(TOY, encoding="utf-8")
     return shell
+
+
+@pytest.fixture
+def toy(shell: Shell) -> Shell:
+    """The same with the scenario `toy`."""
+    return add_toy(shell)

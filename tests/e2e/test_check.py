@@ -205,15 +205,15 @@ def test_a_snapshot_that_has_more_or_other_files_is_refused(hunt, crash):
     assert "code/linked was not there" in command("replay", crash)[2]
     (code / "linked").unlink()
     # What Python would take for the compiled form of what is there: removed, as it will be made again.
-    source = code / "crashhunt" / "episode.py"
-    stray = source.parent / "__pycache__" / "episode.cpython-311.pyc"
+    source = code / "crashhunt" / "episode" / "_episode.py"
+    stray = source.parent / "__pycache__" / "_episode.cpython-311.pyc"
     stray.parent.mkdir(exist_ok=True)
     times = source.stat()
     kept = source.read_bytes()
     source.write_bytes(evil.read_bytes().ljust(len(kept), b"#"))
     os.utime(source, (times.st_atime, times.st_mtime))
     py_compile.compile(
-        str(source), cfile=str(stray.with_name(f"episode.{__import__('sys').implementation.cache_tag}.pyc"))
+        str(source), cfile=str(stray.with_name(f"_episode.{__import__('sys').implementation.cache_tag}.pyc"))
     )
     source.write_bytes(kept)
     os.utime(source, (times.st_atime, times.st_mtime))
@@ -236,7 +236,7 @@ def test_a_snapshot_that_has_more_or_other_files_is_refused(hunt, crash):
 
 def test_a_snapshot_that_is_damaged_is_made_again(hunt, toy):
     (snapshot,) = (hunt / "snapshots").iterdir()
-    (snapshot / "code" / "crashhunt" / "episode.py").write_text("")
+    (snapshot / "code" / "crashhunt" / "episode" / "_episode.py").write_text("")
     toy.crashhunt("run", "h", "2", "13", *HUNT[2:], "--keep-going", "--keep-trials")
     assert command("check", "h")[0] == 0
 

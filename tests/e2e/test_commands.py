@@ -17,7 +17,7 @@ def told(shell, hunt: str, run) -> tuple:
         json.loads((snapshot / f"{name}.json").read_text()) for name in ("manifest", "environment")
     )
     (crash,) = done.json["crashes"]
-    err = re.sub(r"\d+:\d\d;", "M:SS;", done.err.replace(hunt, "h"))  # how long it took
+    err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
     return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err
 
 

@@ -21,7 +21,7 @@ def crash(shell, made_once):
 def typed(shell, text: str, *words: str) -> str:
     done = subprocess.run(
         [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.environment, input=text,
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=150, check=False,
     )  # fmt: skip
     assert "Traceback" not in done.stderr, done.stderr
     return done.stdout
@@ -41,7 +41,7 @@ def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
 def test_quitting_the_debugger_is_no_crash_of_ours(crash):
     done = subprocess.run(
         [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.environment, input="q\n",
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=150, check=False,
     )  # fmt: skip
     assert done.returncode == 130
     assert "Traceback" not in done.stderr

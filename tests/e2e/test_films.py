@@ -7,6 +7,7 @@ import json
 import av
 import numpy as np
 import pytest
+from conftest import add_toy
 from PIL import Image
 
 SHOWY = """
@@ -37,10 +38,11 @@ class Showy:
             return {"seen": render.Heatmap(self.seen), "step": [render.Text(str(self.step), title="count")]}
 """
 BUILTIN = 4
-WORDS = ("--arg", "speed=8", "--set", "vehicles=10", "--seed", "1", "--crash-on", "agent_error")
+WORDS = ("--arg", "speed=8", "--scenario", "toy", "--seed", "1", "--crash-on", "agent_error")
 
 
 def hunted(shell):
+    add_toy(shell)
     (shell.folder / "showy.py").write_text(SHOWY, encoding="utf-8")
     shell.crashhunt("run", "h", "1", "1", "60", "--agent", "showy:Showy", *WORDS)
 
@@ -105,15 +107,15 @@ def test_no_panels_and_the_last_seconds(crash):
     assert size(crash.folder / "g/000000.png") > (200, 100)
 
 
-def test_several_crashes_in_one_film(shell):
-    words = ("--agent", "faulty:Raises", "--arg", "at=12", "--set", "vehicles=10", "--seed", "1", "--keep-going")
-    found = shell.crashhunt("run", "h", "2", "2", "40", *words, "--json").json
+def test_several_crashes_in_one_film(toy):
+    words = ("--agent", "faulty:Raises", "--arg", "at=12", "--scenario", "toy", "--seed", "1", "--keep-going")
+    found = toy.crashhunt("run", "h", "2", "2", "40", *words, "--json").json
     names = ",".join(crash["id"] for crash in found["crashes"])
     for who in ((), ("--from-log",)):
-        out = shell.crashhunt("replay", "h", "--crash", names, *who, "--frames", f"f{len(who)}", "--size", "128x128",
+        out = toy.crashhunt("replay", "h", "--crash", names, *who, "--frames", f"f{len(who)}", "--size", "128x128",
                               "--blank-frames", "3", "--last-step-repeats", "1")  # fmt: skip
         assert f"f{len(who)} has {13 * 2 + 3} pictures" in out.out
-    done = shell.crashhunt("replay", "h", "--crash", names, expect=2)
+    done = toy.crashhunt("replay", "h", "--crash", names, expect=2)
     assert "names several" in done.err
 
 

@@ -153,9 +153,9 @@ def test_trials_that_could_not_be_set_up_run_again(toy):
 
 
 def test_another_version_of_a_hunt_runs_elsewhere(toy):
-    toy.crashhunt("run", "h", "2", "10", "99", *KEEP, "--arg", "speed=14", "--set", "gap_m=20:30")
-    done = toy.crashhunt("rerun", "h", "--to", "slower", "--set", "speed=4", "--set", "trials=7", "--json").json
-    assert [(hunt["dir"], hunt["outcomes"]) for hunt in done["hunts"]] == [("slower", {"survived": 7})]
+    toy.crashhunt("run", "h", "2", "4", "99", *KEEP, "--arg", "speed=14", "--set", "gap_m=20:30")
+    done = toy.crashhunt("rerun", "h", "--to", "slower", "--set", "speed=4", "--set", "trials=3", "--json").json
+    assert [(hunt["dir"], hunt["outcomes"]) for hunt in done["hunts"]] == [("slower", {"survived": 3})]
     # The same seeds, and the same traffic.
     for old, new in zip(rows(toy, "h"), rows(toy, "slower"), strict=False):
         assert (old["seed"], old["scenario.gap_m"]) == (new["seed"], new["scenario.gap_m"])
@@ -177,7 +177,7 @@ def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
 
 
 def test_a_hunt_of_ones_own_scenario_begins_anew(toy):
-    toy.crashhunt("run", "h", "1", "9", "99", *KEEP)
+    toy.crashhunt("run", "h", "1", "4", "99", *KEEP)
     before = [row["digest"] for row in rows(toy, "h")]
     for number in range(2):  # the second time, the scenario is that of what was set aside the first time
         done = toy.crashhunt("rerun", "h", "--all", "--json").json
@@ -222,13 +222,13 @@ def test_tables_of_trials(toy):
 
 def test_which_of_two_agents_crashes_less(toy):
     for name, speed in (("fast", "14"), ("slow", "4"), ("again", "14")):
-        toy.crashhunt("run", name, "2", "20", "99", *KEEP, "--arg", f"speed={speed}")
+        toy.crashhunt("run", name, "2", "6", "99", *KEEP, "--arg", f"speed={speed}", "--set", "gap_m=20:30")
     found = toy.crashhunt("compare", "fast", "slow", "again", "--json", "--html", "c.html").json
     fast, slow, again = found["hunts"]
     assert fast["crashes"] == again["crashes"] > 5
     assert (slow["crashes"], slow["crash_rate"], slow["median_steps_to_crash"]) == (0, 0.0, None)
     assert slow["interval"][0] == 0.0
-    assert slow["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 20))  # Clopper and Pearson's, for none of 20
+    assert slow["interval"][1] == pytest.approx(1 - 0.025 ** (1 / 6))  # Clopper and Pearson's, for none of 6
     against_slow, against_again = found["pairs"]
     assert (against_slow["only_first"], against_slow["only_second"]) == (fast["crashes"], 0)
     assert against_slow["p_value"] == pytest.approx(2 * 0.5 ** fast["crashes"])

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from conftest import rewritten
+from conftest import add_toy, rewritten
 
 from crashhunt.base.version import __version__
 
@@ -31,15 +31,25 @@ class Planner:
 '''
 
 
-def hunted(shell):
+def write_planner(shell):
     (shell.folder / "my_pkg").mkdir()
     (shell.folder / "my_pkg" / "__init__.py").write_text("")
     (shell.folder / "my_pkg" / "agents.py").write_text(AGENT)
     (shell.folder / "helper.py").write_text("WORDS = 'out of ideas'\nGAIN = 0.01\n")
+
+
+def hunted(shell):
+    write_planner(shell)
+    words = ("--scenario", "own", "--agent", "my_pkg.agents:Planner", "--set", "gap_m=30")
+    add_toy(shell).folder.joinpath("toy").rename(shell.folder / "own")
+    shell.crashhunt("run", "h", "1", "2", "100", *words)
+
+
+def hunted_on_sumo(shell):
+    write_planner(shell)
     shutil.copytree(Path(__file__).parents[2] / "scenarios" / "loop", shell.folder / "own")
     words = ("--scenario", "own", "--agent", "my_pkg.agents:Planner", "--set", "vehicles=10")
     shell.crashhunt("run", "h", "1", "2", "100", *words)
-    return shell
 
 
 @pytest.fixture
@@ -47,8 +57,13 @@ def crash(shell, made_once):
     return made_once(hunted, shell)
 
 
-def test_the_originals_may_be_gone(shell):
-    crash = hunted(shell)
+@pytest.fixture
+def crash_on_sumo(shell, made_once):
+    return made_once(hunted_on_sumo, shell)
+
+
+def test_the_originals_may_be_gone(crash_on_sumo):
+    crash = crash_on_sumo
     for name in ("my_pkg", "own"):
         shutil.rmtree(crash.folder / name)
     (crash.folder / "helper.py").write_text("WORDS = 'something else'\nGAIN = 5.0\n")
@@ -126,13 +141,13 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
-def test_replay_takes_the_crash_with_the_fewest_steps(shell):
-    words = ("run", "h", "2", "6", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--set", "vehicles=10")
-    report = shell.crashhunt(*words, "--keep-going", "--json").json
+def test_replay_takes_the_crash_with_the_fewest_steps(toy):
+    words = ("run", "h", "2", "4", "200", "--agent", "faulty:Raises", "--arg", "at=5:60", "--scenario", "toy")
+    report = toy.crashhunt(*words, "--keep-going", "--json").json
     steps = [crash["step"] for crash in report["crashes"]]
     assert steps == sorted(steps)
-    assert shell.crashhunt("replay", "h", "--json").json["crash"] == report["crashes"][0]["id"]
-    done = shell.crashhunt("replay", "h", "--crash", "77", expect=2)
+    assert toy.crashhunt("replay", "h", "--json").json["crash"] == report["crashes"][0]["id"]
+    done = toy.crashhunt("replay", "h", "--crash", "77", expect=2)
     assert report["crashes"][0]["id"] in done.err
 
 
@@ -197,21 +212,22 @@ def test_hunt_toml_is_what_a_replay_uses(crash):
     assert crash.crashhunt("replay", "h", "--json", expect=1).json["edits"] == ["ego.speed was 8.0 and is 5.5"]
 
 
-def test_an_agent_that_is_not_deterministic_is_found_out(shell):
-    (shell.folder / "coin.py").write_text(
+def test_an_agent_that_is_not_deterministic_is_found_out(toy):
+    (toy.folder / "coin.py").write_text(
         "import os\n\nclass Agent:\n    def reset(self, seed): self.step = 0\n\n"
         "    def act(self, observation):\n        self.step += 1\n        assert self.step < 20\n"
         "        return 5 + os.urandom(1)[0] / 1000 * (self.step > 9), 0\n"
     )
-    shell.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--set", "vehicles=10", "--json")
-    done = shell.crashhunt("replay", "h", "--times", "3", "--json", expect=1).json
+    toy.crashhunt("run", "h", "1", "1", "100", "--agent", "coin:Agent", "--scenario", "toy", "--json")
+    done = toy.crashhunt("replay", "h", "--times", "3", "--json", expect=1).json
     assert (done["verdict"], done["times"]) == ("diverged", 3)
     assert done["divergence"]["step"] == 10
     assert done["divergence"]["field"] == "action[target_speed]"
     assert done["agreed"] < 3
 
 
-def test_what_cannot_be_compared_says_which(crash):
+def test_what_cannot_be_compared_says_which(crash_on_sumo):
+    crash = crash_on_sumo
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     scenario = snapshot / "scenario" / "scenario.toml"
     edit(scenario, "vehicles = 8", "vehicles = 4")
@@ -238,7 +254,7 @@ def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     code = snapshot / "code" / "crashhunt"
     edit(code / "episode" / "_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")
-    edit(code / "__init__.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
+    edit(code / "base" / "version.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
     for words in ((), ("--until", "5")):
         refused = crash.crashhunt("replay", "h", "--force", *words, expect=2)
         assert "the snapshot has crashhunt 7.8.9" in refused.err

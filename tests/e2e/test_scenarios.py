@@ -14,23 +14,35 @@ import crashhunt
 from crashhunt.recording import read_lanes
 from crashhunt.scenario import shipped_scenarios
 
-SEEDS = {"merge": 3, "intersection": 3}  # with which a crash comes soon
+SEEDS = {  # with which a crash comes soon
+    "highway": 3,
+    "highway-policy": 8,
+    "intersection": 1,
+    "intersection-highway-env": 4,
+    "intersection-two-agents": 4,
+    "loop": 6,
+    "merge": 7,
+    "motorway": 6,
+    "roundabout": 2,
+}
 
 
 @pytest.mark.parametrize("scenario", sorted(shipped_scenarios()))
 def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
     seed = str(SEEDS.get(scenario, 1))
     words = ("--scenario", scenario, "--seed", seed, "--deterministic")
-    found = shell.crashhunt("run", "h", "2", "400", "1500", *words, "--json").json
+    found = shell.crashhunt("run", "h", "2", "400", "500", *words, "--json").json
     (crash,) = found["crashes"]
     assert crash["confirmed"]
-    whole = scenario in ("loop", "highway", "intersection-two-agents")
-    for who in ((), ("--code", "current"), ("--from-log",)) if whole else ((),):
-        assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
     frames = ("--frames", "f", "--last-seconds", "1", "--size", "160x120", "--json")
-    written = shell.crashhunt("replay", "h", *frames).json
-    assert written["written"]["f"] in (21, 16, 12)  # steps of 0.1, 0.2 and 1 s, and the last one again
-    if not whole:
+    replayed = shell.crashhunt("replay", "h", *frames).json
+    assert replayed["verdict"] == "reproduced"
+    assert replayed["written"]["f"] in (21, 16, 12)  # steps of 0.1, 0.2 and 1 s, and the last one again
+    for who in {"loop": (("--code", "current"), ("--from-log",)), "intersection-two-agents": (("--from-log",),)}.get(
+        scenario, ()
+    ):
+        assert shell.crashhunt("replay", "h", *who, "--json").json["verdict"] == "reproduced"
+    if scenario not in ("loop", "highway"):
         return
     shell.crashhunt("export", "h", "crash.zip")
     assert shell.crashhunt("replay", "crash.zip", "--json").json["digest_replayed"] == crash["digest"]
@@ -143,7 +155,7 @@ def test_a_mistake_in_a_highway_scenario_is_one_line(shell, table, says):
 
 
 def test_the_accelerator_changes_nothing_but_the_time(shell):
-    words = ("2", "6", "60", "--scenario", "highway", "--seed", "1", "--keep-going")
+    words = ("2", "4", "30", "--scenario", "highway", "--seed", "1", "--keep-going")
     shell.crashhunt("run", "fast", *words)
     shell.crashhunt("run", "slow", *words, "--no-accelerate")
     fast, slow = (
@@ -154,7 +166,7 @@ def test_the_accelerator_changes_nothing_but_the_time(shell):
         for name in ("fast", "slow")
     )
     assert fast == slow
-    assert len({digest for _, _, digest in fast}) == 6
+    assert len({digest for _, _, digest in fast}) == 4
     assert "accelerate = false" in (shell.folder / "slow/hunt.toml").read_text()
     if any(outcome == "collision" for _, outcome, _ in fast):
         assert shell.crashhunt("replay", "fast", "--no-accelerate", "--json").json["verdict"] == "reproduced"
@@ -228,8 +240,8 @@ def test_every_crash_has_the_map_of_its_own_trial(shell):
     """An argument may change the road; what is drawn is the road that was driven."""
     (shell.folder / "scenario.toml").write_text(WIDER)
     words = ("--scenario", ".", "--seed", "1", "--keep-going")
-    found = shell.crashhunt("run", "h", "2", "12", "100", *words, "--json").json["crashes"]
-    assert len(found) >= 3
+    found = shell.crashhunt("run", "h", "2", "4", "60", *words, "--json").json["crashes"]
+    assert len(found) >= 2
     for crash in found:
         lanes = read_lanes(shell.folder / crash["path"] / "log.mcap")
         rings = [np.hypot(*np.concatenate(borders).T) for borders in lanes]

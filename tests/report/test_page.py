@@ -52,7 +52,7 @@ def hunt(shell, made_once):
     return made_once(hunted, shell)
 
 
-def wait_until(condition, seconds: float = 15.0):
+def wait_until(condition, seconds: float = 60.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "the page did not get there"
