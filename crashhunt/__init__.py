@@ -4,6 +4,7 @@
 ``accelerate`` speeds highway-env up in a process of your own.
 """
 
+import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -18,18 +19,20 @@ from crashhunt.base.version import __version__
 
 __all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run"]
 
+_HOMES = {
+    "Hunt": "crashhunt.hunts",
+    "Suite": "crashhunt.suites",
+    "accelerate": "crashhunt.simulators.accelerator",
+    "compare": "crashhunt.estimation",
+    "load": "crashhunt.hunts",
+}
+
 
 def __getattr__(name: str) -> Any:
     """Import the functions when they are first asked for: a worker needs none of them."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "accelerate":
-        from crashhunt.simulators.accelerator import accelerate
-
-        return accelerate
-    from crashhunt import api
-
-    return getattr(api, name)
+    return getattr(importlib.import_module(_HOMES.get(name, "crashhunt.api")), name)
 
 
 def __dir__() -> list[str]:

@@ -7,21 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.calls import called_with, clear_calls
-from crashhunt.crashes import Bundle, find_bundle
-from crashhunt.estimation import compare
-from crashhunt.hunts import Hunt, load
-from crashhunt.plans import HuntOptions, Spec, hunt_options, plan, request_of, spec_words
-from crashhunt.replays import ReplayOptions, ReplayReport, replay as _replay
-from crashhunt.snapshots import SnapshotOptions
-from crashhunt.suites import Suite
+from crashhunt.plans import HuntOptions, Spec, hunt_options, request_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from crashhunt.hunts import HuntReport, HuntStatus
-    from crashhunt.replays import Code
+    from crashhunt.crashes import Bundle
+    from crashhunt.hunts import Hunt, HuntReport, HuntStatus
+    from crashhunt.replays import Code, ReplayReport
+    from crashhunt.snapshots import SnapshotOptions
 
-__all__ = ["Hunt", "HuntCall", "RunCall", "Suite", "compare", "load", "prepare", "replay", "run"]
+__all__ = ["HuntCall", "RunCall", "prepare", "replay", "run"]
 
 
 @dataclass(frozen=True)
@@ -78,9 +74,15 @@ def prepare(asked: HuntCall) -> Hunt:
 
 
 def _prepared(asked: HuntCall) -> Hunt:
-    request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel)
-    snapshot = asked.snapshot if asked.snapshot is not None else SnapshotOptions.of(asked)
+    # What is out of its range is refused before anything large is imported: somebody waits at a terminal.
+    request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel).checked()
+    from crashhunt.plans import plan
+
     found, settings = plan(request)
+    from crashhunt.hunts import Hunt
+    from crashhunt.snapshots import SnapshotOptions
+
+    snapshot = asked.snapshot if asked.snapshot is not None else SnapshotOptions.of(asked)
     return Hunt(
         Path(asked.directory),
         found,
@@ -132,9 +134,13 @@ def replay(
     Raises:
         CrashhuntError: it cannot be run.
     """
+    from crashhunt.crashes import Bundle, find_bundle
+    from crashhunt.plans import spec_words
+    from crashhunt.replays import ReplayOptions, replay as replayed
+
     bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
     edits = spec_words(changes)
     options = ReplayOptions(
         code=code, changes=edits, times=times, force=force, scenario=str(scenario), accelerate=accelerate
     )
-    return _replay(bundle, options)
+    return replayed(bundle, options)

@@ -44,10 +44,7 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     # From here to where the hunt takes over there is nothing to keep, and an exception would be lost where somebody
     # else's import swallows it.
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
-    from rich.console import Console
-
     from crashhunt.api import prepare
-    from crashhunt.report import Watcher, describe_hunt
 
     hunt = prepare(
         options.directory,
@@ -58,6 +55,10 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         command=["crashhunt", *words],
         **chosen_options(options),
     )
+    from rich.console import Console
+
+    from crashhunt.report import Watcher, describe_hunt
+
     console = Console(stderr=options.json, highlight=False)
     for note in hunt.scenario.notes:
         console.print(one_line(note), markup=False, soft_wrap=True)

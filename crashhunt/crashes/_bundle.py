@@ -14,7 +14,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.base.files import sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
 from crashhunt.base.names import listed, near_path, one_of
-from crashhunt.recording import Recording, foxglove_layout, read_black_box, read_log, write_log
+from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
 from crashhunt.trial import Collision, Escape, Failure, TrialResult, TrialSpec, check_parts, outcome_of
 from crashhunt.world import ClosestApproach, Event
@@ -96,6 +96,8 @@ class Bundle:
         Raises:
             BundleError: it is missing, damaged, or that of another crash.
         """
+        from crashhunt.recording import read_log  # MCAP and protobuf take longer than a hunt that is refused
+
         log = self.path / layout.LOG
         found = read_log(log)
         if found.digest != self.result.digest:
@@ -316,6 +318,8 @@ def write_bundle(
         snapshot: the digest of the code that ran.
         lanes: of the map, for whoever looks at the log.
     """
+    from crashhunt.recording import foxglove_layout, write_log
+
     name = f"{result.spec.number:06d}-{result.outcome}"
     final, building = directory / layout.CRASHES / name, directory / layout.CRASHES / f".{name}.part"
     shutil.rmtree(building, ignore_errors=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING
-from xml.sax.saxutils import escape, unescape
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.names import did_you_mean, listed
@@ -104,11 +103,15 @@ def _defined(name: str, texts: list[bytes]) -> bool:
 
 
 def _definition(name: str) -> re.Pattern[bytes]:
+    from xml.sax.saxutils import escape  # which imports urllib and ssl
+
     written = re.escape(escape(name, {'"': "&quot;", "'": "&apos;"}).encode())
     return re.compile(rb"""\bid\s*=\s*["'](?:%b|%b)["']""" % (written, re.escape(name.encode())))
 
 
 def _ids(tags: bytes, texts: list[bytes]) -> list[str]:
+    from xml.sax.saxutils import unescape  # which imports urllib and ssl
+
     found = re.compile(rb"""<(?:%b)\s[^<>]*?\bid\s*=\s*["']([^"']*)["']""" % tags)
     names = (name.decode(errors="replace") for text in texts for name in found.findall(text))
     return list(dict.fromkeys(unescape(name, {"&quot;": '"', "&apos;": "'"}) for name in names))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 from crashhunt.base.errors import ScenarioError
 
@@ -142,6 +141,8 @@ def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference]
         found: what `references` has found in it.
         name: what each is to name; what it does already changes nothing.
     """
+    from xml.sax.saxutils import quoteattr  # which imports urllib and ssl
+
     parts, end = [], 0
     for reference in found:
         value = name(reference)
