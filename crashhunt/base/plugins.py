@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Group",
     "import_module",
+    "load_attribute",
     "load_object",
     "locate",
     "registered",
 ]
 
-Group = Literal["agents", "executors", "oracles", "samplers", "simulators"]
+Group = Literal["agents", "backends", "executors", "oracles", "samplers", "simulators"]
 
 
 def registered(group: Group) -> dict[str, EntryPoint]:
@@ -50,10 +51,28 @@ def locate(group: Group, name: str) -> Any:
 
 
 def load_object(target: str, *, shown: str = "") -> Any:
-    """Import what a ``module:attribute`` stands for.
+    """Import the class or function that a ``module:attribute`` stands for.
 
     Args:
         target: the module and what in it can be called.
+        shown: how errors name it.
+
+    Raises:
+        PluginError: there is no such thing, or importing it failed.
+    """
+    found = load_attribute(target, shown=shown)
+    if not callable(found):
+        raise PluginError(
+            f"{shown or target!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function"
+        )
+    return found
+
+
+def load_attribute(target: str, *, shown: str = "") -> Any:
+    """Import what a ``module:attribute`` stands for, whatever it is.
+
+    Args:
+        target: the module and the attribute.
         shown: how errors name it.
 
     Raises:
@@ -71,10 +90,6 @@ def load_object(target: str, *, shown: str = "") -> Any:
                 fix=did_you_mean(part, public) or "mend the name",
             )
         found = getattr(found, part)
-    if not callable(found):
-        raise PluginError(
-            f"{name!r} is a {type(found).__name__}, which cannot be called", fix="name a class or function"
-        )
     return found
 
 

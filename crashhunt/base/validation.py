@@ -6,7 +6,7 @@ What fits to the letter is built without pydantic, whose import and schemas are 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import EnumType
 from functools import cache
 from pathlib import Path
@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, 
 from crashhunt.base.names import did_you_mean
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from pydantic import TypeAdapter
 
     from crashhunt.base.errors import CrashhuntError
@@ -25,7 +27,15 @@ __all__ = ["validate"]
 T = TypeVar("T")
 
 
-def validate(kind: type[T], data: object, *, where: str, error: type[CrashhuntError]) -> T:
+def validate(
+    kind: type[T],
+    data: object,
+    *,
+    where: str,
+    error: type[CrashhuntError],
+    under: str = "",
+    keys: Callable[[], Iterable[str]] | None = None,
+) -> T:
     """Build a dataclass from plain data; unknown keys and wrong types are errors.
 
     Args:
@@ -33,11 +43,23 @@ def validate(kind: type[T], data: object, *, where: str, error: type[CrashhuntEr
         data: as it was read from TOML or JSON.
         where: the file, for the error.
         error: the error to raise; its message has key and value, its fix says what would do.
+        under: the key of the table that this is, where it is one of a file.
+        keys: returns what a file may have at its top, where that is not what the dataclass has.
     """
     try:
         return cast(T, _built(kind, data))
     except _NotToTheLetterError:
-        return _validated(kind, data, where, error)
+        return _validated(kind, data, _Place(where, error, under, keys))
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where what is validated comes from, for the error."""
+
+    where: str
+    error: type[CrashhuntError]
+    under: str
+    keys: Callable[[], Iterable[str]] | None
 
 
 class _NotToTheLetterError(Exception):
@@ -94,17 +116,19 @@ def _hints_of(kind: type) -> tuple[dict[str, Any], frozenset[str]]:
     return {item.name: hints[item.name] for item in items}, frozenset(needed)
 
 
-def _validated(kind: type[T], data: object, where: str, error: type[CrashhuntError]) -> T:
+def _validated(kind: type[T], data: object, place: _Place) -> T:
     from pydantic import ValidationError
 
+    error, where = place.error, place.where
     try:
         return cast(T, _adapter(cast(Any, kind)).validate_python(data))
     except ValidationError as problem:
         first = problem.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
+        path = tuple(str(part) for part in first["loc"])
+        key = ".".join((place.under, *path) if place.under else path)
         if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _known_keys(kind, tuple(str(part) for part in first["loc"][:-1]))
-            fix = did_you_mean(str(first["loc"][-1]), known) or f"the keys here are {', '.join(known)}"
+            known = list(place.keys()) if place.keys and len(path) == 1 else _known_keys(kind, path[:-1])
+            fix = did_you_mean(path[-1], known) or f"the keys here are {', '.join(known)}"
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
         if first["type"] in ("missing", "missing_argument"):
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None

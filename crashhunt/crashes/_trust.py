@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
-from xml.parsers import expat
 
-from crashhunt.base.errors import ScenarioError, UsageError
+from crashhunt.base.errors import UsageError
 from crashhunt.base.plugins import registered
 from crashhunt.oracles import oracle_name
-from crashhunt.scenario.backends.sumo import (
-    ATTRIBUTES,
-    ELEMENTS,
-    HARMLESS,
-    LABELS,
-    READ,
-    WRITTEN,
-    canonical,
-    filled_in,
-    is_output,
-    is_shown,
-    read_xml,
-)
+from crashhunt.scenario import backend_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
     from crashhunt.base.plugins import Group
     from crashhunt.plans import HuntSettings
-    from crashhunt.scenario import Scenario, SumoSetup
+    from crashhunt.scenario import Scenario
 
 __all__ = ["refuse_side_effects"]
 
@@ -50,73 +37,13 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
             raise _refusal(f"it would import {name!r}")
     for module in scenario.modules():
         raise _refusal(f"it would import {module!r}")
-    if scenario.gym is not None and (scenario.gym.kwargs or scenario.arguments or values):
-        raise _refusal("it gives its environment arguments")
+    backend = backend_of(scenario.simulator)
+    if backend is None or backend.side_effect is None:
+        raise _refusal(f"nobody knows what the simulator {scenario.simulator!r} does besides simulating")
     asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
-    for text in _texts([scenario.highway.config, asked, list(values.values())] if scenario.highway else []):
-        if "." in text and not text.startswith("highway_env."):  # the class of a vehicle
-            raise _refusal(f"its configuration names {text!r}")
-    if scenario.sumo is not None:
-        _check_sumo(scenario, scenario.sumo, values)
-
-
-def _check_sumo(scenario: Scenario, sumo: SumoSetup, values: Mapping[str, Any]) -> None:
-    options = [*sumo.options, *(setup.option for setup in scenario.arguments.values() if setup.option)]
-    for option in options:
-        name = canonical(option)
-        if name not in HARMLESS or is_output(name) or is_shown(name):
-            raise _refusal(f"it sets SUMO's option {option!r}")
-    texts = set(scenario.texts())
-    for file in scenario.files():
-        try:
-            content = read_xml(scenario.folder / file)
-            if file in texts and not sumo.literal:
-                content = filled_in(content, values)
-        except (ScenarioError, UnicodeDecodeError, KeyError, ValueError) as error:
-            raise _refusal(f"{file} cannot be checked: {error}") from None
-        _check_text(file, content, reads=file in texts)
-
-
-def _check_text(file: str, content: bytes, *, reads: bool) -> None:
-    """Refuse an XML file that has anything but what is known to simulate.
-
-    Args:
-        file: its name.
-        content: as SUMO gets it.
-        reads: whether the files that it names have been looked at.
-    """
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag not in ELEMENTS:
-            raise _refusal(f"{file} has <{tag}>, of which nobody knows what SUMO does with it")
-        for name, value in attributes.items():
-            if (tag, name) in READ:
-                if not reads or value.startswith("/") or "${" in value:
-                    raise _refusal(f"{file} has <{tag} {name}={value!r}>, and SUMO would read that file")
-            elif name not in ATTRIBUTES and name not in WRITTEN:  # these are turned away from where they point
-                raise _refusal(f"{file} has <{tag} {name}=…>, of which nobody knows what SUMO does with it")
-        key, value = attributes.get("key", ""), attributes.get("value", "")
-        if tag == "param" and key not in LABELS and {"/", "\\", ":"}.intersection(value):
-            raise _refusal(f"{file} has the parameter {key} = {value!r}, which might name a file")
-
-    def doctype(*_: object) -> None:
-        raise _refusal(f"{file} has a document type, with which it may say anything")
-
-    parser.StartElementHandler = start
-    parser.StartDoctypeDeclHandler = doctype
-    try:
-        parser.Parse(content, True)
-    except (expat.ExpatError, ValueError, LookupError) as error:
-        raise _refusal(f"{file} cannot be checked: {error}") from None
-
-
-def _texts(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict | list | tuple):
-        for inner in value.values() if isinstance(value, dict) else value:
-            yield from _texts(inner)
+    effect = backend.side_effect(scenario, values, asked)
+    if effect:
+        raise _refusal(effect)
 
 
 def _refusal(reason: str) -> UsageError:

@@ -10,6 +10,7 @@ import numpy as np
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.version import __version__
+from crashhunt.scenario import as_in_file
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class WorkerSettings:
         """Return plain dicts, strings and numbers."""
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
-        scenario: dict[str, Any] = _asked(replace(self.scenario, file=type(self.scenario).file))
+        scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file)))
         return {
             **{item.name: getattr(self, item.name) for item in fields(self)},
             "schema": _SCHEMA,

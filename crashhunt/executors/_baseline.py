@@ -38,7 +38,6 @@ _SHARED = (
     "copy", "pickle", "struct", "collections", "itertools", "functools", "threading", "subprocess", "socket", "numpy",
     "numpy.random", "numpy.linalg", "gymnasium",
 )  # fmt: skip
-_SIMULATORS = ("highway_env",)  # in Python, with settings in classes
 _IGNORED = frozenset({
     "__warningregistry__", "__builtins__", "_abc_impl", "__annotations__", "__weakref__", "__abstractmethods__",
     "last_exc", "last_type", "last_value", "last_traceback", "_",
@@ -74,9 +73,13 @@ class Baseline:
         code: folders of the user's code.
         scratch: where files are the worker's own, and its simulator's.
         files: of the scenario. SUMO reads routes as it goes on, through links in the scratch folder.
+        simulators: the packages of simulators in whose classes an episode may change something.
     """
 
-    def __init__(self, code: tuple[str, ...], scratch: Path, files: Iterable[Path] = ()) -> None:
+    def __init__(
+        self, code: tuple[str, ...], scratch: Path, files: Iterable[Path] = (), simulators: tuple[str, ...] = ()
+    ) -> None:
+        self._simulators = simulators
         # A folder, and not what begins like it.
         self._scratch = tuple(os.path.join(place, "") for place in (scratch, scratch.resolve()))  # noqa: PTH118
         self._read = {os.devnull, *(str(file.resolve()) for file in files)}  # and where nobody reads what is written
@@ -145,7 +148,7 @@ class Baseline:
             self._modules[name] = module
             if name in _SHARED:
                 self._table(name, vars(module))
-            elif name.partition(".")[0] in _SIMULATORS:
+            elif name.partition(".")[0] in self._simulators:
                 self._table(name, vars(module))
                 for thing in list(vars(module).values()):
                     if isinstance(thing, type) and thing.__module__ == name:

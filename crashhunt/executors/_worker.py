@@ -119,7 +119,8 @@ class Worker:
             _tidy(simulator)
             scenario = self._settings.scenario
             files = [scenario.folder / name for name in scenario.files()]
-            self._baseline = Baseline(self._settings.code, self._settings.scratch, files)
+            watched = scenario.backend.watched
+            self._baseline = Baseline(self._settings.code, self._settings.scratch, files, watched)
         self._baseline.begin()
         self.used = True
         made = time.monotonic()

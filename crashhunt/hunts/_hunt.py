@@ -26,7 +26,6 @@ from crashhunt.hunts._trials import LAG, Trials
 from crashhunt.plans import with_settings
 from crashhunt.replays import confirm
 from crashhunt.samplers import NamedSampler
-from crashhunt.scenario.backends.sumo import explained
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -378,7 +377,8 @@ def _under_way(parallel: int) -> int:
 
 def _why_invalid(result: TrialResult, scenario: Scenario) -> str:
     """Why a trial could not be set up, with what the simulator said about it last."""
-    if scenario.sumo is not None and result.failure is not None:
+    explained = scenario.backend.explained
+    if explained is not None and result.failure is not None:
         error = explained(result.summary, result.failure.last_output, scenario)
         if error is not None:
             return str(error)

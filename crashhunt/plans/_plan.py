@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import secrets
 from dataclasses import replace
-from importlib import metadata
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
@@ -17,10 +16,9 @@ from crashhunt.plans._request import fields_of, sized
 from crashhunt.plans._scope import Owners, Takes, agent_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, varies_only_asked
-from crashhunt.scenario import Scenario, load_scenario, scenario_digest, with_action
-from crashhunt.simulators.accelerator import ACCELERATED
+from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
 from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_spec, signature_of
-from crashhunt.world import LIMITS, TOLD_BY
+from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -76,15 +74,10 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
-    """Tell whoever hunts in an unknown version of highway-env that it will not be fast."""
-    if scenario.highway is None or not (run.accelerate and scenario.highway.accelerate):
-        return scenario
-    version = metadata.version("highway-env")
-    if version in ACCELERATED:
-        return scenario
-    known = ", ".join(ACCELERATED)
-    note = f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
-    return replace(scenario, notes=(*scenario.notes, note))
+    """Tell whoever hunts where the accelerator does not know the simulator that it will not be fast."""
+    accelerator = scenario.backend.accelerator
+    note = accelerator.note(scenario) if accelerator is not None and run.accelerate else ""
+    return replace(scenario, notes=(*scenario.notes, note)) if note else scenario
 
 
 def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
@@ -95,11 +88,11 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
             f"hunt.toml and the scenario do not agree on the controlled vehicle {min(missing)!r}",
             fix="name the same vehicles in both",
         )
-    if scenario.highway is not None and not settings.run.accelerate:
-        scenario = replace(scenario, highway=replace(scenario.highway, accelerate=False))
+    if scenario.backend.accelerator is not None and not settings.run.accelerate:
+        scenario = scenario.backend.accelerator.switched_off(scenario)
     if settings.events:
         scenario = replace(scenario, events={**scenario.events, **settings.events})
-    if scenario.sumo is not None:  # elsewhere than it was hunted, it may be another simulator's
+    if scenario.backend.actions:  # elsewhere than it was hunted, it may be another simulator's
         scenario = _acting(scenario, {agent: chosen.action or "" for agent, chosen in settings.agents.items()})
     return scenario.with_agents({agent: chosen.agent for agent, chosen in settings.agents.items()})
 
@@ -107,9 +100,9 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
 def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     """Return the scenario with the forms of action that are asked for; an empty one is as the scenario says."""
     for agent, action in actions.items():
-        if action and scenario.sumo is None:
-            fix = "leave it out; the environment has its own"
-            raise UsageError(f"--action {action} is for SUMO, and {scenario.name} is not", fix=fix)
+        if action and not scenario.backend.actions:
+            meant, fix = titles(lambda backend: bool(backend.actions)), "leave it out; the environment has its own"
+            raise UsageError(f"--action {action} is for {meant}, and {scenario.name} is not", fix=fix)
         if action:
             scenario = with_action(scenario, agent, action)
     return scenario
@@ -117,7 +110,8 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
-    told = TOLD_BY.get(scenario.simulator)
+    backend = backend_of(scenario.simulator)
+    told = backend.told_events if backend is not None else None
     never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
     if not never:
         return scenario

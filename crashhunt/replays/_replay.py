@@ -37,9 +37,6 @@ _LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 Code = Literal["snapshot", "current", "log"]
 
-# On whose version everything depends that a simulator computes.
-_SIMULATORS = {"sumo": ("libsumo",), "highway": ("highway-env", "numpy"), "gym": ("gymnasium",)}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayOptions:
@@ -222,7 +219,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     environment = snapshot.environment()
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
     there, here = environment.get("cpu", ""), processor()
-    if scenario.highway is not None and there != here:
+    if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
     warnings += edits.ignored
@@ -283,10 +280,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     ids = dict(zip(settings.agents, other.agents, strict=True))
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
-    there = other.step_length_s
-    if other.highway is not None:
-        rate = other.highway.config.get("policy_frequency")  # where it is not said, it is once a second in most
-        there = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
+    there = other.backend.step_length_s(other)
     return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
@@ -364,7 +358,7 @@ def _judge(
     if was != now:
         return "not_comparable", f"what is recorded is another: {_prologue_change(was, now)}"
     changed = environment_changes(rerun.snapshot.environment())
-    for name in _SIMULATORS.get(rerun.worker.scenario.simulator, ()):
+    for name in rerun.worker.scenario.backend.versions:
         if name in changed:
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
     crashed = result.outcome in rerun.worker.crash_on

@@ -13,7 +13,7 @@ from crashhunt.base.integrity import digest_of_file
 if TYPE_CHECKING:
     from crashhunt.scenario._scenario import Scenario
 
-__all__ = ["as_plain_data", "digest_of_described", "scenario_digest"]
+__all__ = ["as_in_file", "as_plain_data", "digest_of_described", "scenario_digest"]
 
 
 def scenario_digest(scenario: Scenario) -> str:
@@ -31,6 +31,14 @@ def digest_of_described(files: dict[str, Any], *, says: object = None) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
+def as_in_file(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a scenario as plain data, in which the simulator's table stands where it does in a file."""
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        found |= value if key == "tables" else {key: value}
+    return found
+
+
 def as_plain_data(scenario: Scenario) -> dict[str, Any]:
     """Return what a scenario says, as TOML can hold it, without what is nobody's business but this process's."""
 
@@ -39,7 +47,7 @@ def as_plain_data(scenario: Scenario) -> dict[str, Any]:
             return {key: plain(item) for key, item in value.items() if item is not None}
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
 
-    data: dict[str, Any] = plain(asdict(replace(scenario, folder=Path())))
+    data: dict[str, Any] = as_in_file(plain(asdict(replace(scenario, folder=Path()))))
     if not data["events"]:
         del data["events"]  # which an earlier crashhunt does not know
     return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}

@@ -1,20 +1,16 @@
-"""The tables of a ``scenario.toml``."""
+"""The tables of a ``scenario.toml`` that every simulator has."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 __all__ = [
     "AgentSetup",
     "ArgumentSetup",
-    "CrashRule",
-    "GymSetup",
-    "HighwaySetup",
     "ObservationSetup",
-    "SumoSetup",
 ]
 
 DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
@@ -104,75 +100,3 @@ class ObservationSetup:
         "sin_h",
     )
     normalize: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class SumoSetup:
-    """``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
-
-    Args:
-        net: the network.
-        routes: route files.
-        additional: additional files.
-        options: further options of SUMO without their dashes, such as ``lateral-resolution``. Where there is no
-            ``time-to-teleport``, it is -1: nobody is taken away, and a jam stays one. What they would have SUMO write
-            is not written.
-        literal: whether ``${NAME}`` in a route or additional file is left as it is, instead of being filled in.
-    """
-
-    net: str
-    routes: tuple[str, ...] = ()
-    additional: tuple[str, ...] = ()
-    options: dict[str, bool | int | float | str] = field(default_factory=dict)
-    literal: bool | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class HighwaySetup:
-    """``[highway]``: an environment of highway-env.
-
-    Args:
-        id: as `gymnasium.make` takes it, such as ``highway-fast-v0``; ``module:ID`` imports a module of your own first.
-        config: what differs from the environment's own configuration; tables are merged, but one with another
-            ``type`` replaces.
-        off_road: whether leaving the lanes is a crash; by default everywhere but in car parks, where they are bays.
-        accelerate: whether the accelerator is used; it changes no bit.
-    """
-
-    id: str
-    config: dict[str, Any] = field(default_factory=dict)
-    off_road: bool | None = None
-    accelerate: bool = True
-
-
-@dataclass(frozen=True, kw_only=True)
-class CrashRule:
-    """``[gym.crash]``: when a step of a Gymnasium environment is a crash; any of these.
-
-    Args:
-        info: a key of the info that is true.
-        termination: the environment terminates; what it truncates is no crash.
-        reward_below: the reward of the step is below this.
-        function: ``module:function``, called with observation, reward, terminated, truncated, info; what it returns is
-            taken as true or false, and a text as what happened.
-    """
-
-    info: str = ""
-    termination: bool = False
-    reward_below: float | None = None
-    function: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GymSetup:
-    """``[gym]``: any environment of Gymnasium.
-
-    Args:
-        id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
-        kwargs: of the environment.
-        crash: what counts as a crash.
-    """
-
-    id: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
-    crash: CrashRule = field(default_factory=CrashRule)

@@ -14,6 +14,7 @@ from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError, ScenarioE
 from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable
 from crashhunt.scenario import argument_values
+from crashhunt.scenario.backends.gym import GymSetup
 from crashhunt.simulators._options import as_tables, merge
 from crashhunt.simulators._spaces import ObservationForm, action_form, native
 from crashhunt.world import Contact, Roster, Scene
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import CrashRule, Scenario
+    from crashhunt.scenario import Scenario
+    from crashhunt.scenario.backends.gym import CrashRule
     from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
 
 __all__ = ["GymSimulator"]
@@ -47,10 +49,8 @@ class GymSimulator:
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
-        if scenario.gym is None:
-            raise ScenarioError("the scenario has no [gym] table", fix="add it", where=scenario.origin)
         self._scenario = scenario
-        self._setup = scenario.gym
+        self._setup = scenario.table(GymSetup)
         (self._agent,) = scenario.agents
         self.step_length_s = scenario.step_length_s
         self._factory = self._find()

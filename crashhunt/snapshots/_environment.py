@@ -9,10 +9,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from crashhunt.scenario import installed_backends
+
 __all__ = ["environment", "environment_changes", "processor", "versions"]
 
-_VERSIONED = ("crashhunt", "libsumo", "gymnasium", "numpy", "highway-env")
-_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "SUMO_HOME", "OMP_NUM_THREADS", "VIRTUAL_ENV")
+_VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
+_VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
 
 
 def environment() -> dict[str, Any]:
@@ -23,13 +25,14 @@ def environment() -> dict[str, Any]:
     """
     modules = {name.partition(".")[0] for name in list(sys.modules)}
     distributions: dict[str, str] = {}
+    named = versions()
     loaded: set[str] = set()
     for distribution in metadata.distributions():
         name, version = _name_and_version(distribution)
         if not name:
             continue
         distributions[name] = version
-        if name in _VERSIONED or not modules.isdisjoint(_top_level_modules(distribution)):
+        if name in named or not modules.isdisjoint(_top_level_modules(distribution)):
             loaded.add(name)
     return {
         "schema": 1,
@@ -38,10 +41,10 @@ def environment() -> dict[str, Any]:
         "platform": platform.platform(),
         "machine": platform.machine(),
         "cpu": processor(),
-        "versions": versions(),
+        "versions": named,
         "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
         "loaded": sorted(loaded, key=str.lower),
-        "variables": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
+        "variables": {name: os.environ[name] for name in _variables() if name in os.environ},
     }
 
 
@@ -71,14 +74,20 @@ def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that every crash names."""
+    """Return the versions that every crash names: those of all simulators that are installed are among them."""
     found = {"python": platform.python_version()}
-    for name in _VERSIONED:
+    for name in dict.fromkeys(
+        (*_VERSIONED, *(name for _, backend in installed_backends() for name in backend.versions))
+    ):
         try:
             found[name] = _version_of(name)
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def _variables() -> tuple[str, ...]:
+    return (*_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
 
 
 def environment_changes(recorded: dict[str, Any]) -> dict[str, tuple[str, str]]:

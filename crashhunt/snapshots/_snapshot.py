@@ -27,7 +27,6 @@ from crashhunt.base.integrity import (
 from crashhunt.oracles import modules_of
 from crashhunt.plans import HuntSettings, SnapshotChoices, read_settings, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described, load_scenario
-from crashhunt.scenario.backends.sumo import movable
 from crashhunt.snapshots._environment import environment
 from crashhunt.snapshots._sources import Sources, find_sources, git
 from crashhunt.trial import Choice, Constant
@@ -363,10 +362,11 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
 
     entries: dict[str, Any] = {}
     texts = set(scenario.texts())
+    relocated = scenario.backend.relocated
     for name in scenario.files():
         place = f"scenario/{name}"
         entries[place] = _store(scenario.folder / name, building / place)
-        moved = movable(scenario.folder / name) if name in texts else None
+        moved = relocated(scenario.folder / name) if relocated is not None and name in texts else None
         if moved is not None:
             (building / place).write_bytes(moved)
             entries[place] = {"size": len(moved), "blake2b": digest_of_file(building / place)}

@@ -4,7 +4,6 @@ from ._contact import Touch as Touch, first_contact as first_contact, reachable_
 from ._events import (
     EVENT_WORDS as EVENT_WORDS,
     LIMITS as LIMITS,
-    TOLD_BY as TOLD_BY,
     Event as Event,
     event_counts as event_counts,
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["EVENT_WORDS", "LIMITS", "TOLD_BY", "Event", "event_counts"]
+__all__ = ["EVENT_WORDS", "LIMITS", "Event", "event_counts"]
 
 EVENT_WORDS = {
     "red_light": ("red light run", "red lights run"),
@@ -21,14 +21,6 @@ EVENT_WORDS = {
     "teleport": ("teleport", "teleports"),
 }
 """Each kind, in words: of one and of several."""
-
-TOLD_BY: Mapping[str, tuple[str, ...]] = {
-    "sumo": tuple(EVENT_WORDS),
-    "highway": ("wrong_way", "not_moving"),
-    "gym": (),
-    "toy": (),
-}
-"""Which kinds the simulators that come with crashhunt look for; of others nobody knows."""
 
 LIMITS: Mapping[str, tuple[float, str]] = {"not_moving": (60.0, "s"), "hard_braking": (math.nan, "m/s²")}
 """The kinds that have a limit, which may be asked for as ``KIND:LIMIT``: what it is by default, and its unit. NaN

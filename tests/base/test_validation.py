@@ -16,7 +16,9 @@ from pydantic import TypeAdapter, ValidationError
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.validation import validate
 from crashhunt.plans import HuntSettings, Request, plan
-from crashhunt.scenario import Scenario, shipped_folder
+from crashhunt.scenario import Scenario, backend_of, shipped_folder
+from crashhunt.scenario.backends.highway import HighwaySetup
+from crashhunt.scenario.backends.sumo import SumoSetup
 
 
 def as_read(settings) -> dict:
@@ -24,8 +26,16 @@ def as_read(settings) -> dict:
     return json.loads(json.dumps(asdict(settings)))
 
 
+def tables_of(file) -> list:
+    """What every simulator has in a scenario, and its own table."""
+    data = tomllib.loads(file.read_text())
+    name = data.get("simulator", "sumo")
+    table = data.pop(name)
+    return [(Scenario, data), (backend_of(name).table, table)]
+
+
 TABLES = [
-    *((Scenario, tomllib.loads(file.read_text())) for file in sorted(shipped_folder().glob("*/scenario.toml"))),
+    *(pair for file in sorted(shipped_folder().glob("*/scenario.toml")) for pair in tables_of(file)),
     (HuntSettings, as_read(plan(Request(trials=1, max_steps=2, scenario="loop", seed=1))[1])),
 ]
 JUNK = (
@@ -65,8 +75,8 @@ def test_every_table_of_ours_is_what_pydantic_would_have_built():
     assert all(same_as_pydantic(kind, data) for kind, data in TABLES)
 
 
-@pytest.mark.parametrize("kind", [Scenario, HuntSettings])
-def test_whatever_is_in_a_table_is_seen_as_pydantic_sees_it(kind):
+@pytest.mark.parametrize(("kind", "least"), [(Scenario, 200), (HuntSettings, 200), (SumoSetup, 20), (HighwaySetup, 20)])
+def test_whatever_is_in_a_table_is_seen_as_pydantic_sees_it(kind, least):
     accepted = refused = 0
     for data in [data for known, data in TABLES if known is kind][:2]:
         for *path, last in list(places(data)):
@@ -85,7 +95,7 @@ def test_whatever_is_in_a_table_is_seen_as_pydantic_sees_it(kind):
                     accepted += 1
                 else:
                     refused += 1
-    assert min(accepted, refused) > 200
+    assert min(accepted, refused) > least
 
 
 def test_a_scenario_that_is_right_needs_no_pydantic():

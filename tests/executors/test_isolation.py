@@ -108,7 +108,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[T
 def test_a_trial_does_not_depend_on_its_place(run, module, scenario):
     found = load_scenario("merge-highway-env" if scenario == "toy" else scenario)
     if scenario == "toy":
-        found = replace(found, simulator="toy", highway=None, observation=None, arguments={})
+        found = replace(found, simulator="toy", tables={}, observation=None, arguments={})
     pooled = run(module, found, PoolExecutor, 3)
     (fresh,) = run(module, found, FreshProcessExecutor, 1)
     assert {(str(result.outcome), result.digest) for result in pooled} == {("survived", fresh.digest)}

@@ -11,6 +11,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import ScenarioError
 from crashhunt.scenario import load_scenario, scenario_from_dict, shipped_folder, shipped_scenarios
+from crashhunt.scenario.backends.sumo import SumoSetup
 
 LOOP = shipped_folder() / "loop"
 
@@ -195,8 +196,7 @@ def test_a_bare_sumocfg_is_a_scenario(town):
     assert list(scenario.agents) == ["odd name #1"]  # departs first
     assert scenario.agents["odd name #1"].existing
     assert scenario.step_length_s == 0.5
-    assert scenario.sumo is not None
-    assert scenario.sumo.options == {
+    assert scenario.table(SumoSetup).options == {
         "begin": 5.0,
         "end": "100",
         "lateral-resolution": "0.8",

@@ -14,7 +14,9 @@ import pytest
 from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.scenario import AgentSetup, HighwaySetup, Scenario, SumoSetup
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.scenario.backends.highway import HighwaySetup
+from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.simulators.sumo import SumoEvents, SumoSimulator
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
@@ -58,7 +60,7 @@ def drive(tmp_path):
             step_length_s=dt,
             warmup_s=warmup_s,
             agents=agents,
-            sumo=SumoSetup(net=NET.name, routes=("r.rou.xml",), options=options),
+            tables={"sumo": SumoSetup(net=NET.name, routes=("r.rou.xml",), options=options)},
             events=limits,
             folder=folder,
         )
@@ -295,7 +297,7 @@ def test_on_highway_env_a_standstill_and_driving_backwards(tmp_path):
     scenario = Scenario(
         simulator="highway",
         agents={"ego": AgentSetup()},
-        highway=HighwaySetup(id="highway-fast-v0", config=config),
+        tables={"highway": HighwaySetup(id="highway-fast-v0", config=config)},
         events={"not_moving": 3.0},
     )
     simulator = HighwaySimulator(scenario, tmp_path)

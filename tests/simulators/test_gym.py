@@ -11,7 +11,8 @@ from gymnasium import spaces
 
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
-from crashhunt.scenario import AgentSetup, ArgumentSetup, CrashRule, GymSetup, Scenario
+from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
+from crashhunt.scenario.backends.gym import CrashRule, GymSetup
 from crashhunt.simulators.gym import GymSimulator
 from crashhunt.testing import SimulatorContract
 
@@ -63,7 +64,7 @@ def fell_hard(observation, reward, terminated, truncated, info):
 
 def scenario_of(name, *, crash=None, arguments=None, **kwargs):
     setup = GymSetup(id=name, kwargs=kwargs, crash=CrashRule(**(crash or {})))
-    return Scenario(simulator="gym", gym=setup, agents={"ball": AgentSetup()}, arguments=arguments or {})
+    return Scenario(simulator="gym", tables={"gym": setup}, agents={"ball": AgentSetup()}, arguments=arguments or {})
 
 
 def simulator_of(tmp_path, *words, **options):

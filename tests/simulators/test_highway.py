@@ -14,12 +14,12 @@ from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_finding
 from crashhunt.scenario import (
     AgentSetup,
     ArgumentSetup,
-    HighwaySetup,
     ObservationSetup,
     Scenario,
     argument_values,
     load_scenario,
 )
+from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators.highway import HighwaySimulator
 from crashhunt.testing import SimulatorContract
 
@@ -29,7 +29,7 @@ IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry
 def scenario_of(name, agents=1, *, config=None, observation=None, arguments=None, **setup):
     return Scenario(
         simulator="highway",
-        highway=HighwaySetup(id=name, config=config or {}, **setup),
+        tables={"highway": HighwaySetup(id=name, config=config or {}, **setup)},
         agents={f"agent-{number}": AgentSetup() for number in range(agents)},
         observation=observation,
         arguments=arguments or {},

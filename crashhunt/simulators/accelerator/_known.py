@@ -14,7 +14,7 @@ import numpy as np
 from highway_env.envs.common import observation
 from highway_env.vehicle import behavior, controller, kinematics, objects
 
-from crashhunt.simulators.accelerator._versions import ACCELERATED
+from crashhunt.scenario.backends.highway import ACCELERATED
 from crashhunt.simulators.accelerator._watch import MODULES, is_plain
 
 if TYPE_CHECKING:

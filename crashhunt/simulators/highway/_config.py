@@ -10,6 +10,7 @@ from highway_env.vehicle.objects import RoadObject
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.names import did_you_mean
+from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators._options import as_tables, merge
 
 if TYPE_CHECKING:
@@ -33,9 +34,8 @@ def configured(default: Mapping[str, Any], scenario: Scenario, arguments: Mappin
     Raises:
         ScenarioError: an entry does not exist, or values do not go together.
     """
-    assert scenario.highway is not None
     config = deepcopy(dict(default))
-    tables = [deepcopy(scenario.highway.config), *as_tables(scenario, arguments)]
+    tables = [deepcopy(scenario.table(HighwaySetup).config), *as_tables(scenario, arguments)]
     for table in tables:
         _check_keys(scenario, config, table)
         merge(config, table)
@@ -76,9 +76,8 @@ def _let_in(scenario: Scenario, config: dict[str, Any]) -> None:
     if "controlled_vehicles" in config:
         config["controlled_vehicles"] = count
     elif count > 1:
-        assert scenario.highway is not None
         message = f"has one controlled vehicle, not {count}"
-        raise mistake(scenario, "id", scenario.highway.id, message, "name one agent")
+        raise mistake(scenario, "id", scenario.table(HighwaySetup).id, message, "name one agent")
     if count > 1:
         for key in ("action", "observation"):
             if not config[key]["type"].startswith("MultiAgent"):

@@ -27,6 +27,7 @@ from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
+from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
 from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
@@ -34,7 +35,7 @@ from crashhunt.simulators._spaces import ObservationForm, action_form, native
 from crashhunt.simulators._standstill import Standstill
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
-from crashhunt.world import TOLD_BY, Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
+from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -69,10 +70,8 @@ class HighwaySimulator:
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:
-        if scenario.highway is None:
-            raise ScenarioError("the scenario has no [highway] table", fix="add it", where=scenario.origin)
         self._scenario = scenario
-        self._setup = scenario.highway
+        self._setup = scenario.table(HighwaySetup)
         self._kinematics = Kinematics(scenario.observation) if scenario.observation is not None else None
         self._possible = tuple(scenario.agents)
         if not self._setup.accelerate:
@@ -86,7 +85,7 @@ class HighwaySimulator:
         except InvalidEpisodeError as error:
             raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
 
-    told_events = TOLD_BY["highway"]
+    told_events = BACKEND.told_events
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
         """Make the environment, and let everybody in."""

@@ -13,13 +13,13 @@ from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scenario import ObservationSetup
-from crashhunt.scenario.backends.sumo import StagedFiles
+from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators.sumo._events import SumoEvents
 from crashhunt.simulators.sumo._sight import Sight
-from crashhunt.world import PERSON, TOLD_BY, Lane, is_person
+from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +62,7 @@ class SumoSimulator:
         }
         self.agents: list[str] = []
         # Without these options of SUMO a vehicle is always in the middle of a lane.
-        options = scenario.sumo.options if scenario.sumo else {}
+        options = scenario.table(SumoSetup).options
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._sight = Sight(tuple(scenario.agents), scenario.step_length_s, lateral=self._lateral)
         self._edges: dict[str, tuple[int, float]] = {}
@@ -71,7 +71,7 @@ class SumoSimulator:
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
 
-    told_events = TOLD_BY["sumo"]
+    told_events = BACKEND.told_events
 
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo brings along."""

@@ -1,3 +1,4 @@
+from ._backend import BACKEND as BACKEND
 from ._files import StagedFiles as StagedFiles, filled_in as filled_in
 from ._known import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
 from ._names import check_names as check_names
@@ -13,6 +14,7 @@ from ._options import (
 )
 from ._says import explained as explained
 from ._sumocfg import load_sumocfg as load_sumocfg
+from ._table import SumoSetup as SumoSetup
 from ._xml import (
     READ as READ,
     WRITTEN as WRITTEN,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
 from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, canonical, is_output, is_shown
+from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.scenario.backends.sumo._xml import read_xml, references, rewritten
 
 if TYPE_CHECKING:
@@ -36,10 +37,8 @@ class StagedFiles:
     """
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        if scenario.sumo is None:
-            raise InvalidEpisodeError("the scenario has no [sumo] table", fix="add it", where=scenario.origin)
         self._scenario = scenario
-        self._sumo = scenario.sumo
+        self._sumo = scenario.table(SumoSetup)
         self._folder = folder
         self._templates: dict[Path, string.Template] = {}
         self._rendered: dict[Path, str] = {}

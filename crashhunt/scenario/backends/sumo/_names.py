@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.names import did_you_mean, listed
+from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.scenario.backends.sumo._xml import read_xml
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
     Raises:
         ScenarioError: with what was probably meant.
     """
-    if scenario.sumo is None:
-        return
     demand = [read_xml(scenario.folder / name) for name in scenario.texts()]
     open_ended = any(_SECRETIVE.search(text) for text in demand)
     for agent, setup in scenario.agents.items():
@@ -67,8 +66,8 @@ def line_of(name: str, files: Iterable[Path]) -> str:
 
 
 def _check_edges(scenario: Scenario, setup: AgentSetup, key: str) -> None:
-    if setup.edges and scenario.sumo is not None:
-        net = [read_xml(scenario.folder / scenario.sumo.net)]
+    if setup.edges:
+        net = [read_xml(scenario.folder / scenario.table(SumoSetup).net)]
         for edge in setup.edges:
             _check(key, "edge", edge, net, scenario.origin)
 

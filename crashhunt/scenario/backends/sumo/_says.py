@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario.backends.sumo._names import line_of
+from crashhunt.scenario.backends.sumo._table import SumoSetup
 
 if TYPE_CHECKING:
     from crashhunt.scenario._scenario import Scenario
@@ -61,7 +62,7 @@ def _errors(output: str) -> list[str]:
 
 
 def _about_an_option(said: str, scenario: Scenario) -> ScenarioError | None:
-    options = scenario.sumo.options if scenario.sumo is not None else {}
+    options = scenario.table(SumoSetup).options
     keys = {name: f"sumo.options.{name}" for name in options}
     keys |= {setup.option: f"arguments.{name}.option" for name, setup in scenario.arguments.items() if setup.option}
     found, number = _OPTION.search(said), _NUMBER.search(said)

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._scenario import Scenario, check_options
-from crashhunt.scenario._tables import AgentSetup, ArgumentSetup, ObservationSetup, SumoSetup
+from crashhunt.scenario._scenario import Scenario
+from crashhunt.scenario._tables import AgentSetup, ArgumentSetup, ObservationSetup
+from crashhunt.scenario.backends.sumo._check import check_options
 from crashhunt.scenario.backends.sumo._config import changes, is_left_out, read_config, split_names
 from crashhunt.scenario.backends.sumo._options import INPUTS, RESERVED
+from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.scenario.backends.sumo._xml import nested_files, read_xml, written_by
 
 __all__ = ["load_sumocfg"]
@@ -77,13 +79,15 @@ def load_sumocfg(path: Path, *, ego: str = "") -> Scenario:
         observation=ObservationSetup(),
         agents={agent: setup},
         arguments={"scale": ArgumentSetup(default=scale, help="scales the traffic demand", option="scale")},
-        sumo=SumoSetup(
-            net=net,
-            routes=routes,
-            additional=additional,
-            options={"begin": begin, "time-to-teleport": _TELEPORT_S, **kept},
-            literal=literal or None,
-        ),
+        tables={
+            "sumo": SumoSetup(
+                net=net,
+                routes=routes,
+                additional=additional,
+                options={"begin": begin, "time-to-teleport": _TELEPORT_S, **kept},
+                literal=literal or None,
+            )
+        },
         notes=(note, *notes),
     )
 

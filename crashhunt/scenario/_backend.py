@@ -1,0 +1,144 @@
+"""What a simulator is to everybody but itself: one descriptor, of which `Scenario`, plans, snapshots and replays ask.
+
+A simulator needs none: without, a scenario has no table for it, and a stranger's bundle that names it is refused. To
+give one to yours, make a `Backend` in a module that does not import the simulator (commands that only read a scenario
+import it), and register it under the name that the simulator has::
+
+    [project.entry-points."crashhunt.simulators"]
+    mysim = "mypackage.simulator:MySimulator"
+
+    [project.entry-points."crashhunt.backends"]
+    mysim = "mypackage.backend:BACKEND"
+
+Then a ``scenario.toml`` may have a table ``[mysim]``, of which the simulator asks by ``scenario.table(MySetup)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, is_dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from pathlib import Path
+
+    from crashhunt.base.errors import ScenarioError
+    from crashhunt.scenario._scenario import Scenario
+    from crashhunt.trial import Value
+
+__all__ = ["Accelerator", "Backend", "Configuration"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Configuration:
+    """A file of the simulator's own, which is run as it is, without a ``scenario.toml``.
+
+    Args:
+        endings: of its name, such as ``.sumocfg``; the first one is how people are told of it.
+        load: returns it as a scenario, from its path and from what ``--ego`` says, which may be empty.
+        arguments: the scenario arguments that every such scenario has, for completion in the shell.
+    """
+
+    endings: tuple[str, ...]
+    load: Callable[[Path, str], Scenario]
+    arguments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accelerator:
+    """What makes a simulator faster, and changes no bit of what it computes.
+
+    Args:
+        switched_off: returns a scenario without it, as ``--no-accelerate`` asks for.
+        note: returns what to tell somebody for whom it will do nothing; empty where it will, or where it is off.
+    """
+
+    switched_off: Callable[[Scenario], Scenario]
+    note: Callable[[Scenario], str]
+
+
+def _nothing(_scenario: Scenario) -> Iterable[str]:
+    return ()
+
+
+def _accepted(_scenario: Scenario, _where: str) -> None:
+    return None
+
+
+def _found(_scenario: Scenario, _ego: str) -> None:
+    return None
+
+
+def _its_own(scenario: Scenario) -> float:
+    return scenario.step_length_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Backend:
+    """Everything about a simulator that others than itself have to know; all of it may be left out.
+
+    Functions are called with the scenario, whose table is ``scenario.table(KIND)``; paths are relative to its folder.
+
+    Args:
+        title: how people call it.
+        table: the dataclass of its table in ``scenario.toml``; its types must be there at run time, and may be numbers,
+            text, lists, tuples and tables of those, and further dataclasses.
+        example: what must be in the table, in words, for somebody who has left it out.
+        keys: those keys of ``scenario.toml`` that not every simulator heeds and this one does (``warmup_s``,
+            ``insertion_timeout_s``, ``agents.route``, …): all others are refused. None where nobody knows.
+        shows_itself: whether agents are shown what the simulator shows of itself, where there is no ``[observation]``.
+        check: raises `ScenarioError` for a scenario that cannot be meant, given the file for its ``where``.
+        check_names: the same for what its files do not define, given what ``--ego`` says; not asked about what has run.
+        files: what an episode reads; it is part of the digest, and travels in the snapshot.
+        texts: those of ``files`` that may say ``${NAME}``, for a scenario argument.
+        relocated: returns the content of one of ``texts`` as it is right wherever its folder goes, None where it is.
+        modules: the code of the user's that it imports besides the agents', as ``module:attribute``; what has no colon
+            is passed over, so that the id of an environment may be given as it is.
+        notes: what to tell people about what was decided on their behalf, in lines.
+        versions: the distributions on whose version everything depends that it computes.
+        variables: of the environment, on which it depends; written down with the versions.
+        per_processor: whether it may round otherwise on another processor.
+        step_length_s: the control step, in s, where it is not the scenario's own.
+        told_events: the kinds of traffic events that it tells; None where nobody knows.
+        actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
+        accelerator: where it has one.
+        configurations: files of its own that are run as they are.
+        explained: returns what is wrong with the scenario, from the message with which no episode could be set up and
+            from what it printed; None where it is not to blame.
+        side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that follow "the
+            crash is a stranger's, and"; empty where it does nothing else. It is given the values of the trial's
+            scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
+        watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
+            is not used again.
+        options: what an option of ``crashhunt run`` is for it, by the option's name, for ``--help``.
+    """
+
+    title: str = ""
+    table: type[Any] | None = None
+    example: str = "what it needs"
+    keys: frozenset[str] | None = None
+    shows_itself: bool = False
+    check: Callable[[Scenario, str], None] = _accepted
+    check_names: Callable[[Scenario, str], None] = _found
+    files: Callable[[Scenario], Iterable[str]] = _nothing
+    texts: Callable[[Scenario], Iterable[str]] = _nothing
+    relocated: Callable[[Path], bytes | None] | None = None
+    modules: Callable[[Scenario], Iterable[str]] = _nothing
+    notes: Callable[[Scenario], Iterable[str]] = _nothing
+    versions: tuple[str, ...] = ()
+    variables: tuple[str, ...] = ()
+    per_processor: bool = False
+    step_length_s: Callable[[Scenario], float] = _its_own
+    told_events: tuple[str, ...] | None = None
+    actions: tuple[str, ...] = ()
+    accelerator: Accelerator | None = None
+    configurations: tuple[Configuration, ...] = ()
+    explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
+    side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
+    watched: tuple[str, ...] = ()
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.table is not None and not is_dataclass(self.table):
+            # What is no dataclass would neither be written down nor sent to a worker.
+            raise TypeError(f"the table of a backend is a dataclass, and {self.table!r} is none")

@@ -1,0 +1,84 @@
+"""Any environment of Gymnasium, to a scenario: its table, and what follows from it. Nothing here imports Gymnasium."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.scenario._backend import Backend
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from crashhunt.scenario._scenario import Scenario
+    from crashhunt.trial import Value
+
+__all__ = ["BACKEND", "CrashRule", "GymSetup"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrashRule:
+    """``[gym.crash]``: when a step of a Gymnasium environment is a crash; any of these.
+
+    Args:
+        info: a key of the info that is true.
+        termination: the environment terminates; what it truncates is no crash.
+        reward_below: the reward of the step is below this.
+        function: ``module:function``, called with observation, reward, terminated, truncated, info; what it returns is
+            taken as true or false, and a text as what happened.
+    """
+
+    info: str = ""
+    termination: bool = False
+    reward_below: float | None = None
+    function: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GymSetup:
+    """``[gym]``: any environment of Gymnasium.
+
+    Args:
+        id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
+        kwargs: of the environment.
+        crash: what counts as a crash.
+    """
+
+    id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    crash: CrashRule = field(default_factory=CrashRule)
+
+
+def _check(scenario: Scenario, where: str) -> None:
+    if len(scenario.agents) != 1:
+        message = f"agents = {sorted(scenario.agents)!r} are several, and a Gymnasium environment has one"
+        raise ScenarioError(message, fix="keep one", where=where)
+    if scenario.observation is not None:
+        message = "observation = '' is not for Gymnasium environments, which show what they show"
+        raise ScenarioError(message, fix="remove it", where=where)
+
+
+def _modules(scenario: Scenario) -> Iterable[str]:
+    setup = scenario.table(GymSetup)
+    return setup.id, setup.crash.function
+
+
+def _side_effect(scenario: Scenario, values: Mapping[str, Value], _specifications: Iterable[str]) -> str:
+    # What an environment does with its keywords, only its own code can tell.
+    given = scenario.table(GymSetup).kwargs or scenario.arguments or values
+    return "it gives its environment arguments" if given else ""
+
+
+BACKEND = Backend(
+    title="Gymnasium",
+    table=GymSetup,
+    example="the id of the environment",
+    keys=frozenset(),
+    shows_itself=True,
+    check=_check,
+    modules=_modules,
+    versions=("gymnasium",),
+    told_events=(),
+    side_effect=_side_effect,
+)

@@ -1,0 +1,99 @@
+"""highway-env, to a scenario: its table, and what follows from it. Nothing here imports it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.scenario._backend import Accelerator, Backend
+from crashhunt.scenario._scenario import STEP_LENGTH_S
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from crashhunt.scenario._scenario import Scenario
+    from crashhunt.trial import Value
+
+__all__ = ["ACCELERATED", "BACKEND", "HighwaySetup"]
+
+ACCELERATED = {"1.12.1": "863e3d3e122c46ec"}
+"""The versions of highway-env that the accelerator knows, and the digest of the modules in which it replaces
+something."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HighwaySetup:
+    """``[highway]``: an environment of highway-env.
+
+    Args:
+        id: as `gymnasium.make` takes it, such as ``highway-fast-v0``; ``module:ID`` imports a module of your own first.
+        config: what differs from the environment's own configuration; tables are merged, but one with another
+            ``type`` replaces.
+        off_road: whether leaving the lanes is a crash; by default everywhere but in car parks, where they are bays.
+        accelerate: whether the accelerator is used; it changes no bit.
+    """
+
+    id: str
+    config: dict[str, Any] = field(default_factory=dict)
+    off_road: bool | None = None
+    accelerate: bool = True
+
+
+def _check(scenario: Scenario, where: str) -> None:
+    if scenario.step_length_s != STEP_LENGTH_S:
+        message = f"step_length_s = {scenario.step_length_s!r} is not for highway-env"
+        raise ScenarioError(message, fix="set policy_frequency in highway.config", where=where)
+
+
+def _step_length(scenario: Scenario) -> float:
+    rate = scenario.table(HighwaySetup).config.get("policy_frequency")
+    # Where it is not said, it is once a second in most.
+    return 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
+
+
+def _as_it_is(scenario: Scenario) -> Scenario:
+    return scenario.with_table(replace(scenario.table(HighwaySetup), accelerate=False))
+
+
+def _not_accelerated(scenario: Scenario) -> str:
+    version = metadata.version("highway-env")
+    if not scenario.table(HighwaySetup).accelerate or version in ACCELERATED:
+        return ""
+    known = ", ".join(ACCELERATED)
+    return f"the accelerator does not know highway-env {version} and steps aside; it knows {known}"
+
+
+def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
+    for text in _texts([scenario.table(HighwaySetup).config, list(specifications), list(values.values())]):
+        if "." in text and not text.startswith("highway_env."):  # the class of a vehicle
+            return f"its configuration names {text!r}"
+    return ""
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _texts(inner)
+
+
+BACKEND = Backend(
+    title="highway-env",
+    table=HighwaySetup,
+    example="the id of the environment",
+    keys=frozenset(),
+    shows_itself=True,
+    check=_check,
+    modules=lambda scenario: (scenario.table(HighwaySetup).id,),
+    versions=("highway-env", "numpy"),
+    per_processor=True,
+    step_length_s=_step_length,
+    told_events=("wrong_way", "not_moving"),
+    accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
+    side_effect=_side_effect,
+    watched=("highway_env",),  # in Python, with settings in classes
+    options={"--no-accelerate": "run highway-env as it is; the accelerator changes no bit, and only the time it takes"},
+)

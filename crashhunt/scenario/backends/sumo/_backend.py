@@ -1,0 +1,120 @@
+"""SUMO, to a scenario: its table, its files, and what follows from them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crashhunt.scenario._backend import Backend, Configuration
+from crashhunt.scenario.backends.sumo._options import INPUTS, canonical, writes
+from crashhunt.scenario.backends.sumo._table import SumoSetup
+from crashhunt.world import EVENT_WORDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from crashhunt.base.errors import ScenarioError
+    from crashhunt.scenario._scenario import Scenario
+    from crashhunt.trial import Value
+
+__all__ = ["BACKEND"]
+
+_VEHICLE = ("existing", "type", "route", "edges", "depart_s", "depart_lane", "depart_pos", "depart_speed")
+_DRIVING = ("action", "target_speeds", "speed_mode")
+
+
+# Whoever asks what backends there are imports this module, and need not wait for the rest: it is imported where it is
+# needed.
+
+
+def _check(scenario: Scenario, where: str) -> None:
+    from crashhunt.scenario.backends.sumo._check import check
+
+    check(scenario, where)
+
+
+def _check_names(scenario: Scenario, ego: str) -> None:
+    from crashhunt.scenario.backends.sumo._names import check_names
+
+    check_names(scenario, ego)
+
+
+def _files(scenario: Scenario) -> Iterator[str]:
+    sumo = scenario.table(SumoSetup)
+    yield sumo.net
+    yield from _texts(scenario)
+    for option, value in sumo.options.items():
+        if canonical(option) in INPUTS:
+            yield from (name.strip() for name in str(value).split(",") if name.strip())
+
+
+def _texts(scenario: Scenario) -> Iterator[str]:
+    """Routes, additional files, and what these have SUMO read."""
+    from crashhunt.scenario.backends.sumo._xml import nested_files
+
+    sumo = scenario.table(SumoSetup)
+    named = (*sumo.routes, *sumo.additional)
+    yield from named
+    yield from nested_files(scenario.folder, named, inside=True)
+
+
+def _relocated(path: Path) -> bytes | None:
+    from crashhunt.scenario.backends.sumo._xml import movable
+
+    return movable(path)
+
+
+def _notes(scenario: Scenario) -> Iterator[str]:
+    """Tell what SUMO would write and does not."""
+    from crashhunt.scenario.backends.sumo._xml import written_by
+
+    sumo = scenario.table(SumoSetup)
+    named = [name for option in sumo.options if writes(name := canonical(option))]
+    found = [f"{', '.join(named)} (nothing is written)"] if named else []
+    found += written_by(scenario.folder, (*sumo.routes, *sumo.additional))
+    if found:
+        yield f"of {scenario.file}, a trial does not take over: {'; '.join(found)}"
+
+
+def _load(path: Path, ego: str) -> Scenario:
+    from crashhunt.scenario.backends.sumo._sumocfg import load_sumocfg
+
+    return load_sumocfg(path, ego=ego)
+
+
+def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
+    from crashhunt.scenario.backends.sumo._says import explained
+
+    return explained(message, output, scenario)
+
+
+def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
+    from crashhunt.scenario.backends.sumo._trust import side_effect
+
+    return side_effect(scenario, values, specifications)
+
+
+BACKEND = Backend(
+    title="SUMO",
+    table=SumoSetup,
+    example="net and routes",
+    keys=frozenset({"warmup_s", "insertion_timeout_s", *(f"agents.{key}" for key in (*_VEHICLE, *_DRIVING))}),
+    check=_check,
+    check_names=_check_names,
+    files=_files,
+    texts=_texts,
+    relocated=_relocated,
+    notes=_notes,
+    versions=("libsumo",),
+    variables=("SUMO_HOME",),
+    told_events=tuple(EVENT_WORDS),
+    actions=("continuous", "meta"),
+    configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale",)),),
+    explained=_explained,
+    side_effect=_side_effect,
+    options={
+        "--ego": "for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one; default: the first",
+        "--action": "on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions); default: "
+        "as the scenario says, and continuous for a .sumocfg",
+    },
+)

@@ -1,0 +1,77 @@
+"""What a scenario for SUMO must be: files and arguments that go together, and options with which a trial is a trial."""
+
+from __future__ import annotations
+
+import string
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.scenario._checks import refuse
+from crashhunt.scenario.backends.sumo._options import RESERVED, canonical, is_true
+from crashhunt.scenario.backends.sumo._table import SumoSetup
+from crashhunt.scenario.backends.sumo._xml import read_xml
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.scenario._scenario import Scenario
+
+__all__ = ["check", "check_options"]
+
+
+def check(scenario: Scenario, where: str) -> None:
+    """Refuse a scenario whose table, arguments, files and controlled vehicles do not go together.
+
+    Raises:
+        ScenarioError: with key, value and fix.
+    """
+    sumo = scenario.table(SumoSetup)
+    check_options(sumo.options, where)
+    for name, argument in scenario.arguments.items():
+        if argument.option:
+            check_options({argument.option: ""}, f"{where}: arguments.{name}")
+    for file in scenario.files():
+        if "," in Path(file).name:
+            refuse(where, "sumo", file, "has a comma, at which SUMO begins another file", "rename it")
+    for file in () if sumo.literal else scenario.texts():
+        for name in _asked_for(read_xml(scenario.folder / file)):
+            if name not in scenario.arguments:
+                message = f"has no {name!r}, which {file} asks for"
+                refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
+    for agent, setup in scenario.agents.items():
+        named = [key for key in ("existing", "route", "edges") if getattr(setup, key)]
+        if len(named) != 1:
+            message = "must have one of existing, route, edges"
+            refuse(where, f"agents.{agent}", named, message, "give exactly one of them")
+        speeds = setup.target_speeds
+        if not speeds or list(speeds) != sorted(set(speeds)):
+            refuse(where, f"agents.{agent}.target_speeds", speeds, "does not rise", "list speeds from low to high")
+
+
+def check_options(options: Mapping[str, object], where: str) -> None:
+    """Refuse options of SUMO with which a trial would mean something else.
+
+    Raises:
+        ScenarioError: with the option.
+    """
+    seen: dict[str, str] = {}
+    for option, value in options.items():
+        name = canonical(option)
+        if name in RESERVED:
+            refuse(where, "sumo.options", option, "is an option that crashhunt sets itself", "remove it")
+        if name == "mesosim" and (value == "" or is_true(value)):
+            message = "simulates queues: vehicles jump from one to the next, and none can be driven"
+            refuse(where, f"sumo.options.{option}", value, message, "remove it, to simulate every vehicle")
+        if name in ("configuration-file", "load-state"):
+            message = "names a file that says more than a trial may take over"
+            refuse(where, "sumo.options", option, message, "write its options here instead, and begin at a time")
+        if name in seen:
+            refuse(where, "sumo.options", option, f"is another name of {seen[name]!r}", "give it once")
+        seen[name] = option
+
+
+def _asked_for(content: bytes) -> list[str]:
+    """Return the arguments that a file asks for as ``${NAME}``."""
+    if b"${" not in content:
+        return []
+    return string.Template(content.decode("utf-8", "replace")).get_identifiers()

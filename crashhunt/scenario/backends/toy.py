@@ -1,0 +1,9 @@
+"""The toy, to a scenario: it has no table and reads no file."""
+
+from __future__ import annotations
+
+from crashhunt.scenario._backend import Backend
+
+__all__ = ["BACKEND"]
+
+BACKEND = Backend(title="the toy", told_events=(), side_effect=lambda *_: "")
