@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import crashhunt
@@ -50,3 +51,51 @@ def test_optional_faculties_are_protocols():
     """Of simulators and agents see their ``_protocol.py``, and `crashhunt.base.faculties`."""
     files = [file for file in ROOT.rglob("*.py") if not str(file.relative_to(ROOT)).startswith(_OTHERS)]
     assert [line for file in files for line in asked_by_name(file)] == []
+
+
+SIMULATORS = re.compile("sumo|highway|gym(?!nasium)", re.IGNORECASE)  # gymnasium is the library of spaces
+HOMES = (
+    "scenario/backends/",
+    "simulators/sumo/",
+    "simulators/highway/",
+    "simulators/accelerator/",
+    "simulators/gym.py",
+)
+NAMED_ALL_THE_SAME = {
+    "__init__.py": "tells Gymnasium of crashhunt/SUMO-v0, which is an id that people write",
+    "envs/": "is that environment, which is SUMO and nothing else",
+    "cli/__init__.py": "has an example for people",
+    "guide/": "has the names of pages",
+    "plans/_options.py": "says to people what an option is for",
+}
+
+
+def simulators_named(file: Path) -> list[str]:
+    """The simulators that the code of a file names; what is there for people to read is not code."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    found = []
+    for node in ast.walk(tree):
+        if id(node) in prose:
+            continue
+        said = [value for _, value in ast.iter_fields(node) if isinstance(value, str)]
+        found += [f"{node.lineno}: {text}" for text in said if SIMULATORS.search(text)]
+    return found
+
+
+def test_simulators_are_named_in_their_own_homes_only():
+    named: dict[str, list[str]] = {}
+    for file in sorted([*ROOT.rglob("*.py"), *ROOT.rglob("*.pyi")]):
+        name = file.relative_to(ROOT).as_posix()
+        if not name.startswith(HOMES) and (found := simulators_named(file)):
+            named[name] = found
+    excused = {name: reason for name in named for reason in NAMED_ALL_THE_SAME if name.startswith(reason)}
+    assert {name: found for name, found in named.items() if name not in excused} == {}
+    assert set(excused.values()) == set(NAMED_ALL_THE_SAME), "what names none needs no excuse"
+
+
+def test_a_simulator_that_is_named_in_code_is_found(tmp_path):
+    (tmp_path / "m.py").write_text(
+        '"""SUMO."""\nimport gymnasium\nif x.sumo:\n    """highway"""\n    f(gym=1, y="a sumo")\n'
+    )
+    assert [line.partition(":")[0] for line in simulators_named(tmp_path / "m.py")] == ["3", "5", "5"]

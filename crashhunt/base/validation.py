@@ -26,6 +26,9 @@ __all__ = ["validate"]
 
 T = TypeVar("T")
 
+_UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
+_MISSING = ("missing", "missing_argument")
+
 
 def validate(
     kind: type[T],
@@ -123,17 +126,28 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
     try:
         return cast(T, _adapter(cast(Any, kind)).validate_python(data))
     except ValidationError as problem:
-        first = problem.errors(include_url=False)[0]
+        first = _telling(problem.errors(include_url=False))
         path = tuple(str(part) for part in first["loc"])
         key = ".".join((place.under, *path) if place.under else path)
-        if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        if first["type"] in _UNKNOWN:
             known = list(place.keys()) if place.keys and len(path) == 1 else _known_keys(kind, path[:-1])
             fix = did_you_mean(path[-1], known) or f"the keys here are {', '.join(known)}"
             raise error(f"unknown key {key!r}", fix=fix, where=where) from None
-        if first["type"] in ("missing", "missing_argument"):
+        if first["type"] in _MISSING:
             raise error(f"the key {key!r} is missing", fix="add it", where=where) from None
         message = first["msg"][0].lower() + first["msg"][1:]
         raise error(f"{key} = {first['input']!r}: {message}", fix="change the value", where=where) from None
+
+
+def _telling(errors: Sequence[Any]) -> Any:
+    """Of several mistakes the first one; where a key is missing because it is misspelt, that it is."""
+    first = errors[0]
+    if first["type"] in _MISSING:
+        for other in errors[1:]:
+            beside = other["type"] in _UNKNOWN and other["loc"][:-1] == first["loc"][:-1]
+            if beside and did_you_mean(str(other["loc"][-1]), [str(first["loc"][-1])]):
+                return other
+    return first
 
 
 @cache

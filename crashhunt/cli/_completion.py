@@ -59,7 +59,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 def _attach(parser: argparse.ArgumentParser) -> None:
     known: dict[str, Completer] = {
-        "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(".toml", ".sumocfg")(prefix)],
+        "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(*_endings())(prefix)],
         "--agent": lambda **_: _registered("agents"),
         "--sampler": lambda **_: _registered("samplers"),
         "--executor": lambda **_: _registered("executors"),
@@ -99,6 +99,12 @@ def _topics() -> list[str]:
     return [page.topic for page in list_pages()]
 
 
+def _endings() -> tuple[str, ...]:
+    from crashhunt.scenario import endings
+
+    return endings()
+
+
 def _registered(group: Any) -> list[str]:
     from crashhunt.base.plugins import registered
 
@@ -125,7 +131,7 @@ def _runs(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
 
 def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]:
     """What the scenario says of arguments; it is only read, as a shell does not wait."""
-    from crashhunt.scenario import shipped_folder
+    from crashhunt.scenario import configurations, shipped_folder
 
     name = vars(parsed_args).get("scenario") or "loop"
     for file in (shipped_folder() / name / layout.SCENARIO, Path(name) / layout.SCENARIO, Path(name)):
@@ -135,7 +141,8 @@ def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]
             return list(dict.fromkeys(key for table in tables for key in table)) if of_agents else [*said["arguments"]]
         except (OSError, ValueError, KeyError, AttributeError):
             continue
-    return ["scale"] if name.endswith(".sumocfg") and not of_agents else []
+    found = (known.arguments for known in configurations() if name.endswith(known.endings))
+    return [] if of_agents else list(next(found, ()))
 
 
 def _several(one: Completer) -> Completer:

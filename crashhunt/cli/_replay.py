@@ -60,7 +60,7 @@ def add_replay(commands: Any) -> None:
         "see whether they crash there as well",
     )  # fmt: skip
     replay.add_argument(
-        "--no-accelerate", action="store_true", help="run highway-env as it is, without the accelerator"
+        "--no-accelerate", action="store_true", help="run the simulator as it is, without the accelerator"
     )
     replay.add_argument(
         "--times", metavar="N", type=integer, default=1, help="how often, to see whether all agree; default: 1"
@@ -87,7 +87,7 @@ def add_replay(commands: Any) -> None:
     )  # fmt: skip
     look.add_argument(
         "--gui", action="store_true",
-        help="open the simulator's own window (sumo-gui), follow the agent, and pause before the crash",
+        help="open the simulator's own window, follow the agent, and pause before the crash",
     )  # fmt: skip
     look.add_argument(
         "--sleep", metavar="S", type=number,

@@ -15,7 +15,7 @@ Then a ``scenario.toml`` may have a table ``[mysim]``, of which the simulator as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -110,7 +110,6 @@ class Backend:
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
         watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
             is not used again.
-        options: what an option of ``crashhunt run`` is for it, by the option's name, for ``--help``.
     """
 
     title: str = ""
@@ -136,7 +135,6 @@ class Backend:
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     watched: tuple[str, ...] = ()
-    options: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.table is not None and not is_dataclass(self.table):

@@ -1,4 +1,5 @@
 from ._agents import AgentContract as AgentContract
+from ._backends import BackendContract as BackendContract
 from ._escapes import EscapeCheck as EscapeCheck, check_escape as check_escape
 from ._executors import ExecutorContract as ExecutorContract
 from ._samplers import SamplerContract as SamplerContract

@@ -95,5 +95,4 @@ BACKEND = Backend(
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,
     watched=("highway_env",),  # in Python, with settings in classes
-    options={"--no-accelerate": "run highway-env as it is; the accelerator changes no bit, and only the time it takes"},
 )

@@ -112,9 +112,4 @@ BACKEND = Backend(
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale",)),),
     explained=_explained,
     side_effect=_side_effect,
-    options={
-        "--ego": "for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one; default: the first",
-        "--action": "on SUMO: continuous (a speed and a lane change) or meta (highway-env's five actions); default: "
-        "as the scenario says, and continuous for a .sumocfg",
-    },
 )
