@@ -16,12 +16,13 @@ from gymnasium import spaces
 from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed, LaneChanger, RandomAgent, Recorded
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose, TrafficEvents
 from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
 from crashhunt.scenario import AgentSetup, Scenario, with_action
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.space import Choice, Constant, Range
-from crashhunt.testing import AgentContract, ExecutorContract, SamplerContract, SimulatorContract
+from crashhunt.testing import AgentContract, ExecutorContract, OracleContract, SamplerContract, SimulatorContract, drive
 
 TOY = Scenario(simulator="toy", agents={"ego": AgentSetup(), "second": AgentSetup(action="meta")})
 
@@ -120,6 +121,45 @@ class TestSweepSampler(SamplerContract):
         for space in (SPACE, {("ego", "speed"): Constant(3)}):
             with pytest.raises(UsageError, match="one argument"):
                 SweepSampler(space)
+
+
+class TestReportedCollision(OracleContract):
+    @pytest.fixture
+    def make(self):
+        return ReportedCollision
+
+    def test_it_finds_something(self, make):
+        assert any(make().check(scene, ["ego"]) for scene in drive())
+
+
+class TestOverlap(TestReportedCollision):
+    @pytest.fixture
+    def make(self):
+        return Overlap
+
+
+class TestOffRoad(TestReportedCollision):
+    @pytest.fixture
+    def make(self):
+        return OffRoad
+
+
+class TestTooClose(TestReportedCollision):
+    @pytest.fixture
+    def make(self):
+        return TooClose
+
+
+class TestRedLight(TestReportedCollision):
+    @pytest.fixture
+    def make(self):
+        return RedLight
+
+
+class TestTrafficEvents(TestReportedCollision):
+    @pytest.fixture
+    def make(self):
+        return TrafficEvents
 
 
 class TestPoolExecutor(ExecutorContract):

@@ -1,0 +1,117 @@
+"""What every oracle must do."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from crashhunt.oracles import BringsOutcomes, Finding, Oracle, SeesMap
+from crashhunt.trial import Outcome
+from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene
+
+__all__ = ["OracleContract", "drive"]
+
+Make = Callable[[], Oracle]
+
+_AGENTS = ("ego", "second")
+_LANES = [Lane("road_0", 3.2, ((0.0, 0.0), (400.0, 0.0))), Lane("road_1", 3.2, ((0.0, 3.2), (400.0, 3.2)))]
+
+
+class OracleContract:
+    """Checks `crashhunt.oracles.Oracle`, and `SeesMap` and `BringsOutcomes` where they are offered.
+
+    The fixture ``make`` returns a function that makes an oracle.
+    """
+
+    @pytest.fixture
+    def make(self) -> Make:
+        """Return what makes an oracle."""
+        raise NotImplementedError("give the suite a fixture named make")
+
+    def test_it_has_a_name_and_says_which_outcomes_it_brings(self, make: Make) -> None:
+        """As names and categories that reports can print."""
+        oracle = make()
+        assert isinstance(oracle.name, str)
+        assert oracle.name
+        if isinstance(oracle, BringsOutcomes):
+            for name, category in oracle.outcomes.items():
+                assert Outcome.own(name, category).category in ("traffic crash", "traffic event")
+
+    def test_it_finds_what_agents_do_and_gives_the_evidence(self, make: Make) -> None:
+        """One piece of it, about one of the agents, with an outcome that every hunt has or that it has declared."""
+        oracle = make()
+        brings = set(oracle.outcomes) if isinstance(oracle, BringsOutcomes) else set()
+        for findings in _watch(oracle):
+            for finding in findings:
+                assert finding.outcome in brings or not Outcome(finding.outcome).is_own
+                assert Outcome(finding.outcome).category in ("traffic crash", "traffic event")
+                evidence = [part for part in (finding.collision, finding.event) if part is not None]
+                assert [part.agent in _AGENTS for part in evidence] == [True]
+
+    def test_the_same_scenes_give_the_same_findings(self, make: Make) -> None:
+        """It draws no random numbers, keeps no clock, and another one remembers nothing of this one's scenes."""
+        assert list(_watch(make(), seed=1)) == list(_watch(make(), seed=2))
+
+    def test_it_leaves_scenes_as_they_are(self, make: Make) -> None:
+        """They are recorded, and shown to others."""
+        oracle = make()
+        _show_map(oracle)
+        for scene in drive():
+            before = copy.deepcopy((scene.data.tolist(), scene.contacts, scene.off_road, scene.events, scene.lanes))
+            oracle.check(scene, _AGENTS)
+            assert (scene.data.tolist(), scene.contacts, scene.off_road, scene.events, scene.lanes) == before
+
+    def test_it_bears_agents_that_are_not_there_and_empty_roads(self, make: Make) -> None:
+        """Somebody who has arrived is in no scene any more."""
+        oracle = make()
+        _show_map(oracle, lanes=())
+        assert oracle.check(Scene(0.0, Roster(()), [], [], []), _AGENTS) == []
+        for scene in drive():
+            assert oracle.check(scene, ("gone",)) == []
+            assert oracle.check(scene, ()) == []
+
+
+def drive() -> Iterator[Scene]:
+    """Yield the scenes of an episode in which much goes wrong, each with the one before.
+
+    ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second`` stands.
+    """
+    actors = [Actor(name, "car", 4.5, 1.8) for name in ("ego", "second", "other", "near")]
+    roster, previous = Roster(tuple(actors)), None
+    for step in range(60):
+        x = 1.5 * step
+        points = [(x, 0.0), (-30.0, 0.0), (40.0 + 0.5 * step, 0.0), (60.0, 2.2)]
+        touching = abs(points[2][0] - 2.25 - (x - 2.25)) < 4.5
+        scene = Scene(
+            0.1 * step,
+            roster,
+            points,
+            [0.0] * 4,
+            [15.0, 0.0, 5.0, 0.0],
+            contacts=(Contact("ego", "other", "collision", "road_0", 15.0, 5.0),) if touching else (),
+            off_road=("ego",) if step > 55 else (),
+            lanes=("road_0", "road_0", "road_0", "road_1"),
+            swept=step > 0,
+        )
+        if step == 20:
+            scene.events = (Event("red_light", "ego", "ego ran the red light 'c'", x=x, y=0.0, speed=15.0),)
+        scene.follow(previous)
+        previous = scene
+        yield scene
+
+
+def _watch(oracle: Oracle, seed: int = 0) -> Iterator[list[Finding]]:
+    _show_map(oracle)
+    random.seed(seed)  # whoever draws from a global generator is found out by another seed
+    np.random.seed(seed)  # noqa: NPY002
+    for scene in drive():
+        yield oracle.check(scene, _AGENTS)
+
+
+def _show_map(oracle: Oracle, lanes: tuple[Lane, ...] = tuple(_LANES)) -> None:
+    if isinstance(oracle, SeesMap):
+        oracle.see_map(lanes)
