@@ -33,7 +33,7 @@ _OFFERED = {
     "crashhunt.world": "Scene Roster Actor Contact Lane Event ClosestApproach outlines_overlap rectangle_gap "
     "time_to_contact closest_approach",
     "crashhunt.simulators": "Simulator ActionForm FullBraking SpeedAndLaneChange MetaAction SpaceAction Kinematics",
-    "crashhunt.oracles": "Oracle Finding ReportedCollision Overlap OffRoad TrafficEvents",
+    "crashhunt.oracles": "Oracle Finding SeesMap BringsOutcomes ReportedCollision Overlap OffRoad TooClose",
     "crashhunt.samplers": "",
     "crashhunt.executors": "Executor PoolExecutor FreshProcessExecutor",
     "crashhunt.render": "Action ActionDistribution Bar Contour Curve Curve3D Heatmap Picture Text scope",
