@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import ArgumentError
-from crashhunt.plans import Owners, Takes
+from crashhunt.plans import Owners, Takes, takes_of
 from crashhunt.trial import Constant, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.plans import ArgumentSpec, HuntSettings
     from crashhunt.trial import TrialSpec
@@ -45,7 +45,8 @@ def edited_spec(
     settings: HuntSettings,
     original: HuntSettings,
     changes: Mapping[str, str],
-    ask: Callable[[str], Takes] | None = None,
+    *,
+    code: Sequence[str] | None = None,
 ) -> tuple[TrialSpec, Edits]:
     """Return the trial as it is to be replayed, and what is not as it was recorded.
 
@@ -54,7 +55,8 @@ def edited_spec(
         settings: ``hunt.toml`` as it is now.
         original: ``hunt.toml`` as it was when the trial ran.
         changes: ``NAME`` or ``AGENT.NAME`` to value, applied last.
-        ask: returns what an agent takes by its code, where the record does not say; None where that may not run.
+        code: the folders of the code that is to drive, which is asked what an agent takes where the record is silent;
+            None where none of it may run.
 
     Raises:
         ArgumentError: an argument does not exist, or a range is given where it takes one value.
@@ -76,7 +78,7 @@ def edited_spec(
             longer = name == "max_steps" and now > before_it  # which leaves nothing out
             (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
     for name, text in changes.items():
-        key = _find(name, recorded, settings, ask)
+        key = _find(name, recorded, settings, code)
         values[key] = _constant(text, after.get(key), f"--set {name}")
     arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
     scenario_arguments = dict(recorded.scenario_arguments)
@@ -111,9 +113,7 @@ def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Any:
     return distribution.value
 
 
-def _find(
-    name: str, recorded: TrialSpec, settings: HuntSettings, ask: Callable[[str], Takes] | None
-) -> tuple[str, str]:
+def _find(name: str, recorded: TrialSpec, settings: HuntSettings, code: Sequence[str] | None) -> tuple[str, str]:
     specs = _specs(settings)
     agents = {
         agent: Takes(tuple(dict.fromkeys([*(known for owner, known in specs if owner == agent), *values])))
@@ -121,6 +121,7 @@ def _find(
     }
     scenario = [*(known for owner, known in specs if not owner), *recorded.scenario_arguments]
     owners = Owners(agents, tuple(dict.fromkeys(scenario)))
+    ask = None if code is None else lambda agent: takes_of(settings.agents[agent].agent, code)
     owner = owners.of_record(name, ask, option="--set")
     if owner is None:
         raise owners.unknown(name, option="--set", whose="the crash")

@@ -221,7 +221,8 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     there, here = environment.get("cpu", ""), processor()
     if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
-    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes)
+    runs = None if code == "log" or not options.trusted else snapshot.code if code == "snapshot" else ()
+    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
     if code == "log":
         if edits.all:

@@ -146,14 +146,24 @@ def test_run_rerun_suite_and_replay_mean_the_same(two):
     assert not (two.folder / "x").exists()
 
     # One agent's argument, and nobody else's: bare where one only has it, and open agents take what they are given.
-    changes = ("--set", "ego.speed=6", "--set", "gap_m=50")
-    two.crashhunt("rerun", "h", "--to", "g", *changes, "--set", "other.faster=30")
+    changes = ("--set", "ego.speed=6", "--set", "other.faster=30", "--set", "gap_m=50")
+    two.crashhunt("rerun", "h", "--to", "g", *changes)
     assert asked(two, "g") == {"ego": {"speed": "6.0"}, "other": {"faster": "30", "speed": "25.0"}}
     request = json.loads((two.folder / "g" / "request.json").read_text())["request"]
     assert request["arguments"] == {"other.speed": "25.0", "ego.speed": "6", "other.faster": "30"}
     assert request["scenario_arguments"] == {"gap_m": "50"}
     done = two.crashhunt("replay", "h", *changes, "--json", expect=None)
-    assert done.json["edits"] == ["ego.speed was 4.0 and is 6.0", "gap_m was 60.0 and is 50.0"]
+    assert done.json["edits"] == [
+        "ego.speed was 4.0 and is 6.0", "other.faster was (not there) and is 30", "gap_m was 60.0 and is 50.0"
+    ]  # fmt: skip
+    # What has no plain default is in no record, but the code knows it.
+    edits = two.crashhunt("replay", "h", "--set", "ego.model=x", "--json", expect=None).json["edits"]
+    assert edits == ["ego.model was (not there) and is x"]
+    assert "several agents take it" in two.crashhunt("replay", "h", "--set", "model=x", expect=2).err  # one takes any
+    for drivers in ("--from-log", "--code=current"):
+        code = 2 if drivers == "--from-log" else None
+        done = two.crashhunt("replay", "h", drivers, "--set", "ego.model=x", expect=code)
+        assert ("has no argument 'ego.model'" in done.err) == (code == 2)  # recorded actions have no code to ask
 
     (two.folder / "s.toml").write_text(
         '[[hunts]]\nid = "a"\nscenario = "toys"\ntrials = 1\nmax_steps = 5\nseed = 1\n'
