@@ -32,6 +32,7 @@ _OFFERED = {
     "crashhunt.agents": "",
     "crashhunt.world": "Scene Roster Actor Contact Lane Event ClosestApproach outlines_overlap rectangle_gap "
     "time_to_contact closest_approach",
+    "crashhunt.scenario": "load_scenario Scenario AgentSetup ObservationSetup Backend Configuration Accelerator",
     "crashhunt.simulators": "Simulator ActionForm FullBraking SpeedAndLaneChange MetaAction SpaceAction Kinematics",
     "crashhunt.oracles": "Oracle Finding SeesMap BringsOutcomes ReportedCollision Overlap OffRoad TooClose",
     "crashhunt.samplers": "",

@@ -50,6 +50,12 @@ def _contents() -> list[str]:
     return lines
 
 
+def _always_read(*_: object) -> list[str]:
+    """The pages of which the code makes a part, which may have changed although the file has not."""
+    return ["index", "reference/api", "reference/commands"]
+
+
 def setup(app: Any) -> None:
     """Have every page completed when it is read."""
     app.connect("source-read", _complete)
+    app.connect("env-get-outdated", _always_read)

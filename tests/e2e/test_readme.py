@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from pages import PAGES, Page, prepare, tree
+from pages import PAGES, ROOT, Page, prepare, tree
 
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
@@ -76,6 +76,13 @@ def test_what_is_neither_run_nor_written_says_so(topic):
 def test_all_pages_are_read():
     assert {page.topic for root in ROOTS for page in tree(root)} >= {t for t in PAGES if Page(t).commands}
     assert len(Page("README").text.splitlines()) <= 250
+
+
+@pytest.mark.parametrize("file", ["README.md", ".github/SECURITY.md"])
+def test_links_lead_somewhere(file):  # those of the guide are checked where it is built
+    links = re.findall(r"\]\((?!\w+:)([^)#]+)", (ROOT / file).read_text(encoding="utf-8"))
+    assert links
+    assert [link for link in links if not (ROOT / file).parent.joinpath(link).exists()] == []
 
 
 def test_every_option_that_is_mentioned_exists(shell):
