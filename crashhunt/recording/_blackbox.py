@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.base.errors import BundleError, RecorderError
+from crashhunt.recording.records import action, notes, observation, prologue, step as steps
+from crashhunt.recording.records._type import is_evidence
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Frame, Roster, Scene
 
-__all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "Tag", "read_black_box", "read_header"]
+__all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
 
 _MAGIC = b"CRASHBB1"
 _HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
@@ -45,22 +47,6 @@ DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
 """What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
 
 
-class Tag(IntEnum):
-    """What a record holds."""
-
-    PROLOGUE = 1  # JSON: the agents with their array shapes, the step length
-    ACTORS = 2  # JSON: actors that were not seen before; each is numbered in order of appearance
-    ROSTER = 3  # uint32[]: the numbers of the actors present from here on
-    OBSERVATION = 4  # raw bytes of what the agent ``aux`` is shown
-    ACTION = 5  # raw bytes of what the agent ``aux`` answers
-    STEP = 6  # int64 step, float64 time, float64 reward of each agent, then the scene's data
-    LANES = 7  # text: the lane of each actor of the roster, one a line
-    EVENTS = 8  # JSON: what touched, who left the road
-    HEIGHTS = 9  # float64[]: z of each actor, then the grade at each; only where the map is not flat
-    SPINES = 10  # of each long vehicle that is bent: uint32 row, uint32 points, float64 x, y and z of each
-    NOTES = 11  # JSON: traffic events. What we conclude from an episode is no part of it, nor of its digest
-
-
 class Phase(IntEnum):
     """What the process was doing."""
 
@@ -70,8 +56,8 @@ class Phase(IntEnum):
     DONE = 3
 
 
-# Members of an enum are looked up and converted at every use; these are used in every step.
-_STEP, _OBSERVATION, _ACTION = int(Tag.STEP), int(Tag.OBSERVATION), int(Tag.ACTION)
+# Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
+_STEP, _OBSERVATION, _ACTION = steps.TYPE.tag, observation.TYPE.tag, action.TYPE.tag
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -122,7 +108,7 @@ class BlackBox:
         self._roster: object = None
         self._steps: dict[int, struct.Struct] = {}
         self._trail: list[tuple[Roster, int, Scene | None]] = []
-        self._notes: list[tuple[int, int]] = []
+        self._aside: list[tuple[int, int]] = []
         try:
             self._reserve(_FIRST)
         except RecorderError:
@@ -136,16 +122,16 @@ class BlackBox:
         self._step = 0
         self._roster = None
         self._trail.clear()
-        self._notes.clear()
+        self._aside.clear()
 
     def prologue(self, payload: bytes, agents: int) -> None:
         """Record what the trial consists of; ``agents`` is how many rewards each step has."""
         self._agents = agents
         self._steps = {}
-        self.append(Tag.PROLOGUE, 0, payload)
+        self.append(prologue.TYPE.tag, 0, payload)
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
-        """Record something rare."""
+        """Record something rare, of any type."""
         offset, length = self._offset, len(payload)
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
@@ -153,13 +139,13 @@ class BlackBox:
         start = offset + 8
         self._map[start : start + length] = payload
         self._finish(start + length)
+        if not is_evidence(tag):
+            self._aside.append((offset, self._offset))
         self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
 
     def note(self, payload: bytes) -> None:
         """Record what is no part of the digest."""
-        begins = self._offset
-        self.append(Tag.NOTES, 0, payload)
-        self._notes.append((begins, self._offset))
+        self.append(notes.TYPE.tag, 0, payload)
 
     def observation(self, agent: int, array: NDArray[np.generic]) -> None:
         """Record what an agent is about to be shown."""
@@ -235,7 +221,7 @@ class BlackBox:
     def evidence(self) -> list[memoryview]:
         """The bytes of all records so far over which the digest runs."""
         whole = memoryview(self._map)
-        edges = [_FIRST, *chain.from_iterable(self._notes), self._offset]
+        edges = [_FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:

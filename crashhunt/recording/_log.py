@@ -8,40 +8,38 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from operator import itemgetter
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
-import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.writer import Writer
 
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.recording import _schemas as schemas
-from crashhunt.recording._blackbox import Record, Tag
-from crashhunt.recording._recording import Prologue, Recording, decode_spines, pack_spines
+from crashhunt.recording._blackbox import Record
+from crashhunt.recording._recording import Recording
+from crashhunt.recording._schemas import MESSAGES, NAMESPACE
 from crashhunt.recording._views import write_views
 from crashhunt.recording._writer import LogWriter, to_ns
+from crashhunt.recording.records import RECORD_TYPES, step
+from crashhunt.recording.records._type import BytesForm, TextForm
+from crashhunt.recording.records.prologue import Prologue
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.recording.records._type import Form
     from crashhunt.trial import TrialResult
     from crashhunt.world import Lane
 
 __all__ = ["read_log", "write_log"]
 
 SCHEMA = "1"
-_STEP = struct.Struct("<qd")
-_TEXTS = {
-    Tag.PROLOGUE: "/prologue",
-    Tag.ACTORS: "/scene/actor_definitions",
-    Tag.LANES: "/scene/lanes",
-    Tag.EVENTS: "/events",
-    Tag.NOTES: "/traffic_events",
-}
+_KNOWN_BY_TOPIC = 11
+"""The last tag of the types that have been there from the beginning: a channel of any other says its tag."""
 
 
 def write_log(
@@ -94,11 +92,12 @@ def read_log(path: Path) -> Recording:
             if version != SCHEMA:
                 raise refuse(f"its schema is {version}, not {SCHEMA}", "use the version of crashhunt that wrote it")
             messages = reader.iter_messages(log_time_order=False)
-            evidence = sorted(
-                (message.sequence, channel.topic, message.data)
+            evidence = [
+                _Message(message.sequence, channel.topic, message.data, schema.name, channel.metadata)
                 for schema, channel, message in messages
-                if schema is not None and schema.name.startswith("crashhunt.") and message.sequence
-            )
+                if schema is not None and schema.name.startswith(NAMESPACE) and message.sequence
+            ]
+            evidence.sort(key=itemgetter(0))
             return Recording(_read_evidence(evidence))
     except OSError as error:
         raise refuse(f"cannot be read: {error.strerror}", "give the path of a log.mcap") from None
@@ -110,115 +109,77 @@ def read_log(path: Path) -> Recording:
         raise refuse(f"damaged: {type(error).__name__}: {error}") from None
 
 
-def _agent_topic(agent: str, what: str) -> str:
-    return f"/agents/{quote(agent, safe='')}/{what}"
+class _Message(NamedTuple):
+    """A message of the evidence, the name of its schema, and what its channel says."""
+
+    sequence: int
+    topic: str
+    data: bytes
+    schema: str
+    metadata: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class _ArrayCodec:
-    """Arrays of one agent, to messages and back."""
+class _Channel:
+    """Records of one type, and of one agent where each has its own, as messages of a log."""
 
+    tag: int
+    aux: int
     topic: str
-    kind: Any
-    dtype: str
-
-    def encode(self, payload: bytes) -> bytes:
-        data: bytes = self.kind(values=np.frombuffer(payload, self.dtype).tolist()).SerializeToString()
-        return data
-
-    def decode(self, data: bytes) -> bytes:
-        return np.array(list(self.kind.FromString(data).values), self.dtype).tobytes()
+    form: Form
 
 
-def _codecs(prologue: Prologue) -> dict[tuple[int, int], _ArrayCodec]:
-    found = {}
-    for number, agent in enumerate(prologue.agents):
-        for tag, what, dtype in (
-            (Tag.OBSERVATION, "observation", agent.observation_dtype),
-            (Tag.ACTION, "action", agent.action_dtype),
-        ):
-            found[int(tag), number] = _ArrayCodec(_agent_topic(agent.id, what), schemas.array_type(dtype), dtype)
-    return found
+def _channel(tag: int, aux: int, prologue: Prologue) -> _Channel:
+    kind = RECORD_TYPES.get(tag)
+    if kind is None:  # of a black box that a later version wrote
+        return _Channel(tag, aux, f"/records/{tag}/{aux}", BytesForm())
+    agent = quote(prologue.agents[aux].id, safe="") if kind.per_agent else ""
+    return _Channel(tag, aux, kind.topic.format(agent=agent), kind.form)
 
 
 def _write_evidence(log: LogWriter, recording: Recording) -> None:
-    codecs = _codecs(recording.prologue)
-    agents = len(recording.agents)
+    prologue = recording.prologue
+    channels: dict[tuple[int, int], _Channel] = {}
     time_ns = 0
     for sequence, (tag, aux, payload) in enumerate(recording.records, 1):
-        if tag in _TEXTS:
-            log.write(_TEXTS[Tag(tag)], schemas.Text, schemas.Text(text=payload).SerializeToString(), time_ns, sequence)
-        elif tag == Tag.ROSTER:
-            message = schemas.Roster(actors=np.frombuffer(payload, "<u4").tolist())
-            log.write("/scene/roster", schemas.Roster, message.SerializeToString(), time_ns, sequence)
-        elif tag == Tag.HEIGHTS:
-            heights, grades = np.frombuffer(payload, "<f8").reshape(2, -1).tolist()
-            message = schemas.Heights(heights=heights, grades=grades)
-            log.write("/scene/heights", schemas.Heights, message.SerializeToString(), time_ns, sequence)
-        elif tag == Tag.SPINES:
-            message = _spines_message(payload)
-            log.write("/scene/spines", schemas.Spines, message.SerializeToString(), time_ns, sequence)
-        elif tag == Tag.STEP:
-            step, time_s = _STEP.unpack_from(payload)
-            time_ns = to_ns(time_s)
-            values = np.frombuffer(payload, "<f8", offset=_STEP.size).tolist()
-            rewards, scene = values[:agents], values[agents:]
-            count = len(scene) // 4
-            message = schemas.Step(
-                step=step,
-                time_s=time_s,
-                rewards=rewards,
-                positions=scene[: 2 * count],
-                headings=scene[2 * count : 3 * count],
-                speeds=scene[3 * count :],
-            )
-            log.write("/scene", schemas.Step, message.SerializeToString(), time_ns, sequence)
-        else:
-            codec = codecs[tag, aux]
-            log.write(codec.topic, codec.kind, codec.encode(payload), time_ns, sequence)
+        channel = channels.get((tag, aux))
+        if channel is None:
+            channel = channels[tag, aux] = _channel(tag, aux, prologue)
+        if tag == step.TYPE.tag:
+            time_ns = to_ns(step.time_of(payload))
+        name, fields = channel.form.to_message(payload, prologue, aux)
+        kind = MESSAGES[name]
+        metadata = None if tag <= _KNOWN_BY_TOPIC else {"tag": str(tag), "aux": str(aux)}
+        log.write(channel.topic, kind, kind(**fields).SerializeToString(), time_ns, sequence, metadata)
 
 
-def _read_evidence(evidence: Sequence[tuple[int, str, bytes]]) -> Iterator[Record]:
-    texts = {topic: tag for tag, topic in _TEXTS.items()}
-    arrays: dict[str, tuple[int, int, _ArrayCodec]] = {}
-    for expected, (sequence, topic, data) in enumerate(evidence, 1):
-        if sequence != expected:
+def _read_evidence(messages: Sequence[_Message]) -> Iterator[Record]:
+    channels = {kind.topic: _Channel(tag, 0, kind.topic, kind.form) for tag, kind in RECORD_TYPES.items()}
+    prologue: Prologue | None = None
+    for expected, message in enumerate(messages, 1):
+        if message.sequence != expected:
             raise BundleError(f"message {expected} of the evidence is missing", fix="get an undamaged copy of it")
-        if topic == "/scene":
-            yield _read_step(data)
-        elif topic == "/scene/roster":
-            yield Record(Tag.ROSTER, 0, np.array(schemas.Roster.FromString(data).actors, "<u4").tobytes())
-        elif topic == "/scene/heights":
-            heights = schemas.Heights.FromString(data)
-            yield Record(Tag.HEIGHTS, 0, np.array([*heights.heights, *heights.grades], "<f8").tobytes())
-        elif topic == "/scene/spines":
-            yield _read_spines(data)
-        elif topic in texts:
-            payload = schemas.Text.FromString(data).text.encode()
-            if texts[topic] == Tag.PROLOGUE:
-                codecs = _codecs(Prologue.decode(payload))
-                arrays = {codec.topic: (tag, agent, codec) for (tag, agent), codec in codecs.items()}
-            yield Record(texts[topic], 0, payload)
-        else:
-            tag, agent, codec = arrays[topic]
-            yield Record(tag, agent, codec.decode(data))
+        channel = channels.get(message.topic)
+        if channel is None:
+            channel = channels[message.topic] = _unknown(message)
+        kind = MESSAGES[message.schema[len(NAMESPACE) :]]
+        payload = channel.form.to_payload(kind.FromString(message.data), prologue, channel.aux)
+        if prologue is None:
+            prologue = Prologue.decode(payload)
+            for aux in range(len(prologue.agents)):
+                of_agent = [_channel(tag, aux, prologue) for tag, kind in RECORD_TYPES.items() if kind.per_agent]
+                channels |= {channel.topic: channel for channel in of_agent}
+        yield Record(channel.tag, channel.aux, payload)
 
 
-def _read_step(data: bytes) -> Record:
-    step = schemas.Step.FromString(data)
-    values = np.array([*step.rewards, *step.positions, *step.headings, *step.speeds], "<f8")
-    return Record(Tag.STEP, 0, _STEP.pack(step.step, step.time_s) + values.tobytes())
-
-
-def _spines_message(payload: bytes) -> Any:
-    spines = decode_spines(payload)
-    coordinates = [value for spine in spines.values() for point in spine for value in point]
-    return schemas.Spines(rows=list(spines), points=[len(spine) for spine in spines.values()], coordinates=coordinates)
-
-
-def _read_spines(data: bytes) -> Record:
-    message = schemas.Spines.FromString(data)
-    values = np.array(list(message.coordinates), "<f8").reshape(-1, 3)
-    ends = np.cumsum(list(message.points))[:-1]
-    spines = dict(zip(message.rows, np.split(values, ends), strict=True))
-    return Record(Tag.SPINES, 0, pack_spines(spines))
+def _unknown(message: _Message) -> _Channel:
+    """The channel of records that came with a later version; what they mean is not known, what they are is."""
+    tag = int(message.metadata["tag"])  # without one, no version has written it
+    name = message.schema[len(NAMESPACE) :]
+    form = next((form for form in (TextForm(), BytesForm()) if name in form.messages), None)
+    if form is None:
+        raise BundleError(
+            f"there are records of a type that this version does not know ({message.topic})",
+            fix="use the version that wrote it",
+        )
+    return _Channel(tag, int(message.metadata.get("aux", 0)), message.topic, form)

@@ -2,46 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-__all__ = [
-    "DoubleArray",
-    "FloatArray",
-    "Heights",
-    "IntArray",
-    "Metrics",
-    "Roster",
-    "Spines",
-    "Step",
-    "Text",
-    "array_type",
-]
+from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._type import BytesForm
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["MESSAGES", "NAMESPACE"]
+
+NAMESPACE = "crashhunt."
 _TYPES = {
     "double": descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE,
     "float": descriptor_pb2.FieldDescriptorProto.TYPE_FLOAT,
     "int64": descriptor_pb2.FieldDescriptorProto.TYPE_INT64,
     "uint32": descriptor_pb2.FieldDescriptorProto.TYPE_UINT32,
     "string": descriptor_pb2.FieldDescriptorProto.TYPE_STRING,
+    "bytes": descriptor_pb2.FieldDescriptorProto.TYPE_BYTES,
 }
-_MESSAGES = {
-    "Text": {"text": "string"},
-    "Roster": {"actors": "uint32*"},
-    "FloatArray": {"values": "float*"},
-    "DoubleArray": {"values": "double*"},
-    "IntArray": {"values": "int64*"},
-    "Step": {
-        "step": "int64",
-        "time_s": "double",
-        "rewards": "double*",
-        "positions": "double*",
-        "headings": "double*",
-        "speeds": "double*",
-    },
-    "Heights": {"heights": "double*", "grades": "double*"},
-    "Spines": {"rows": "uint32*", "points": "uint32*", "coordinates": "double*"},
+_METRICS = {
     "Metrics": {
         "speed": "double",
         "time_to_collision_s": "double",
@@ -49,44 +31,41 @@ _MESSAGES = {
         "required_deceleration": "double",
     },
 }
+_OF_RECORDS = {name: fields for kind in RECORD_TYPES.values() for name, fields in kind.form.messages.items()}
+# A schema in a log has its whole file, so what few logs have is in one of its own.
+_FILES: dict[str, Mapping[str, Mapping[str, str]]] = {
+    "crashhunt/log.proto": {**_OF_RECORDS, **_METRICS},
+    "crashhunt/bytes.proto": BytesForm.messages,
+}
 
 
 def _make() -> dict[str, Any]:
-    file = descriptor_pb2.FileDescriptorProto(name="crashhunt/log.proto", package="crashhunt", syntax="proto3")
-    for name, fields in _MESSAGES.items():
+    # A pool of its own: another version of crashhunt in the same process must not clash with it.
+    pool = descriptor_pool.DescriptorPool()
+    for place, messages in _FILES.items():
+        file = _file(place, messages)
+        pool.Add(file) if hasattr(pool, "Add") else pool.AddSerializedFile(file.SerializeToString())
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(NAMESPACE + name))
+        for messages in _FILES.values()
+        for name in messages
+    }
+
+
+def _file(place: str, messages: Mapping[str, Mapping[str, str]]) -> Any:
+    file = descriptor_pb2.FileDescriptorProto(name=place, package=NAMESPACE.rstrip("."), syntax="proto3")
+    for name, fields in messages.items():
         message = file.message_type.add(name=name)
         for number, (field, kind) in enumerate(fields.items(), 1):
-            repeated = kind.endswith("*")
             label = descriptor_pb2.FieldDescriptorProto
             message.field.add(
                 name=field,
                 number=number,
                 type=_TYPES[kind.rstrip("*")],
-                label=label.LABEL_REPEATED if repeated else label.LABEL_OPTIONAL,
+                label=label.LABEL_REPEATED if kind.endswith("*") else label.LABEL_OPTIONAL,
             )
-    # A pool of its own: another version of crashhunt in the same process must not clash with it.
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file) if hasattr(pool, "Add") else pool.AddSerializedFile(file.SerializeToString())
-    return {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"crashhunt.{name}")) for name in _MESSAGES
-    }
+    return file
 
 
-_classes = _make()
-Text, Roster, Step, Metrics = (_classes[name] for name in ("Text", "Roster", "Step", "Metrics"))
-Heights, Spines = _classes["Heights"], _classes["Spines"]
-FloatArray, DoubleArray, IntArray = (_classes[name] for name in ("FloatArray", "DoubleArray", "IntArray"))
-
-
-def array_type(dtype: str) -> Any:
-    """Return the message that holds arrays of a NumPy type without losing a bit.
-
-    Args:
-        dtype: as NumPy writes it, such as ``<f4``.
-    """
-    kind, size = dtype[1], int(dtype[2:])
-    if kind == "f" and size in (4, 8):
-        return FloatArray if size == 4 else DoubleArray
-    if kind in "iub":
-        return IntArray
-    raise TypeError(f"arrays of {dtype} cannot be recorded")
+MESSAGES = _make()
+"""The class of each message, by its name."""

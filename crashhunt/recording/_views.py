@@ -19,7 +19,7 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 
 from crashhunt.base.errors import BundleError
-from crashhunt.recording import _schemas as schemas
+from crashhunt.recording._schemas import MESSAGES
 from crashhunt.recording._writer import LogWriter, to_ns
 from crashhunt.world import approaches, is_person, levels, outlines
 
@@ -258,12 +258,13 @@ def _bend(entity: Any, scene: Scene, row: int) -> None:
 
 
 def _write_metrics(log: LogWriter, agent: str, scenes: Sequence[Scene]) -> None:
+    kind = MESSAGES["Metrics"]
     times, gaps, brakes = approaches([scene.frame for scene in scenes], agent)
     for scene, time, gap, brake in zip(scenes, times.tolist(), gaps.tolist(), brakes.tolist(), strict=True):
         row = scene.roster.index.get(agent)
         speed = scene.speeds[row] if row is not None else math.nan
-        metrics = schemas.Metrics(speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake)
-        log.write("/metrics", schemas.Metrics, metrics.SerializeToString(), to_ns(scene.time_s))
+        metrics = kind(speed=speed, time_to_collision_s=time, gap_m=gap, required_deceleration=brake)
+        log.write("/metrics", kind, metrics.SerializeToString(), to_ns(scene.time_s))
 
 
 def _write_events(log: LogWriter, scenes: Sequence[Scene]) -> None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from mcap_protobuf.schema import build_file_descriptor_set
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mcap.writer import Writer
 
 __all__ = ["LogWriter", "to_ns"]
@@ -25,7 +27,15 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
-    def write(self, topic: str, kind: Any, data: bytes, time_ns: int, sequence: int = 0) -> None:
+    def write(
+        self,
+        topic: str,
+        kind: Any,
+        data: bytes,
+        time_ns: int,
+        sequence: int = 0,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
         """Write a serialised message.
 
         Args:
@@ -34,6 +44,7 @@ class LogWriter:
             data: the message.
             time_ns: simulation time.
             sequence: its number within the evidence.
+            metadata: of the channel.
         """
         channel = self._channels.get(topic)
         if channel is None:
@@ -41,7 +52,7 @@ class LogWriter:
             if name not in self._schemas:
                 described = build_file_descriptor_set(kind).SerializeToString()
                 self._schemas[name] = self._writer.register_schema(name, "protobuf", described)
-            channel = self._writer.register_channel(topic, "protobuf", self._schemas[name])
+            channel = self._writer.register_channel(topic, "protobuf", self._schemas[name], dict(metadata or {}))
             self._channels[topic] = channel
         self._writer.add_message(channel, time_ns, data, time_ns, sequence)
 

@@ -4,8 +4,9 @@ import math
 
 import pytest
 
-from crashhunt.recording import _schemas as schemas
+from crashhunt.recording._schemas import MESSAGES
 from crashhunt.recording._writer import to_ns
+from crashhunt.recording.records._arrays import message_of
 
 
 @pytest.mark.parametrize(
@@ -16,37 +17,37 @@ from crashhunt.recording._writer import to_ns
     ],
 )  # fmt: skip
 def test_arrays_keep_every_bit(dtype, name):
-    assert schemas.array_type(dtype).DESCRIPTOR.full_name == f"crashhunt.{name}"
+    assert MESSAGES[message_of(dtype)].DESCRIPTOR.full_name == f"crashhunt.{name}"
 
 
 @pytest.mark.parametrize("dtype", ["<f2", "<f16", "<c8", "<U2", "|O8"])
 def test_arrays_that_would_lose_some_are_refused(dtype):
     with pytest.raises(TypeError, match="cannot be recorded"):
-        schemas.array_type(dtype)
+        message_of(dtype)
 
 
 def test_the_numbers_on_the_wire_stay_what_they_are():
     """Logs that were written before are read by these."""
-    step = schemas.Step(step=3, time_s=1.0, rewards=[0.5], positions=[1.0, 2.0], headings=[3.0], speeds=[4.0])
+    step = MESSAGES["Step"](step=3, time_s=1.0, rewards=[0.5], positions=[1.0, 2.0], headings=[3.0], speeds=[4.0])
     assert [(field.name, field.number) for field in step.DESCRIPTOR.fields] == [
         ("step", 1), ("time_s", 2), ("rewards", 3), ("positions", 4), ("headings", 5), ("speeds", 6),
     ]  # fmt: skip
     assert step.DESCRIPTOR.file.name == "crashhunt/log.proto"
     for kind, fields in (
-        (schemas.Text, ["text"]),
-        (schemas.Roster, ["actors"]),
-        (schemas.Heights, ["heights", "grades"]),
-        (schemas.Spines, ["rows", "points", "coordinates"]),
-        (schemas.Metrics, ["speed", "time_to_collision_s", "gap_m", "required_deceleration"]),
-        (schemas.FloatArray, ["values"]),
+        (MESSAGES["Text"], ["text"]),
+        (MESSAGES["Roster"], ["actors"]),
+        (MESSAGES["Heights"], ["heights", "grades"]),
+        (MESSAGES["Spines"], ["rows", "points", "coordinates"]),
+        (MESSAGES["Metrics"], ["speed", "time_to_collision_s", "gap_m", "required_deceleration"]),
+        (MESSAGES["FloatArray"], ["values"]),
     ):
         assert [field.name for field in kind.DESCRIPTOR.fields] == fields
         assert [field.number for field in kind.DESCRIPTOR.fields] == list(range(1, len(fields) + 1))
-    assert schemas.Text(text="ä").SerializeToString() == b"\x0a\x02\xc3\xa4"
-    assert schemas.Roster(actors=[1, 300]).SerializeToString() == b"\x0a\x03\x01\xac\x02"
-    assert schemas.IntArray(values=[-1]).SerializeToString() == b"\x0a\x0a" + b"\xff" * 9 + b"\x01"
-    assert schemas.DoubleArray(values=[1.0]).SerializeToString() == b"\x0a\x08" + bytes(6) + b"\xf0\x3f"
-    assert schemas.FloatArray(values=[1.0]).SerializeToString() == b"\x0a\x04\x00\x00\x80\x3f"
+    assert MESSAGES["Text"](text="ä").SerializeToString() == b"\x0a\x02\xc3\xa4"
+    assert MESSAGES["Roster"](actors=[1, 300]).SerializeToString() == b"\x0a\x03\x01\xac\x02"
+    assert MESSAGES["IntArray"](values=[-1]).SerializeToString() == b"\x0a\x0a" + b"\xff" * 9 + b"\x01"
+    assert MESSAGES["DoubleArray"](values=[1.0]).SerializeToString() == b"\x0a\x08" + bytes(6) + b"\xf0\x3f"
+    assert MESSAGES["FloatArray"](values=[1.0]).SerializeToString() == b"\x0a\x04\x00\x00\x80\x3f"
 
 
 def test_times_of_messages_are_never_negative():

@@ -19,7 +19,6 @@ from crashhunt.recording import (
     Record,
     Recording,
     Tag,
-    _schemas as schemas,
     encode_actors,
     encode_heights,
     encode_notes,
@@ -29,12 +28,13 @@ from crashhunt.recording import (
     read_lanes,
     write_log,
 )
+from crashhunt.recording._schemas import MESSAGES
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Lane, Roster, Scene
 
 KINDS = {
     "/map": SceneUpdate, "/scene/actors": SceneUpdate, "/scene/crash": SceneUpdate, "/tf": FrameTransforms,
-    "/ego/pose": PoseInFrame, "/log": Log, "/metrics": schemas.Metrics,
+    "/ego/pose": PoseInFrame, "/log": Log, "/metrics": MESSAGES["Metrics"],
 }  # fmt: skip
 ACTORS = (
     Actor("ego", "passenger", 5.0, 2.0),

@@ -1,0 +1,131 @@
+"""What is said of a type of record: all of it in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.recording._divergence import Divergence
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from crashhunt.recording._reading import Reading, StepRecord
+    from crashhunt.recording.records.prologue import AgentChannel, Prologue
+
+    Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
+
+__all__ = [
+    "FIRST_ASIDE",
+    "SCENE",
+    "BytesForm",
+    "Form",
+    "RecordType",
+    "TextForm",
+    "is_evidence",
+    "scene_texts",
+]
+
+FIRST_ASIDE = 128
+"""Tags from here on are of records that are no evidence: whoever does not know a type knows what the digest is of."""
+_NOTES = 11  # the only type of the first eleven that is no evidence, from before there was that rule
+SCENE = "scene"
+
+
+def is_evidence(tag: int) -> bool:
+    """Whether records with this tag belong to the digest of the trial."""
+    return tag < FIRST_ASIDE and tag != _NOTES
+
+
+class Form:
+    """How a payload looks as a message of a log. Every bit of the payload must come back.
+
+    Args:
+        messages: the protobuf messages that it may be: name to the type of each field by its name.
+    """
+
+    messages: Mapping[str, Mapping[str, str]]
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+        """Return the name of the message, and the values of its fields."""
+        raise NotImplementedError
+
+    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+        """Return the payload that was given to `to_message`; the prologue itself is read without one."""
+        raise NotImplementedError
+
+
+class TextForm(Form):
+    """A payload that is text."""
+
+    messages: Mapping[str, Mapping[str, str]] = {"Text": {"text": "string"}}
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+        """Return the text."""
+        return "Text", {"text": payload}
+
+    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+        """Return it again."""
+        text: str = message.text
+        return text.encode()
+
+
+class BytesForm(Form):
+    """Any payload, of which a log does not say what it means."""
+
+    messages: Mapping[str, Mapping[str, str]] = {"Bytes": {"data": "bytes"}}
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+        """Return it as it is."""
+        return "Bytes", {"data": payload}
+
+    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+        """Return it as it was."""
+        data: bytes = message.data
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class RecordType:
+    """Everything that crashhunt must know of a type of record.
+
+    Args:
+        tag: its number in the black box; from `FIRST_ASIDE` on it is no evidence. Never given twice.
+        name: for people, and for the place of a value.
+        topic: of its messages in a log; ``{agent}`` stands for the agent whose number is the record's ``aux``.
+        form: how it looks there. A type that came after the first eleven is text or bytes, so that a crashhunt that
+            does not know it can read the record and count it in the digest; what people want to see of it is a view.
+        read: adds a record, given as ``aux`` and payload, to what has been read so far.
+        difference: the first difference between what two equal steps hold of it; of one agent, where ``{agent}`` is in
+            the topic. None where it is never compared, or with another type.
+        value: of the agent or actor of a divergence, the value at an index, for the steps around.
+    """
+
+    tag: int
+    name: str
+    topic: str
+    form: Form
+    read: Callable[[Reading, int, bytes], None]
+    difference: Difference | None = None
+    value: Callable[[StepRecord, str, tuple[int, ...]], Any] | None = None
+
+    @property
+    def per_agent(self) -> bool:
+        """Whether every agent has its own records of it."""
+        return "{agent}" in self.topic
+
+
+def scene_texts(*fields: str) -> Difference:
+    """Return a comparison of some fields of the scenes."""
+
+    def difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
+        if left.scene is None or right.scene is None:  # which the step tells
+            return None
+        for field in fields:
+            # As text, in which a speed that nobody knows, NaN, equals itself.
+            was, now = str(getattr(left.scene, field)), str(getattr(right.scene, field))
+            if was != now:
+                return Divergence(left.step, "", f"scene.{field}", was, now)
+        return None
+
+    return difference
