@@ -1,10 +1,4 @@
 from ._debugger import Look as Look
-from ._replay import (
-    Code as Code,
-    ReplayOptions as ReplayOptions,
-    ReplayReport as ReplayReport,
-    Rerun as Rerun,
-    confirm as confirm,
-    prepare as prepare,
-    replay as replay,
-)
+from ._prepare import Code as Code, ReplayOptions as ReplayOptions, Rerun as Rerun, prepare as prepare
+from ._replay import confirm as confirm, replay as replay
+from ._verdict import ReplayReport as ReplayReport

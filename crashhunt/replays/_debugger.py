@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.episode import Episode
-    from crashhunt.replays._replay import Rerun
+    from crashhunt.replays._prepare import Rerun
     from crashhunt.simulators import Simulator
     from crashhunt.world import Scene
 
@@ -118,7 +118,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
                 f"the replay ended before its last step, with {ended}", where=rerun.bundle.id
             ) from None
         if "error" in answer:
-            raise CrashhuntError(**answer["error"])
+            raise CrashhuntError.from_json(answer)
         return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / layout.BLACK_BOX))
 
 

@@ -130,7 +130,7 @@ def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monk
     (tmp_path / "open").mkdir()
     (tmp_path / "open" / "sitecustomize.py").write_text(DOORS_OPEN)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "open"))
-    monkeypatch.setattr("crashhunt.replays._replay.refuse_side_effects", lambda *_: None)
+    monkeypatch.setattr("crashhunt.replays._prepare.refuse_side_effects", lambda *_: None)
     with open_archive(changed(crash, tmp_path / "bad.zip", *edits)) as archive:
         bundle = find_bundle(archive.directory, "")
         try:

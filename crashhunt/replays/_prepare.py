@@ -1,0 +1,185 @@
+"""What a crash needs to be run again: its recording, the trial with all edits, and who drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
+from crashhunt.base.sandbox import landlock_version
+from crashhunt.crashes import refuse_side_effects
+from crashhunt.episode import WorkerSettings
+from crashhunt.plans import read_settings, with_settings
+from crashhunt.replays._edits import edited_spec
+from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.snapshots import Snapshot, environment_changes, processor
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.plans import HuntSettings
+    from crashhunt.recording import Recording
+    from crashhunt.replays._debugger import Look
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["Code", "ReplayOptions", "Rerun", "prepare"]
+
+Code = Literal["snapshot", "current", "log"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayOptions:
+    """How to replay.
+
+    Args:
+        code: who drives: the code of the snapshot, today's, or the recorded actions.
+        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value.
+        force: replay even from a snapshot that is damaged.
+        times: how often.
+        scenario: the name or path of another scenario to drive in; empty for that of the crash.
+        accelerate: whether simulators are sped up where that changes no bit.
+        trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
+            but simulate.
+        look: what to look at, in a process that has this one's terminal; without it, it runs in one of its own.
+    """
+
+    code: Code = "snapshot"
+    changes: Mapping[str, str] = field(default_factory=dict)
+    force: bool = False
+    times: int = 1
+    scenario: str = ""
+    accelerate: bool = True
+    trusted: bool = True
+    look: Look | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rerun:
+    """A crash, ready to be run again.
+
+    Args:
+        bundle: the crash.
+        recorded: the recording.
+        spec: the trial, with all edits.
+        worker: where and how it runs; its scratch folder is not set yet.
+        code: who drives.
+        snapshot: of the bundle.
+        edits: what is not as it was recorded, in words.
+        warnings: what may make a difference, in words.
+        other_traffic: those edits that are not about who drives: without the crash, they may be why.
+        elsewhere: whether it is in another scenario, so that steps cannot be compared.
+    """
+
+    bundle: Bundle
+    recorded: Recording
+    spec: TrialSpec
+    worker: WorkerSettings
+    code: Code
+    snapshot: Snapshot
+    edits: tuple[str, ...]
+    warnings: tuple[str, ...]
+    other_traffic: tuple[str, ...] = ()
+    elsewhere: bool = False
+
+
+def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
+    """Check a bundle, and gather what its crash needs to be run again.
+
+    Raises:
+        BundleError: the bundle is damaged.
+        UsageError: an edit cannot be meant.
+    """
+    recorded = bundle.recording()
+    snapshot = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
+    warnings = []
+    code: Code = options.code
+    if code == "snapshot" and not snapshot.has_code:
+        code = "current"
+        warnings.append("the hunt kept no snapshot of the code (--no-snapshot), so that today's code drives")
+    if options.force:
+        warnings += [f"the snapshot is damaged: {fault}" for fault in snapshot.faults()]
+    else:
+        snapshot.verify()
+    warnings += [f"{name} was not in the snapshot, and may make a difference" for name in snapshot.additions()]
+    settings = read_settings(bundle.hunt / layout.HUNT)
+    settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
+    scenario = with_settings(snapshot.scenario(), settings)
+    environment = snapshot.environment()
+    warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
+    there, here = environment.get("cpu", ""), processor()
+    if scenario.highway is not None and there != here:
+        warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
+    runs = None if code == "log" or not options.trusted else snapshot.code if code == "snapshot" else ()
+    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
+    warnings += edits.ignored
+    if code == "log":
+        if edits.all:
+            raise UsageError(
+                f"recorded actions belong to the recorded trial, and {edits.all[0]}", fix="replay with --code snapshot"
+            )
+        if not options.trusted:
+            refuse_side_effects(scenario, settings, spec.scenario_arguments)
+            if not landlock_version():
+                warnings.append("this kernel has no Landlock, with which the simulator could write in its folder only")
+        log = str((bundle.path / layout.LOG).resolve())
+        scenario = scenario.with_agents(dict.fromkeys(scenario.agents, "crashhunt.agents:Recorded"))
+        # An agent that failed did not act in its last step, and neither can its record.
+        acted = max((len(recorded.actions(agent)) for agent in recorded.agents), default=0)
+        arguments = {agent: {"log": log, "agent": agent} for agent in scenario.agents}
+        spec = replace(spec, arguments=arguments, max_steps=max(1, min(spec.max_steps, acted)))
+    if options.scenario:
+        if code == "log":
+            message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
+            raise UsageError(message, fix="leave --scenario or --from-log out")
+        scenario, spec = _elsewhere(options.scenario, settings, spec, recorded.prologue.step_length_s)
+        elsewhere = f"the scenario was {settings.scenario} and is {options.scenario}"
+        edits = replace(edits, others=(*edits.others, elsewhere))
+    worker = WorkerSettings(
+        scenario=scenario,
+        oracles=settings.oracles,
+        crash_on=settings.crash_on,
+        scratch=Path(),
+        code=snapshot.code if code == "snapshot" else (),
+        argument_files=snapshot.argument_files if code == "snapshot" else {},
+        timeout_s=settings.run.timeout_s,
+        keep_trials=True,
+        sealed=None if code != "log" or options.trusted else (str(bundle.path),),
+    )
+    return Rerun(
+        bundle,
+        recorded,
+        spec,
+        worker,
+        code,
+        snapshot,
+        edits.all,
+        tuple(warnings),
+        other_traffic=edits.others,
+        elsewhere=bool(options.scenario),
+    )
+
+
+def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s: float) -> tuple[Scenario, TrialSpec]:
+    """The same agents, arguments, seed and simulation time elsewhere; the traffic is its own but for what both have."""
+    other = load_scenario(name)
+    if len(other.agents) != len(settings.agents):
+        counts = f"{len(other.agents)} controlled vehicles, and the crash has {len(settings.agents)}"
+        message = f"--scenario {name!r} has {counts}"
+        raise UsageError(message, fix="give one with as many")
+    ids = dict(zip(settings.agents, other.agents, strict=True))
+    agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
+    shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
+    there = other.step_length_s
+    if other.highway is not None:
+        rate = other.highway.config.get("policy_frequency")  # where it is not said, it is once a second in most
+        there = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
+    return with_settings(other, replace(settings, agents=agents)), replace(
+        spec,
+        arguments={ids[agent]: values for agent, values in spec.arguments.items()},
+        scenario_arguments=argument_values(other) | shared,
+        max_steps=max(1, round(spec.max_steps * step_length_s / there)),
+    )
