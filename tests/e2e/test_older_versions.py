@@ -1,7 +1,14 @@
-"""What an older crashhunt has left is read, shown and replayed. Every version that is released leaves a bundle here."""
+"""What an older crashhunt has left is read, shown, replayed and gone on with.
+
+Every version that is released leaves some of it here, which ``frozen/make.sh .venv/bin/crashhunt VERSION`` makes; it is
+never made anew.
+"""
 
 from __future__ import annotations
 
+import json
+import shutil
+import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -9,9 +16,13 @@ import pytest
 
 BUNDLES = sorted((Path(__file__).parent / "bundles").glob("*.zip"))
 SAME_TRAFFIC = version("libsumo") == "1.28.0"  # which recorded them; another one may compute other traffic
-pytestmark = pytest.mark.parametrize("bundle", list(map(str, BUNDLES)), ids=[path.stem for path in BUNDLES])
+bundles = pytest.mark.parametrize("bundle", list(map(str, BUNDLES)), ids=[path.stem for path in BUNDLES])
+FROZEN = Path(__file__).parent / "frozen"
+HUNTS = sorted(path.parent for path in FROZEN.glob("*/hunt"))
+hunts = pytest.mark.parametrize("place", HUNTS, ids=[path.name for path in HUNTS])
 
 
+@bundles
 def test_its_crash_is_replayed_by_the_crashhunt_inside(shell, bundle):
     report = shell.crashhunt("replay", bundle, "--trust", "--json", expect=0 if SAME_TRAFFIC else None).json
     assert report["verdict"] == "reproduced" if SAME_TRAFFIC else report["verdict"] in ("reproduced", "not_comparable")
@@ -19,9 +30,54 @@ def test_its_crash_is_replayed_by_the_crashhunt_inside(shell, bundle):
         assert report["digest_replayed"] == report["digest_recorded"] != ""
 
 
+@bundles
 def test_it_is_told_and_driven_from_its_log_without_running_its_code(shell, bundle):
     assert "drove into left.8 at step 40" in shell.crashhunt("show", bundle).out
     shell.crashhunt("report", bundle, "--output", "page.html")
     assert "left.8" in (shell.folder / "page.html").read_text()
     driven = shell.crashhunt("replay", bundle, "--from-log", "--json", expect=0 if SAME_TRAFFIC else None)
     assert driven.json["code"] == "log"
+
+
+@hunts
+def test_a_hunt_is_listed_read_and_checked(shell, place):
+    shutil.copytree(place / "hunt", shell.folder / "hunt")
+    told = shell.crashhunt("trials", "hunt", "--format", "jsonl").out.splitlines()
+    assert [json.loads(line)["outcome"] for line in told] == ["collision", "survived", "collision", "survived"]
+    (state,) = shell.crashhunt("status", "hunt", "--json").json["hunts"]
+    assert (state["trials_run"], state["crashes"]) == (4, 2)
+    assert "4 trials and 2 crashes are as written" in shell.crashhunt("check", "hunt").out
+    assert "drove into leader" in shell.crashhunt("show", "hunt", "--crash", "0").out
+    shell.crashhunt("report", "hunt", "--output", "page.html")
+    assert "leader" in (shell.folder / "page.html").read_text()
+
+
+@hunts
+def test_a_hunt_goes_on_with_the_trials_that_it_would_have_had(shell, place):
+    shutil.copytree(place / "hunt", shell.folder / "hunt")
+    shutil.copytree(FROZEN / "toy", shell.folder / "toy")
+    options = ("--scenario", "toy", "--seed", "1", "--keep-going", "--no-snapshot")
+    shell.crashhunt("run", "hunt", "1", "6", "60", *options)
+    shell.crashhunt("run", "anew", "1", "6", "60", *options)
+    tables = [shell.crashhunt("trials", name, "--format", "jsonl").out.splitlines() for name in ("hunt", "anew")]
+    old, new = ([{**json.loads(line), "wall_s": 0} for line in table] for table in tables)
+    assert old == new
+    assert len(old) == 6
+
+
+@hunts
+@pytest.mark.parametrize("name", ["hunt", "fault.zip", "highway.zip"])
+def test_crashes_are_replayed_by_the_code_of_today(shell, place, name):
+    shutil.copytree(place, shell.folder / "kept")
+    report = shell.crashhunt("replay", f"kept/{name}", "--trust", "--json", expect=None).json
+    expected = ("reproduced",) if name != "highway.zip" else ("reproduced", "not_comparable")
+    assert report["verdict"] in expected
+    assert "step" in shell.crashhunt("show", f"kept/{name}").out
+
+
+@hunts
+def test_a_bundle_alone_is_shown(shell, place):
+    with zipfile.ZipFile(place / "highway.zip") as archive:
+        archive.extractall(shell.folder)
+    (crash,) = (shell.folder / "crashes").iterdir()
+    assert "drove into vehicle." in shell.crashhunt("show", str(crash)).out
