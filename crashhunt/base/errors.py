@@ -22,6 +22,10 @@
 from __future__ import annotations
 
 import errno
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 __all__ = [
     "ActionError",
@@ -72,6 +76,12 @@ class CrashhuntError(Exception):
     def to_json(self) -> dict[str, dict[str, str]]:
         """Return the shape that every command prints under ``--json``."""
         return {"error": {"message": self.message, "fix": self.fix, "where": self.where}}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> CrashhuntError:
+        """Rebuild what `to_json` returned, of any version."""
+        said = data["error"]
+        return cls(str(said.get("message", "")), fix=str(said.get("fix", "")), where=str(said.get("where", "")))
 
 
 def _rebuild(kind: type[CrashhuntError], message: str, fix: str, where: str) -> CrashhuntError:

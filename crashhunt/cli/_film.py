@@ -145,6 +145,6 @@ def _shot(
     from crashhunt.render import Shot
 
     hit = result.collision
-    other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
+    other = hit.other if hit else ""
     lanes = read_lanes(bundle.path / layout.LOG)
     return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels, meanings)

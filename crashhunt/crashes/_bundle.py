@@ -14,6 +14,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.base.files import sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
 from crashhunt.base.names import listed, near_path, one_of
+from crashhunt.base.tolerance import typed_where_there
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
 from crashhunt.trial import Collision, Escape, Failure, TrialResult, TrialSpec, check_parts, outcome_of
@@ -39,15 +40,22 @@ __all__ = [
 SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of itself and of the files beside it
 _KNOWN = bool | float | str | None
-_TYPES: dict[str, Any] = {
-    **dict.fromkeys(("trial", "seed", "hunt_seed", "max_steps", "step"), int),
+_NEEDED: dict[str, Any] = {
+    **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
     **dict.fromkeys(("outcome", "digest", "snapshot"), str),
+}
+_TYPES: dict[str, Any] = {
+    "hunt_seed": int,
     "arguments": dict[str, dict[str, _KNOWN]],
     "scenario_arguments": dict[str, _KNOWN],
     "sim_time_s": float,
     "confirmed": bool | None,
     "divergence": dict | None,
 }
+_KEYS = {
+    *_NEEDED, *_TYPES, "schema", "id", "category", "summary", "collision", "failure", "escape", "event", "events",
+    "closest_approach", "versions", "files", "integrity",
+}  # fmt: skip
 _UNDAMAGED = "get an undamaged copy, or see with crashhunt check what can be saved"
 
 
@@ -63,6 +71,7 @@ class Bundle:
         confirmed: whether a fresh process did the same to the bit; None where nobody tried.
         divergence: where it did not.
         files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
+        added: what a later version says of it, which is written back.
     """
 
     path: Path
@@ -72,6 +81,7 @@ class Bundle:
     confirmed: bool | None = None
     divergence: dict[str, Any] | None = None
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
+    added: dict[str, Any] = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -120,17 +130,18 @@ class Bundle:
 
     def summary(self) -> dict[str, Any]:
         """Return the shape that ``run --json`` prints."""
-        result = self.result
+        plain = self.result.to_json()
+        spec = plain["spec"]
         return {
             "id": self.id,
-            "trial": result.spec.number,
-            "seed": result.spec.seed,
-            "outcome": str(result.outcome),
-            "step": result.steps,
-            "arguments": {agent: dict(values) for agent, values in result.spec.arguments.items()},
-            "scenario_arguments": dict(result.spec.scenario_arguments),
+            "trial": spec["number"],
+            "seed": spec["seed"],
+            "outcome": plain["outcome"],
+            "step": plain["steps"],
+            "arguments": spec["arguments"],
+            "scenario_arguments": spec["scenario_arguments"],
             "path": str(self.path),
-            "digest": result.digest,
+            "digest": plain["digest"],
             "confirmed": self.confirmed,
         }
 
@@ -138,32 +149,27 @@ class Bundle:
         """Write ``crash.json``, all of it or nothing; into another folder where the bundle is still being built."""
         folder = into or self.path
         result = self.result
+        plain = result.to_json()
+        spec = plain["spec"]
         data = {
             "schema": SCHEMA,
             "id": self.id,
             "hunt_seed": self.hunt_seed,
-            "trial": result.spec.number,
-            "seed": result.spec.seed,
-            "max_steps": result.spec.max_steps,
-            "arguments": {agent: dict(values) for agent, values in result.spec.arguments.items()},
-            "scenario_arguments": dict(result.spec.scenario_arguments),
-            "outcome": str(result.outcome),
+            "trial": spec["number"],
+            **{name: spec[name] for name in ("seed", "max_steps", "arguments", "scenario_arguments")},
+            "outcome": plain["outcome"],
             "category": result.outcome.category,
             "summary": result.summary,
-            "step": result.steps,
-            "sim_time_s": result.sim_time_s,
-            "collision": result.to_json()["collision"],
-            "failure": result.to_json()["failure"],
-            "escape": result.to_json()["escape"],
-            "event": result.to_json()["event"],
-            "events": result.to_json()["events"],
-            "closest_approach": result.closest.to_json(),
-            "digest": result.digest,
+            "step": plain["steps"],
+            **{name: plain[name] for name in ("sim_time_s", "collision", "failure", "escape", "event", "events")},
+            "closest_approach": plain["closest"],
+            "digest": plain["digest"],
             "snapshot": self.snapshot,
             "versions": versions(),
             "confirmed": self.confirmed,
             "divergence": self.divergence,
             "files": self.files or _files_beside(folder),
+            **self.added,
         }
         data["integrity"] = digest_of_data(data)
         with whole_file(folder / layout.CRASH) as temporary:
@@ -211,32 +217,47 @@ def _see_that_it_is_whole(data: dict[str, Any]) -> None:
 
 
 def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
-    typed(data, _TYPES)
-    hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
-    check_parts(data["closest_approach"], hit, failure, escape, event)
+    typed(data, _NEEDED)
+    typed_where_there(data, _TYPES)
+    hit, failure, event, escape = (data.get(name) for name in ("collision", "failure", "event", "escape"))
+    closest = data.get("closest_approach", {})
+    check_parts(closest, hit, failure, escape, event)
     typed({"events": data.get("events")}, {"events": dict[str, int] | None})
     if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
         raise ValueError("trial, seed, step or max_steps is out of its range")
     if not re.fullmatch(r"\w+", data["snapshot"]):
         raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
     spec = TrialSpec(
-        data["trial"], data["seed"], data["arguments"], data["scenario_arguments"], max_steps=data["max_steps"]
+        data["trial"],
+        data["seed"],
+        data.get("arguments", {}),
+        data.get("scenario_arguments", {}),
+        max_steps=data["max_steps"],
     )
     result = TrialResult(
         spec,
         outcome_of(data),
         steps=data["step"],
-        sim_time_s=data["sim_time_s"],
+        sim_time_s=data.get("sim_time_s", 0.0),
         digest=data["digest"],
-        closest=ClosestApproach.from_json(data["closest_approach"]),
+        closest=ClosestApproach.from_json(closest),
         collision=Collision.from_json(hit) if hit else None,
-        failure=Failure(**failure) if failure else None,
-        escape=Escape(**escape) if escape else None,
+        failure=Failure.from_json(failure) if failure else None,
+        escape=Escape.from_json(escape) if escape else None,
         event=Event.from_json(event) if event else None,
         events=data.get("events"),
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
-    return Bundle(path, result, data["hunt_seed"], data["snapshot"], data["confirmed"], data["divergence"], files)
+    return Bundle(
+        path,
+        result,
+        data.get("hunt_seed", 0),
+        data["snapshot"],
+        data.get("confirmed"),
+        data.get("divergence"),
+        files,
+        added={name: value for name, value in data.items() if name not in _KEYS},
+    )
 
 
 def list_bundles(directory: Path) -> list[Bundle]:

@@ -33,10 +33,7 @@ Ending = Literal["avoided", "hit", "unclear"]
 
 def partner(result: TrialResult) -> str:
     """Return the other one of a collision; empty where there was none."""
-    hit = result.collision
-    if hit is None or hit.role == "alone":
-        return ""
-    return hit.victim if hit.role == "collider" else hit.collider
+    return result.collision.other if result.collision is not None else ""
 
 
 def find_escape(

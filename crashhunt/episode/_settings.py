@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.tolerance import ESSENTIAL, not_understood, required_in
 from crashhunt.base.version import __version__
 from crashhunt.scenario import as_in_file
 from crashhunt.trial import Outcome
@@ -57,7 +58,7 @@ class WorkerSettings:
     argument_files: dict[str, str] = field(default_factory=dict)
     timeout_s: float = 60.0
     keep_trials: bool = False
-    sealed: tuple[str, ...] | None = None
+    sealed: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
     find_escapes: bool = False
     audit: float = 0.0
     hunt_seed: int = 0
@@ -74,9 +75,11 @@ class WorkerSettings:
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
         scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file)))
+        requires = required_in(self)
         return {
             **{item.name: getattr(self, item.name) for item in fields(self)},
             "schema": _SCHEMA,
+            **({"requires": requires} if requires else {}),
             "scenario": {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)},
             "scratch": str(self.scratch),
             "crash_on": [str(outcome) for outcome in self.crash_on],
@@ -84,31 +87,36 @@ class WorkerSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
-        """Rebuild what `to_json` returned.
+        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
 
         Raises:
-            CrashhuntError: a crashhunt of another version wrote it.
+            CrashhuntError: a crashhunt of another version wrote it, and it needs what this one does not know.
         """
-        from crashhunt.scenario import scenario_from_dict
+        from crashhunt.scenario import Scenario, installed_backends, scenario_from_dict
 
-        if data.get("schema") != _SCHEMA:
+        tables = [backend.table for _, backend in installed_backends()] if data.get("requires") else []
+        unknown = not_understood(data, cls, Scenario, *tables)
+        if data.get("schema") != _SCHEMA or unknown:
+            how = f"with {', '.join(unknown)}, which this one does not know" if unknown else "in another way"
             raise CrashhuntError(
                 f"the snapshot has crashhunt {__version__}, and the one that replays is of a version that runs trials "
-                "in another way",
+                f"{how}",
                 fix=f"pip install crashhunt=={__version__}, or replay with --code current",
             )
         scenario = dict(data["scenario"])
         folder = Path(scenario.pop("folder"))
         notes = tuple(scenario.pop("notes", ()))
         return cls(
-            scenario=scenario_from_dict({**scenario, "notes": notes}, where="worker settings", folder=folder),
+            scenario=scenario_from_dict(
+                {**scenario, "notes": notes}, where="worker settings", folder=folder, tolerant=True
+            ),
             oracles=tuple(data["oracles"]),
             crash_on=tuple(Outcome(name) for name in data["crash_on"]),
             scratch=Path(data["scratch"]),
-            code=tuple(data["code"]),
+            code=tuple(data.get("code", ())),
             argument_files=data.get("argument_files", {}),
-            timeout_s=data["timeout_s"],
-            keep_trials=data["keep_trials"],
+            timeout_s=data.get("timeout_s", 60.0),
+            keep_trials=data.get("keep_trials", False),
             sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
             find_escapes=data.get("find_escapes", False),
             audit=data.get("audit", 0.0),

@@ -163,7 +163,7 @@ class FreshProcessExecutor:
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
-            raise CrashhuntError(**answer["error"])
+            raise CrashhuntError.from_json(answer)
         return TrialResult.from_json(answer["result"])
 
     def _job(self, number: int) -> Path:

@@ -241,7 +241,7 @@ class PoolExecutor:
         try:
             answer = json.loads(line)
             if "error" in answer:
-                raise CrashhuntError(**answer["error"])
+                raise CrashhuntError.from_json(answer)
             change = answer.get("change", True)
             if "result" in answer:
                 result = TrialResult.from_json(answer["result"])

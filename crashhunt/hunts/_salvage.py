@@ -57,7 +57,8 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
                 shutil.copy(source, to / name)
         trials = _copy_rows(found, settings, to)
         sync_tree(to)
-        write_settings(to / layout.HUNT, settings, ["crashhunt", "check", str(found.dir), "--salvage", str(to)])
+        command = ["crashhunt", "check", str(found.dir), "--salvage", str(to)]
+        write_settings(to / layout.HUNT, settings, command, like=found.dir / layout.HUNT)
     except (OSError, shutil.Error) as error:
         wrong = error if not isinstance(error, shutil.Error) else OSError(0, str(error.args[0][0][2]))
         raise cannot_write(to, wrong) from error

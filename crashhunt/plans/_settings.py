@@ -12,6 +12,7 @@ from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
 from crashhunt.base.names import near_path
+from crashhunt.base.tolerance import known_part, merged, slip
 from crashhunt.oracles import DEFAULT_ORACLES
 from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
@@ -142,14 +143,22 @@ def _flat(data: Any, prefix: str = "") -> dict[str, str]:
     return {prefix.removesuffix(".spec"): str(data)}
 
 
-def write_settings(path: Path, settings: HuntSettings, command: list[str]) -> None:
-    """Write ``hunt.toml``, with the command line as a comment on top; all of it or nothing."""
+def write_settings(path: Path, settings: HuntSettings, command: list[str], *, like: Path | None = None) -> None:
+    """Write ``hunt.toml``, with the command line as a comment on top; all of it or nothing.
+
+    Args:
+        path: of the file. What a later version has added to one that is there is kept.
+        settings: what it says.
+        command: the command line.
+        like: another file from which that is taken over instead.
+    """
     import tomli_w
 
     data = _without_none(asdict(settings))
     if not settings.events:
         del data["events"]
     data = {**_in_order(data, settings, _KEYS), "run": _in_order(data["run"], settings.run, _RUN_KEYS)}
+    data = merged(data, _added_to(like or path))
     # No line break of an argument may end the comment.
     line = shlex.join(command).replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     text = f"# {line}\n{tomli_w.dumps(data)}"
@@ -184,7 +193,21 @@ def read_settings(path: Path) -> HuntSettings:
         raise HuntDirectoryError(f"not valid TOML: {error}", fix="mend the file", where=str(path)) from None
     except OSError as error:
         raise HuntDirectoryError(f"cannot be read: {error.strerror}", where=str(path)) from None
-    return validate(HuntSettings, data, where=str(path), error=HuntDirectoryError)
+    known, later = known_part(HuntSettings, data)
+    # What looks like a key that is missing is a slip of somebody's, or damage, and no key of a later version.
+    wrong = {key: later[key] for key in [slip(later, known, HuntSettings)] if key}
+    if "run" in later and isinstance(known.get("run"), dict):
+        wrong |= {"run": merged(known["run"], later["run"])} if slip(later["run"], known["run"], RunSettings) else {}
+    return validate(HuntSettings, {**known, **wrong}, where=str(path), error=HuntDirectoryError)
+
+
+def _added_to(path: Path) -> dict[str, Any]:
+    """What a later version has added to a file, where one is there and can be read."""
+    try:
+        later: dict[str, Any] = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return later
 
 
 def _without_none(data: Any) -> Any:

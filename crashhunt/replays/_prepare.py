@@ -111,7 +111,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     environment = snapshot.environment()
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
     there, here = environment.get("cpu", ""), processor()
-    if scenario.highway is not None and there != here:
+    if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
     runs = None if code == "log" or not options.trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
@@ -173,10 +173,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     ids = dict(zip(settings.agents, other.agents, strict=True))
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
-    there = other.step_length_s
-    if other.highway is not None:
-        rate = other.highway.config.get("policy_frequency")  # where it is not said, it is once a second in most
-        there = 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0
+    there = other.backend.step_length_s(other)
     return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},

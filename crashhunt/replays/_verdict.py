@@ -20,9 +20,6 @@ __all__ = ["ReplayReport", "Verdict", "judged", "up_to"]
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 
-# On whose version everything depends that a simulator computes.
-_SIMULATORS = {"sumo": ("libsumo",), "highway": ("highway-env", "numpy"), "gym": ("gymnasium",)}
-
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
@@ -113,7 +110,7 @@ def _judge(
     if was != now:
         return "not_comparable", f"what is recorded is another: {_prologue_change(was, now)}"
     changed = environment_changes(rerun.snapshot.environment())
-    for name in _SIMULATORS.get(rerun.worker.scenario.simulator, ()):
+    for name in rerun.worker.scenario.backend.versions:
         if name in changed:
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"
     crashed = result.outcome in rerun.worker.crash_on

@@ -52,7 +52,7 @@ class Story:
         self._braking = braking
         hit = bundle.result.collision
         self.agent = bundle.driver
-        self.other = (hit.victim if hit.role == "collider" else hit.collider) if hit and hit.role != "alone" else ""
+        self.other = hit.other if hit else ""
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         tried = bundle.result.escape
         self.escape = tried.step if tried is not None else None

@@ -11,6 +11,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import ScenarioError
 from crashhunt.base.names import did_you_mean, listed, near_path
 from crashhunt.base.plugins import registered
+from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
 from crashhunt.scenario._checks import check, check_arguments, unregistered
 from crashhunt.scenario._registry import backend_names, backend_of, configurations
@@ -58,12 +59,20 @@ def endings() -> tuple[str, ...]:
     return (".toml", *(configuration.endings[0] for configuration in configurations()))
 
 
-def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path) -> Scenario:
+def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path, tolerant: bool = False) -> Scenario:
     """Validate what a ``scenario.toml`` says, without looking at the files that it names.
+
+    Args:
+        data: what it says.
+        where: the file, for the error.
+        folder: where its files are.
+        tolerant: crashhunt itself has written it, perhaps another version: keys that are not known are left out.
 
     Raises:
         ScenarioError: with the key, its value and the fix.
     """
+    if tolerant:
+        data = _known(data)
     known = {item.name for item in fields(Scenario)} - {"tables"}
     asked = {name: _table_kind(name) for name in data if name not in known}
     kinds = {name: kind for name, kind in asked.items() if kind is not None}
@@ -91,6 +100,15 @@ def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path) -> 
     if observation is None and not scenario.backend.shows_itself:
         observation = ObservationSetup()  # said in full, so that a snapshot says it too
     return replace(scenario, tables=tables, folder=folder, name=scenario.name or folder.name, observation=observation)
+
+
+def _known(data: Mapping[str, Any]) -> dict[str, Any]:
+    tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
+    rest = {name: value for name, value in data.items() if name not in tables}
+    known: dict[str, Any] = known_part(Scenario, rest)[0]
+    own = data.get("simulator")  # of which the table is no addition of a later version, known or not
+    known |= {name: value for name, value in rest.items() if name == own}
+    return {**known, **{name: known_part(kind, data[name])[0] for name, kind in tables.items()}}
 
 
 def _table_kind(name: str) -> type[Any] | None:
@@ -151,7 +169,7 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     for key in _INTERNAL:
         if key in data:
             raise ScenarioError(f"unknown key {key!r}", fix="remove it", where=str(path))
-    scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent)
+    scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)
     scenario = replace(scenario, file=path.name)
     check_arguments(scenario, kept=kept)
     agents = {agent: _beside(setup, scenario.folder) for agent, setup in scenario.agents.items()}

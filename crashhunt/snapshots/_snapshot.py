@@ -136,19 +136,31 @@ class Snapshot:
         return {value: str((self.path / place).resolve()) for value, place in found.items()}
 
     def scenario(self) -> Scenario:
-        """Return the scenario as it was."""
+        """Return the scenario as it was; it is read once."""
+        return self._scenario
+
+    @cached_property
+    def _scenario(self) -> Scenario:
         return load_scenario(self.path / "scenario" / layout.SCENARIO, kept=True)
 
     def settings(self) -> HuntSettings:
-        """Return the settings of the hunt as they were."""
+        """Return the settings of the hunt as they were; they are read once."""
+        return self._settings
+
+    @cached_property
+    def _settings(self) -> HuntSettings:
         return read_settings(self.path / layout.HUNT)
 
     def environment(self) -> dict[str, Any]:
-        """Return what was installed.
+        """Return what was installed; it is read once.
 
         Raises:
             BundleError: the file is missing or damaged.
         """
+        return self._environment
+
+    @cached_property
+    def _environment(self) -> dict[str, Any]:
         file = self.path / layout.ENVIRONMENT
         try:
             found = read_object(file)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.text import encodable
+from crashhunt.base.tolerance import known_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -50,8 +51,16 @@ class Collision:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Collision:
         """Rebuild it from plain data, in which null stands for a number that nobody knows."""
-        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in data.items()}
-        return cls(**values | {"seen_by": tuple(data["seen_by"])})
+        known = known_values(cls, data)
+        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in known.items()}
+        return cls(**values | {"seen_by": tuple(data.get("seen_by", ()))})
+
+    @property
+    def other(self) -> str:
+        """The other party; empty where the agent was alone."""
+        if self.role == "alone":
+            return ""
+        return self.victim if self.role == "collider" else self.collider
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +78,11 @@ class Escape:
     too_late: int | None
     braking: float | None
     how: str
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Escape:
+        """Rebuild it from plain data."""
+        return cls(data.get("step"), data.get("too_late"), data.get("braking"), data.get("how", ""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +104,11 @@ class Failure:
     agent: str = ""
     exit_code: int | None = None
     last_output: str = ""
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Failure:
+        """Rebuild it from plain data."""
+        return cls(**{"kind": "", "message": "", **known_values(cls, data)})
 
     def __post_init__(self) -> None:
         # It goes into JSON, a log and onto terminals, and what an exception says may be no valid text.

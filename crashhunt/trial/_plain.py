@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.integrity import typed
+from crashhunt.base.tolerance import typed_where_there
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,12 +30,9 @@ _CLOSEST = dict.fromkeys(("time_to_collision_s", "gap_m", "required_deceleration
 
 _COLLISION: dict[str, Any] = {
     **dict.fromkeys(("agent", "role", "collider", "victim", "kind", "lane"), str),
-    **dict.fromkeys(("x", "y", "collider_speed", "victim_speed"), float | None),
+    **dict.fromkeys(("x", "y", "collider_speed", "victim_speed", "time_s"), float | None),
     "seen_by": list[str],
 }
-
-
-_LATER = {"time_s": float | None}  # what earlier versions did not write
 
 
 _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_output"), str), "exit_code": int | None}
@@ -50,17 +48,23 @@ _EVENT: dict[str, Any] = {
 }
 
 
+_NEEDED = {"collision": ("agent", "role", "collider"), "event": ("kind", "agent", "what")}
+
+
 def check_plain(data: Mapping[str, Any]) -> None:
     """See that plain data has the types that `TrialResult.from_json` takes for granted.
 
     Raises:
         ValueError: with what is not as it should be.
     """
-    typed(data, {"outcome": str, "steps": int, "sim_time_s": float, "digest": str, "wall_s": float, "spec": dict})
-    typed(data["spec"], _SPEC)
-    typed({"events": data.get("events")}, {"events": dict | None})  # which there was not always
+    typed(data, {"outcome": str, "steps": int, "spec": dict})
+    typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
+    typed(data["spec"], dict.fromkeys(("number", "seed", "max_steps"), int))
+    typed_where_there(data["spec"], _SPEC)
+    typed({"events": data.get("events")}, {"events": dict | None})
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
-    check_parts(data["closest"], data["collision"], data["failure"], data.get("escape"), data.get("event"))
+    parts = (data.get(name) for name in ("collision", "failure", "escape", "event"))
+    check_parts(data.get("closest", {}), *parts)
     if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
         raise ValueError("a number is below 0")
 
@@ -78,5 +82,5 @@ def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, 
     ):  # fmt: skip
         typed({name: part}, {name: dict if name == "closest" else dict | None})
         if part is not None:
-            typed(part, types)
-            typed(part, {key: kind for key, kind in _LATER.items() if key in part})
+            typed(part, {key: types[key] for key in _NEEDED.get(name, ())})
+            typed_where_there(part, types)

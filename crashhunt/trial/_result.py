@@ -72,18 +72,18 @@ class TrialResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TrialResult:
-        """Rebuild what `to_json` returned."""
-        hit, failure, event, escape = data["collision"], data["failure"], data.get("event"), data.get("escape")
+        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default."""
+        hit, failure, event, escape = (data.get(name) for name in ("collision", "failure", "event", "escape"))
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=outcome_of(data),
-            closest=ClosestApproach.from_json(data["closest"]),
+            closest=ClosestApproach.from_json(data.get("closest") or {}),
             collision=Collision.from_json(hit) if hit else None,
-            failure=Failure(**failure) if failure else None,
-            escape=Escape(**escape) if escape else None,
+            failure=Failure.from_json(failure) if failure else None,
+            escape=Escape.from_json(escape) if escape else None,
             event=Event.from_json(event) if event else None,
             events=data.get("events"),
-            **{name: data[name] for name in _PLAIN},
+            **{name: data[name] for name in _PLAIN if name in data},
         )
 
     @property
@@ -91,12 +91,11 @@ class TrialResult:
         """The outcome in one line, for people."""
         if self.collision is not None:
             hit = self.collision
-            other = hit.victim if hit.role == "collider" else hit.collider
             if hit.role == "alone":
                 what = "left the road" if self.outcome is Outcome.OFF_ROAD else f"crashed ({hit.kind})"
                 return f"{hit.agent} {what} at step {self.steps}"
             verb = "drove into" if hit.role == "collider" else "was hit by"
-            return f"{hit.agent} {verb} {other} at step {self.steps}"
+            return f"{hit.agent} {verb} {hit.other} at step {self.steps}"
         if self.event is not None:
             return f"{self.event.what}, at step {self.steps}"
         if self.failure is not None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.tolerance import ESSENTIAL, known_values, not_understood, required_of
+from crashhunt.base.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,12 +50,13 @@ class TrialSpec:
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     max_steps: int
-    overruled: Overruled | None = None
+    overruled: Overruled | None = field(default=None, metadata=ESSENTIAL)
     parent: int | None = None
     origin: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dicts and numbers."""
+        requires = required_of(self)
         return {
             "number": self.number,
             "seed": self.seed,
@@ -61,19 +66,30 @@ class TrialSpec:
             **({"overruled": asdict(self.overruled)} if self.overruled else {}),
             **({"parent": self.parent} if self.parent is not None else {}),
             **({"origin": self.origin} if self.origin else {}),
+            **({"requires": requires} if requires else {}),
         }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TrialSpec:
-        """Rebuild what `to_json` returned."""
+        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
+
+        Raises:
+            CrashhuntError: it needs what this version does not know.
+        """
+        unknown = not_understood(data, cls)
+        if unknown:
+            raise CrashhuntError(
+                f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not know",
+                fix="use the version that wrote it",
+            )
         overruled = data.get("overruled")
         return cls(
             data["number"],
             data["seed"],
-            data["arguments"],
-            data["scenario_arguments"],
+            data.get("arguments", {}),
+            data.get("scenario_arguments", {}),
             max_steps=data["max_steps"],
-            overruled=Overruled(**overruled) if overruled else None,
+            overruled=Overruled(**known_values(Overruled, overruled)) if overruled else None,
             parent=data.get("parent"),
             origin=data.get("origin", ""),
         )

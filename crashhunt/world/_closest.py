@@ -6,6 +6,8 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from crashhunt.base.tolerance import known_values
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -32,5 +34,5 @@ class ClosestApproach:
 
     @classmethod
     def from_json(cls, data: Mapping[str, float | None]) -> ClosestApproach:
-        """Rebuild what `to_json` returned."""
-        return cls(**{name: math.inf if value is None else value for name, value in data.items()})
+        """Rebuild what `to_json` returned; what a later version has added is left out."""
+        return cls(**{name: math.inf if value is None else value for name, value in known_values(cls, data).items()})
