@@ -14,7 +14,8 @@ from crashhunt.base.plugins import load_attribute, registered
 from crashhunt.scenario._backend import Backend
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
+    from importlib.metadata import EntryPoint
 
     from crashhunt.scenario._backend import Configuration
 
@@ -28,9 +29,15 @@ def _own() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in pkgutil.iter_modules(crashhunt.scenario.backends.__path__)))
 
 
+@cache
+def _others() -> Mapping[str, EntryPoint]:
+    # Once a process: every look at entry points reads through all that is installed, and every crash asks for versions.
+    return registered("backends")
+
+
 def backend_names() -> tuple[str, ...]:
     """Return the simulators that have a descriptor, those that come with crashhunt first; nothing is imported."""
-    return tuple(dict.fromkeys((*_own(), *registered("backends"))))
+    return tuple(dict.fromkeys((*_own(), *_others())))
 
 
 @cache
@@ -46,7 +53,7 @@ def backend_of(name: str) -> Backend | None:
     if name in _own():
         own: Backend = importlib.import_module(f"crashhunt.scenario.backends.{name}").BACKEND
         return own
-    point = registered("backends").get(name) if ":" not in name else None
+    point = _others().get(name)
     if point is None:
         return None
     found = load_attribute(point.value, shown=name)

@@ -70,7 +70,7 @@ class TestToy(_Written):
 
 
 def test_what_comes_with_crashhunt_is_found_without_entry_points(monkeypatch):
-    monkeypatch.setattr("crashhunt.scenario._registry.registered", lambda _: {})
+    monkeypatch.setattr("crashhunt.scenario._registry._others", dict)
     assert {"gym", "highway", "sumo", "toy"} <= set(backend_names())
     assert backend_of("a.module:Simulator") is None
 
@@ -91,7 +91,7 @@ class Point:
 def test_a_broken_backend_is_an_error_where_it_is_asked_for_and_nowhere_else(monkeypatch, target, says):
     from crashhunt.scenario import installed_backends
 
-    monkeypatch.setattr("crashhunt.scenario._registry.registered", lambda _: {"other": Point(target)})
+    monkeypatch.setattr("crashhunt.scenario._registry._others", lambda: {"other": Point(target)})
     with pytest.raises(PluginError) as caught:
         backend_of("other")
     assert says in str(caught.value)
@@ -145,6 +145,11 @@ def test_a_table_of_nobody_is_refused(tmp_path, changes, says):
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "notes" not in str(caught.value)  # nor what is no key of a file
+
+
+def test_a_table_that_an_older_crashhunt_sends_as_nothing_is_none():
+    sent = {"simulator": "toy", "sumo": None, "highway": None}
+    assert scenario_from_dict(sent, where="worker settings", folder=Path()).tables == {}
 
 
 def test_what_ran_before_with_a_table_that_nobody_used_still_runs(tmp_path):
