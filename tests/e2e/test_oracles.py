@@ -28,7 +28,7 @@ class Fast:
         row = scene.roster.index["ego"]
         if self.steps < 2 or scene.speeds[row] <= self.above:
             return []
-        what = f"ego: {scene.speeds[row]:.0f} m/s on {len(self.map or ())} lanes, {self.steps} steps after it began"
+        what = f"ego: {scene.speeds[row]:.0f} m/s on {len(self.map)} lanes, {self.steps} steps after it began"
         return [Finding(Outcome("too_fast"), event=Event("too_fast", "ego", what))]
 """
 
