@@ -37,7 +37,7 @@ def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where all the hunts of a command run, whatever each of them says."""
     for option in hunt_options():
         if option.about.anywhere:
-            _add(parser, option)
+            _add(parser, option, help_text=option.help_with("as each hunt says"))
     parser.set_defaults(**{option.name: None for option in hunt_options() if option.about.anywhere})
 
 
@@ -47,18 +47,18 @@ def chosen_of_machine(given: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _add(group: argparse._ActionsContainer, option: HuntOption) -> None:
+def _add(group: argparse._ActionsContainer, option: HuntOption, help_text: str = "") -> None:
     about = option.about
     if option.form == "flag":
         action = "store_false" if option.default else "store_true"
-        group.add_argument(about.flag, action=action, dest=option.name, help=option.help)
+        group.add_argument(about.flag, action=action, dest=option.name, help=help_text or option.help)
         return
     words: dict[str, Any] = {"default": option.default}
     if option.form in ("integer", "number"):
         words["type"] = integer if option.form == "integer" else number
     elif option.form == "table" or (option.form == "list" and not about.separator):
         words = {"action": "append", "default": [], "type": Path if about.metavar == "PATH" else None}
-    group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=option.help, **words)
+    group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=help_text or option.help, **words)
 
 
 def _value(option: HuntOption, given: Any) -> Any:

@@ -108,7 +108,11 @@ class HuntOption:
         said = self.about.unset
         if self.form in ("integer", "number", "text") and self.default not in ("", None):
             said = f"{self.default:g}" if self.form == "number" else str(self.default)
-        return f"{self.about.help or self.about.meaning}{f'; default: {said}' if said else ''}"
+        return self.help_with(said)
+
+    def help_with(self, default: str) -> str:
+        """What the command line says of it, with another default."""
+        return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
     def checked(self, value: Any) -> Any:
         """Return a value of this option, plain where it was NumPy's.

@@ -36,7 +36,6 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         CrashhuntError: with what is wrong with it.
     """
     request = request.checked()
-    run = sized(request.run)
     scenario = load_scenario(request.scenario, ego=request.ego)
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
@@ -63,14 +62,15 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         events=limits,
         agents=_agents(request, scenario, signatures, hunted=hunted),
         scenario_arguments=_scenario_arguments(request, scenario, hunted=hunted),
-        run=run,
+        run=request.run,
     )
     if request.action:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
-    scenario = _with_untold(_noted(scenario, run), crash_on)
+    scenario = _with_untold(_noted(scenario, request.run), crash_on)
     NamedSampler(settings.sampler, settings.space, points=settings.points)  # it refuses what it cannot sample
-    return scenario, settings
+    # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
+    return scenario, replace(settings, run=sized(settings.run))
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
