@@ -44,12 +44,15 @@ def _trials(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.hunts import HuntResults, write_parquet, write_text
     from crashhunt.trial import Outcome, in_order
 
-    hunt = HuntResults(options.directory)
-    known = in_order([*Outcome, *hunt.settings.crash_on])  # an oracle may have brought some
     outcomes = [name for name in options.outcome.split(",") if name]
+    brought: tuple[Outcome, ...] = ()  # by oracles of the hunt
+    if any(name not in list(Outcome) for name in outcomes) and options.directory.exists():
+        brought = HuntResults(options.directory).settings.crash_on
+    known = in_order([*Outcome, *brought])
     for name in outcomes:
         if name not in known:
             raise UsageError(f"--outcome {name!r} is none", fix=one_of(name, known, give="give some of"))
+    hunt = HuntResults(options.directory)
     if options.out is None:
         if options.format == "parquet":
             raise UsageError("--format parquet is nothing for a terminal", fix="give --out FILE")
