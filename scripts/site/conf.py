@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 _PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 project = _PROJECT["name"]
+project_copyright = "2026, The crashhunt authors"
 author = _PROJECT["authors"][0]["name"]
 release = crashhunt.__version__
 extensions = ["myst_parser", "sphinx_copybutton"]
