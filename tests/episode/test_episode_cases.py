@@ -208,7 +208,8 @@ def test_the_same_is_drawn_in_every_run(run, monkeypatch):
     run(other)
     assert seeded == [77]
     random.seed(77)
-    assert other.asked[0][3] == random.random()
+    np.random.seed(77)  # noqa: NPY002
+    assert other.asked[0][3:] == (random.random(), np.random.random())  # noqa: NPY002
 
 
 def test_actors_are_told_of_once_and_rosters_when_they_change(run):
@@ -405,14 +406,18 @@ def test_what_an_oracle_or_our_own_files_raise_ends_it(run, error, outcome):
 
 
 def test_an_oracle_of_somebody_elses_is_asked_with_the_others(run):
+    seen = []  # how late it was in the scene before
+
     class Sees:
         name = "sees"
 
         def check(self, scene, agents):
+            seen.append(scene.previous and scene.previous.time_s)
             hit = Collision("ego", "collider", "ego", "other", (self.name,))
             return [Finding(Outcome.COLLISION, hit)] if scene.time_s == 1.0 else []
 
     result = run(oracles=(Overlap(), Sees()))
+    assert seen == [None, 0.0, 0.5]
     assert (result.outcome, result.steps, result.collision.seen_by) == (Outcome.COLLISION, 2, ("sees",))
 
 
