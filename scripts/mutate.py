@@ -96,15 +96,17 @@ def modules_of(name: str) -> list[Path]:
 
 
 def nearest_tests(file: Path) -> tuple[Path, ...]:
-    """Return the test files that lie as a module does."""
+    """Return the test files that lie as a module does: of its name, or of its folder, or of the folder above that."""
     words = file.stem.strip("_").split("_")
-    folder = ROOT / "tests" / file.parent.relative_to("crashhunt")
-    for places in (folder.glob, (ROOT / "tests").rglob):
+    inner = ROOT / "tests" / file.parent.relative_to("crashhunt")
+    for folder in (inner, *inner.parents):
+        if folder == ROOT / "tests":
+            break
         for count in range(len(words), 0, -1):  # of `_ledger_file`, those of `ledger` are better than none
-            found = sorted(places(f"test_{'_'.join(words[:count])}*.py")) if words[0] != "init" else []
+            found = sorted(folder.glob(f"test_{'_'.join(words[:count])}*.py"))
             if found:
                 return tuple(path.relative_to(ROOT) for path in found)
-        if folder.is_dir() and folder != ROOT / "tests":
+        if folder.is_dir():
             return tuple(sorted(path.relative_to(ROOT) for path in folder.glob("test_*.py")))
     return ()
 
