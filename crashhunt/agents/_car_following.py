@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.agents._forms import meta_actions, wanted_meta_action
 from crashhunt.trial import Argument, Range
@@ -48,7 +48,7 @@ class Leader:
     closing_speed: float
 
 
-def check_layout(space: Space[Any] | None) -> None:
+def check_layout(space: Space[object] | None) -> None:
     """Refuse an observation space that does not have the columns which are read here.
 
     Raises:
@@ -200,8 +200,8 @@ class CarFollowing:
         ] = 6.0,
         desired_speed: Annotated[float, Argument("desired_speed", unit="m/s", help="on a free road")] = 25.0,
         step_length_s: float = 0.1,
-        observation_space: Space[Any] | None = None,
-        action_space: Space[Any] | None = None,
+        observation_space: Space[object] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         if not delay_s >= 0:
             raise ValueError(f"delay_s must be at least 0, not {delay_s}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.faculties import offers
 from crashhunt.simulators import HasMeanings
@@ -18,7 +18,7 @@ _ALL = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 _FASTER, _SLOWER = 0.5, -0.75  # m/s²
 
 
-def meta_actions(space: Space[Any] | None) -> Mapping[str, int] | None:
+def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
     """Return the numbers of the meta-actions; None where actions are (target speed, lane change).
 
     What a space does not have, such as a lane change where only the speed is controlled, is IDLE.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.agents._car_following import CAR_LENGTH_M, VX, Leader, X, actors, find_leader, idm_acceleration, off_path
 from crashhunt.agents._forms import wanted_meta_action
@@ -53,8 +53,8 @@ class IntelligentDriver(LaneChanger):
         gain: Annotated[float, Argument("gain", unit="m/s²", help="worth a lane change")] = 0.2,
         patience_s: Annotated[float, Argument("patience_s", unit="s", help="between two decisions")] = 1.0,
         step_length_s: float = 0.1,
-        observation_space: Space[Any] | None = None,
-        action_space: Space[Any] | None = None,
+        observation_space: Space[object] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         super().__init__(
             blind_spot_m=0.0,

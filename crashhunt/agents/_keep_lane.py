@@ -29,7 +29,7 @@ class KeepLaneWithSpeed:
         speed: Annotated[
             float, Argument("speed", distribution=Range(5.0, 30.0), unit="m/s", help="held for ever")
         ] = 15.0,
-        action_space: Space[Any] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         self.speed = speed
         self._meta = meta_actions(action_space)

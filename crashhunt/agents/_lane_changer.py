@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.agents._car_following import (
     CAR_LENGTH_M,
@@ -66,8 +66,8 @@ class LaneChanger:
             float, Argument("desired_speed", distribution=Range(15.0, 30.0), unit="m/s", help="on a free road")
         ] = 22.0,
         step_length_s: float = 0.1,
-        observation_space: Space[Any] | None = None,
-        action_space: Space[Any] | None = None,
+        observation_space: Space[object] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         if not step_length_s > 0:
             raise ValueError(f"step_length_s must be above 0, not {step_length_s}")

@@ -45,8 +45,8 @@ class NumpyPolicy:
         self,
         path: Annotated[str, Argument("path", help="of the weights, an .npz file")],
         step_length_s: float = 1.0,
-        observation_space: Space[Any] | None = None,
-        action_space: Space[Any] | None = None,
+        observation_space: Space[object] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         check_layout(observation_space)
         self._meta = meta_actions(action_space)

@@ -45,8 +45,8 @@ class StableBaselines3:
         path: Annotated[str, Argument("path", help="of the saved model, a .zip file")],
         algorithm: Annotated[str, Argument("algorithm", help=f"its class: {', '.join(_ALGORITHMS)}")] = "PPO",
         deterministic: Annotated[bool, Argument("deterministic", help="the most probable action")] = True,
-        observation_space: Space[Any] | None = None,
-        action_space: Space[Any] | None = None,
+        observation_space: Space[object] | None = None,
+        action_space: Space[object] | None = None,
     ) -> None:
         module, _, name = algorithm.rpartition(":")
         if not module and name not in _ALGORITHMS:
@@ -92,8 +92,8 @@ class _Network(ABC):
         self,
         path: Annotated[str, Argument("path", help="of the weights, with their layers")],
         flatten: Annotated[bool, Argument("flatten", help="observations as one row of numbers")] = True,
-        action_space: Space[Any] | None = None,
-        observation_space: Space[Any] | None = None,
+        action_space: Space[object] | None = None,
+        observation_space: Space[object] | None = None,
     ) -> None:
         try:
             self._load(path)
@@ -106,7 +106,7 @@ class _Network(ABC):
         if observation_space is not None and observation_space.shape is not None:
             self._try(path, observation_space)
 
-    def _try(self, path: str, shown: Space[Any]) -> None:
+    def _try(self, path: str, shown: Space[object]) -> None:
         """Ask once, to find out whether observations go in and actions come out."""
         blank = np.zeros(shown.shape or (), np.float32)
         batch = blank.reshape(1, -1) if self._flatten else blank[None]
@@ -131,7 +131,7 @@ class _Network(ABC):
         """Load the library and the weights."""
 
     @abstractmethod
-    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return a value for each discrete action, or the continuous action, of each observation of a batch."""
 
     def act(self, observation: Any) -> Any:
@@ -180,9 +180,9 @@ class TorchPolicy(_Network):
         """Seed the generator of PyTorch."""
         self._torch.manual_seed(seed)
 
-    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
         with self._torch.inference_mode():
-            answer: NDArray[Any] = self._module(self._torch.from_numpy(batch)).numpy()
+            answer: NDArray[np.generic] = self._module(self._torch.from_numpy(batch)).numpy()
         return answer
 
 
@@ -211,8 +211,8 @@ class OnnxPolicy(_Network):
     def reset(self, seed: int) -> None:
         """Nothing to forget."""
 
-    def _answer(self, batch: NDArray[np.float32]) -> NDArray[Any]:
-        answer: NDArray[Any] = self._session.run(None, {self._input: batch})[0]
+    def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
+        answer: NDArray[np.generic] = self._session.run(None, {self._input: batch})[0]
         return answer
 
 
@@ -245,7 +245,7 @@ def _choices(space: Any) -> Any:
     return type(space).__name__, _shape(space), sizes
 
 
-def _count(space: Space[Any] | None) -> int:
+def _count(space: Space[object] | None) -> int:
     """How many numbers a network answers with: one for each discrete action, or the continuous action itself."""
     from gymnasium.spaces import Discrete
 

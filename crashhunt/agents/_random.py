@@ -22,7 +22,7 @@ class RandomAgent:
 
     def __init__(
         self,
-        action_space: Space[Any],
+        action_space: Space[object],
         hold_steps: Annotated[int, Argument("hold_steps", unit="steps", help="before it draws again")] = 10,
     ) -> None:
         if hold_steps < 1:

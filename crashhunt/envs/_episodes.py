@@ -21,6 +21,7 @@ from crashhunt.trial import TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
     from gymnasium import Space
     from numpy.typing import NDArray
 
@@ -65,14 +66,14 @@ class Episodes:
         self._form = self._simulator.actions[self.agent]
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
         self._episode: Episode | None = None
-        self.observation_space: Space[Any] = self._simulator.observation_spaces[self.agent]
-        self.action_space: Space[Any] = self._form.space
+        self.observation_space: Space[object] = self._simulator.observation_spaces[self.agent]
+        self.action_space: Space[object] = self._form.space
         self.step_length_s = self._simulator.step_length_s
         self._trail = _Trail(round(_TRAIL_S / self.step_length_s) + 1)
         self._crash_step = -1
         self._borders: Any = None
 
-    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
+    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[np.generic], dict[str, Any]]:
         """Begin an episode; return the observation and the info."""
         if self._episode is not None:
             self._episode.close()
@@ -85,7 +86,7 @@ class Episodes:
         self._crash_step, self._borders = -1, None
         return self._episode.observations[self.agent], {"sim_time_s": self._trail.scenes[-1].time_s}
 
-    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, dict[str, Any]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""
         encoded = self._form.encode(action)  # here, where it is an error of the caller's, and the episode goes on
         episode = self._episode
@@ -108,7 +109,7 @@ class Episodes:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
 
-    def picture(self) -> NDArray[Any]:
+    def picture(self) -> NDArray[np.generic]:
         """Return the scene from above, uint8, shape (540, 960, 3)."""
         from crashhunt.recording import lane_borders
         from crashhunt.render import SceneView
@@ -126,7 +127,7 @@ class Episodes:
         )
         view: Any = SceneView
         width, height = _SIZE
-        drawn: NDArray[Any] = view(
+        drawn: NDArray[np.generic] = view(
             seen, self._borders, agent=self.agent, width=width, height=height, crash_step=self._crash_step
         ).draw(steps)
         return drawn

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    import numpy as np
     from gymnasium import Space
     from numpy.typing import NDArray
 
@@ -45,24 +46,24 @@ class RemoteEpisodes:
         self._pipe = here
         self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
         found = self._ask("made", str(scenario), agent, action)
-        self.observation_space: Space[Any] = found["observation_space"]
-        self.action_space: Space[Any] = found["action_space"]
+        self.observation_space: Space[object] = found["observation_space"]
+        self.action_space: Space[object] = found["action_space"]
         self.step_length_s: float = found["step_length_s"]
         self.agent: str = found["agent"]
 
-    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[Any], dict[str, Any]]:
+    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[np.generic], dict[str, Any]]:
         """Begin an episode."""
-        found: tuple[NDArray[Any], dict[str, Any]] = self._ask("reset", seed, dict(arguments))
+        found: tuple[NDArray[np.generic], dict[str, Any]] = self._ask("reset", seed, dict(arguments))
         return found
 
-    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, dict[str, Any]]:
         """Advance one control step."""
-        found: tuple[NDArray[Any], float, bool, dict[str, Any]] = self._ask("step", action)
+        found: tuple[NDArray[np.generic], float, bool, dict[str, Any]] = self._ask("step", action)
         return found
 
-    def picture(self) -> NDArray[Any]:
+    def picture(self) -> NDArray[np.generic]:
         """Return the scene from above."""
-        found: NDArray[Any] = self._ask("picture")
+        found: NDArray[np.generic] = self._ask("picture")
         return found
 
     def close(self) -> None:

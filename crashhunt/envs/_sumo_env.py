@@ -17,6 +17,7 @@ from crashhunt.envs._process import RemoteEpisodes
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
 __all__ = ["SumoEnv"]
@@ -86,7 +87,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[Any], dict[str, Any]]:
+    ) -> tuple[NDArray[np.generic], dict[str, Any]]:
         """Begin an episode.
 
         Args:
@@ -98,7 +99,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._steps = 0
         return self._episodes.reset(drawn, (options or {}).get("arguments", {}))
 
-    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, bool, dict[str, Any]]:
         """Advance one control step.
 
         Raises:
@@ -110,7 +111,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         truncated = not terminated and self._max_steps is not None and self._steps >= self._max_steps
         return observation, reward, terminated, truncated, info
 
-    def render(self) -> NDArray[Any] | None:
+    def render(self) -> NDArray[np.generic] | None:
         """Return the scene from above, where ``render_mode`` asks for it.
 
         Raises:

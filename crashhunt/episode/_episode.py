@@ -105,7 +105,7 @@ class Episode:
         self._checks: list[Callable[[Scene, Sequence[str]], Sequence[Finding]]] = []
         self._max_steps = spec.max_steps
         self._nothing: tuple[float, ...] = ()
-        self._encoders: list[Callable[[Any], NDArray[Any]]] = []
+        self._encoders: list[Callable[[Any], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[Any], Any]] = {}
         # Only those that want to be told are called: this is done several times a step.
         self._on_begin = [one.begin for one in observers if type(one).begin is not Observer.begin]
@@ -135,7 +135,7 @@ class Episode:
         self.setup_s = time.monotonic() - began
         return self.result
 
-    def step(self, given: Mapping[str, NDArray[Any]] = _ASK_ALL) -> TrialResult | None:
+    def step(self, given: Mapping[str, NDArray[np.generic]] = _ASK_ALL) -> TrialResult | None:
         """Ask the agents, advance the simulator by one step, and judge what has come of it.
 
         Args:
@@ -153,7 +153,7 @@ class Episode:
         # This runs a million times a hunt: it is one function, looks up little, and does nothing twice.
         try:
             names, agents, observations, unflatten = self.names, self.agents, self.observations, self._unflatten
-            actions: dict[str, NDArray[Any]] = {}
+            actions: dict[str, NDArray[np.generic]] = {}
             for number in self.acting:
                 name = names[number]
                 observation: Any = observations[name]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
@@ -24,7 +25,7 @@ class Observer:
     def begin(self, episode: Episode) -> None:
         """The simulator has been reset, and `Episode.names` says who takes part; no agent has been made yet."""
 
-    def observation(self, number: int, observation: NDArray[Any]) -> None:
+    def observation(self, number: int, observation: NDArray[np.generic]) -> None:
         """An agent is about to be shown something.
 
         Args:
@@ -32,7 +33,7 @@ class Observer:
             observation: as it is recorded: flattened, where the agent is shown something structured.
         """
 
-    def action(self, number: int, action: NDArray[Any]) -> None:
+    def action(self, number: int, action: NDArray[np.generic]) -> None:
         """An agent has answered.
 
         Args:

@@ -70,11 +70,11 @@ class Recorder(Observer):
             channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 
-    def observation(self, number: int, observation: NDArray[Any]) -> None:
+    def observation(self, number: int, observation: NDArray[np.generic]) -> None:
         """Record what an agent is about to be shown."""
         self._box.observation(number, observation)
 
-    def action(self, number: int, action: NDArray[Any]) -> None:
+    def action(self, number: int, action: NDArray[np.generic]) -> None:
         """Record what an agent answered."""
         self._box.action(number, action)
 

@@ -136,7 +136,7 @@ class HuntResults:
             raise UsageError(f"trial {number} has not ended", fix=f"{self.state.trials_run} trials have")
         return found
 
-    def trials(self) -> NDArray[Any]:
+    def trials(self) -> NDArray[np.generic]:
         """Return a row per trial, as a structured array, shape (trials,).
 
         Its fields are those of ``crashhunt trials``; times in s, distances in m, decelerations in m/s². A number that
@@ -255,7 +255,7 @@ def _row(data: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
     return {name: values.get(name) for name in columns}
 
 
-def _column(values: list[Any]) -> NDArray[Any]:
+def _column(values: list[Any]) -> NDArray[np.generic]:
     if not values:
         return np.empty(0)
     if all(isinstance(value, bool) for value in values):

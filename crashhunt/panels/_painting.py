@@ -258,7 +258,7 @@ def _matrix_of(values: ArrayLike) -> NDArray[np.float64]:
     return matrix
 
 
-def _limits(values: NDArray[Any], low: float | None, high: float | None) -> tuple[float, float]:
+def _limits(values: NDArray[np.generic], low: float | None, high: float | None) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     least, most = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     lower, upper = _numbers([least if low is None else low, most if high is None else high]).tolist()
@@ -273,7 +273,7 @@ def _numbers(values: ArrayLike) -> NDArray[np.float64]:
     return found
 
 
-def _finite_runs(x: NDArray[Any], y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _finite_runs(x: NDArray[np.generic], y: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """The stretches of a curve that have values."""
     there = np.isfinite(y) & np.isfinite(x)
     if there.all():

@@ -29,6 +29,7 @@ from crashhunt.trial import Outcome, TrialResult, TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
@@ -197,7 +198,7 @@ class _Panels(Observer):
             space = episode.simulator.actions[name].space
             save_meanings(self._folder, name, space.meanings if offers(space, HasMeanings) else ())
 
-    def action(self, number: int, action: NDArray[Any]) -> None:
+    def action(self, number: int, action: NDArray[np.generic]) -> None:
         name, step = self._episode.names[number], self._episode.steps + 1
         agent = self._episode.agents[name]
         agent = agent.agent if isinstance(agent, _Stopped) else agent

@@ -29,7 +29,7 @@ class SpeedAndLaneChange:
         from gymnasium import spaces
 
         speed = spaces.Box(0.0, MAX_TARGET_SPEED, (), np.float64)
-        self.space: Space[Any] = spaces.Tuple((speed, spaces.Discrete(3, start=-1)))
+        self.space: Space[object] = spaces.Tuple((speed, spaces.Discrete(3, start=-1)))
 
     def encode(self, action: Any) -> NDArray[np.float64]:
         """Return float64, shape (2,)."""
@@ -59,7 +59,7 @@ class SpaceAction:
 
     names: tuple[str, ...] = ()
 
-    def __init__(self, space: Space[Any]) -> None:
+    def __init__(self, space: Space[object]) -> None:
         self.space = space
         self._dtype = np.dtype(space.dtype)
 
@@ -97,7 +97,7 @@ class MetaAction(SpaceAction):
         return super().encode(action).reshape(1)
 
 
-def cast(action: object, dtype: np.dtype[Any]) -> NDArray[Any]:
+def cast(action: object, dtype: np.dtype[Any]) -> NDArray[np.generic]:
     """Return an action as an array of a type; an encoded one stays as it is.
 
     Raises:

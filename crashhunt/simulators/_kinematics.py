@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from math import atan2, cos, sin
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class Kinematics:
         self._blank = (0.0,) * len(self.features)
 
     @property
-    def space(self) -> Space[Any]:
+    def space(self) -> Space[object]:
         """The Gymnasium space: highway-env's, with bounds that no simulation reaches instead of infinite ones."""
         from gymnasium import spaces
 

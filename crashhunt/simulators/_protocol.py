@@ -56,7 +56,7 @@ class ActionForm(Protocol):
     """How the actions of one agent are written."""
 
     @property
-    def space(self) -> Space[Any]:
+    def space(self) -> Space[object]:
         """The Gymnasium space."""
 
     @property
@@ -86,7 +86,7 @@ class Simulator(Protocol):
         """The agents that act in the next step; those that have terminated are gone."""
 
     @property
-    def observation_spaces(self) -> Mapping[str, Space[Any]]:
+    def observation_spaces(self) -> Mapping[str, Space[object]]:
         """For every possible agent."""
 
     @property
@@ -141,7 +141,7 @@ class FlattensObservations(Protocol):
     """A simulator whose observations are structured, and that hands out flattened arrays, which can be recorded."""
 
     @property
-    def shown_spaces(self) -> Mapping[str, Space[Any]]:
+    def shown_spaces(self) -> Mapping[str, Space[object]]:
         """The Dict or Tuple space into which an agent's observations are unflattened before it is shown them.
 
         Only of agents for which that is so; callable after `Simulator.reset`.

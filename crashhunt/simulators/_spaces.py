@@ -33,17 +33,17 @@ class ObservationForm:
         ScenarioError: the space has no fixed size.
     """
 
-    def __init__(self, space: Space[Any]) -> None:
+    def __init__(self, space: Space[object]) -> None:
         self.original = space
         self.flattened = not isinstance(space, _ARRAYS)
         if self.flattened and not space.is_np_flattenable:
             raise ScenarioError(
                 f"observations of the space {space} have no fixed size", fix="wrap the environment so that they have"
             )
-        self.space: Space[Any] = spaces.flatten_space(space) if self.flattened else space
+        self.space: Space[object] = spaces.flatten_space(space) if self.flattened else space
         self._dtype = np.dtype(self.space.dtype)
 
-    def encode(self, observation: object) -> NDArray[Any]:
+    def encode(self, observation: object) -> NDArray[np.generic]:
         """Return an array of its own, of the type and shape of `space`."""
         if self.flattened:
             observation = spaces.flatten(self.original, observation)
@@ -59,7 +59,7 @@ class FlatAction:
 
     names: tuple[str, ...] = ()
 
-    def __init__(self, space: Space[Any]) -> None:
+    def __init__(self, space: Space[object]) -> None:
         if not space.is_np_flattenable:
             raise ScenarioError(f"actions of the space {space} have no fixed size", fix="wrap the environment")
         self.space = space
@@ -67,7 +67,7 @@ class FlatAction:
 
     def encode(self, action: object) -> NDArray[np.generic]:
         """Return the flattened action; one that is flattened already stays as it is."""
-        array: NDArray[Any] = np.empty(0)
+        array: NDArray[np.generic] = np.empty(0)
         try:
             if isinstance(action, np.ndarray) and action.shape == self._flat.shape:
                 array = cast(action, np.dtype(self._flat.dtype))
@@ -92,7 +92,7 @@ def _any_masked(action: object) -> bool:
     return is_masked(action) or any(map(_any_masked, parts))
 
 
-def action_form(space: Space[Any]) -> ActionForm:
+def action_form(space: Space[object]) -> ActionForm:
     """Return how the actions of a space are written."""
     return SpaceAction(space) if isinstance(space, _ARRAYS) else FlatAction(space)
 

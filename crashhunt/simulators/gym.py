@@ -101,7 +101,7 @@ class GymSimulator:
         """Close the environment."""
         self._env.close()
 
-    def _shown(self, observation: Any) -> NDArray[Any]:
+    def _shown(self, observation: Any) -> NDArray[np.generic]:
         """An observation as it is recorded; one that is not what the environment promises is told, once a hunt.
 
         The episode goes on: what an agent makes of it is its own business, and many environments stray by a rounding.

@@ -213,8 +213,8 @@ class HighwaySimulator:
         self._kinds = dict(zip(self._possible, kinds, strict=True))
         self.actions: dict[str, ActionForm] = {agent: _form(kind) for agent, kind in self._kinds.items()}
         self._forms = dict(zip(self._possible, map(ObservationForm, seen), strict=True))
-        self.observation_spaces: dict[str, Space[Any]]
-        self.shown_spaces: dict[str, Space[Any]] = {}
+        self.observation_spaces: dict[str, Space[object]]
+        self.shown_spaces: dict[str, Space[object]] = {}
         if self._kinematics is not None:
             self.observation_spaces = dict.fromkeys(self._possible, self._kinematics.space)
             self.observation_names = self._kinematics.features
