@@ -5,7 +5,7 @@ What fits to the letter is built without pydantic, whose import and schemas are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import EnumType
 from functools import cache
@@ -82,7 +82,7 @@ def _built(kind: Any, data: Any) -> Any:
         return data
     if ((origin is tuple and inner[1:] == (...,)) or origin is Sequence) and type(data) in (list, tuple):
         return tuple(_built(inner[0], item) for item in data)
-    if origin is dict and type(data) is dict:
+    if origin in (dict, Mapping) and type(data) is dict:
         return {_built(inner[0], key): _built(inner[1], value) for key, value in data.items()}
     if kind is float and type(data) is int and abs(data) < 2**53:
         return float(data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tomllib
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -168,9 +168,13 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str], *, li
 
 def _in_order(data: dict[str, Any], settings: HuntSettings | RunSettings, first: tuple[str, ...]) -> dict[str, Any]:
     """What every version knows, in its order; then what came later, where it is not as it was before it came."""
-    later = (item for item in fields(settings) if item.name not in first and item.default_factory is MISSING)
-    asked = [item.name for item in later if getattr(settings, item.name) != item.default]
+    later = (item for item in fields(settings) if item.name not in first)
+    asked = [item.name for item in later if getattr(settings, item.name) not in (_default(item), None)]
     return {name: data[name] for name in (*first, *asked) if name in data}
+
+
+def _default(item: Field[Any]) -> Any:
+    return item.default if item.default_factory is MISSING else item.default_factory()
 
 
 def read_settings(path: Path) -> HuntSettings:

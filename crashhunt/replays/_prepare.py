@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
+from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import UsageError
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import refuse_side_effects
@@ -31,6 +32,7 @@ __all__ = ["Code", "ReplayOptions", "Rerun", "prepare"]
 Code = Literal["snapshot", "current", "log"]
 
 
+@clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayOptions:
     """How to replay.

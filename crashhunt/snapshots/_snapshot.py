@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
+from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError
 from crashhunt.base.files import sync_folder, sync_tree
 from crashhunt.base.integrity import (
@@ -45,6 +46,7 @@ _PARTS = ("code", "files", "scenario")
 _IMPORTABLE = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
 
 
+@clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotOptions:
     """What a snapshot takes in.

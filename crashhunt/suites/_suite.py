@@ -59,6 +59,7 @@ class _File:
     schema: int = 1
 
 
+@clear_constructor
 class Suite:
     """Hunts to be run into one directory.
 

@@ -26,6 +26,8 @@ from crashhunt.plans import (
     request_of,
     write_settings,
 )
+from crashhunt.replays import ReplayOptions
+from crashhunt.snapshots import SnapshotOptions
 from crashhunt.suites import RunRequest, Suite, SuiteEntry
 
 PACKAGE = Path(crashhunt.__file__).parent
@@ -35,14 +37,17 @@ ADDED = """
         2.5, "driven before anything counts, in s", flag="--warm-up", metavar="S", check=above_zero("give more"),
     )
     witnesses: Sequence[str] = option((), "who is asked", flag="--witness", metavar="NAME")
+    hints: Mapping[str, Spec] | None = option({}, "what helps", flag="--hint", metavar="NAME=VALUE")
 """
 ASKS = """
 import json, pathlib
 from crashhunt.errors import UsageError
 import crashhunt
 from crashhunt.plans import plan, read_settings, request_of, write_settings
+from crashhunt.replays import ReplayOptions
+from crashhunt.snapshots import SnapshotOptions
 from crashhunt.suites import RunRequest, Suite
-hunt = crashhunt.prepare("p", 1, 1, 5, scenario="toy", seed=1, warm_up_s=4, witnesses=["a", "b"])
+hunt = crashhunt.prepare("p", 1, 1, 5, scenario="toy", seed=1, warm_up_s=4, witnesses=["a", "b"], hints={"n": 3})
 folder, = Suite.read("suite.toml").plan("s")
 written = json.loads((folder / "request.json").read_text())["request"]
 planned = RunRequest.read(folder / "request.json").request
@@ -52,10 +57,10 @@ try:
 except UsageError as error:
     refused = str(error)
 def both(settings):
-    return [settings.run.warm_up_s, list(settings.witnesses)]
+    return [settings.run.warm_up_s, list(settings.witnesses), settings.hints]
 print(json.dumps({
     "python": both(hunt.settings), "documented": "warm_up_s: driven before" in crashhunt.run.__doc__,
-    "suite.toml": both(planned), "request.json": [written["run"]["warm_up_s"], written["witnesses"]],
+    "suite.toml": both(planned), "request.json": [written["run"]["warm_up_s"], written["witnesses"], written["hints"]],
     "hunt.toml": both(told), "refused": refused,
 }))
 """
@@ -89,19 +94,21 @@ def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
         assert not done.returncode, done.stderr
         return done.stdout
 
-    words = ("--scenario", "toy", "--seed", "1", "--warm-up", "3", "--witness", "x", "--witness", "y")
+    words = ("--scenario", "toy", "--seed", "1", "--warm-up", "3", "--witness", "x", "--witness", "y", "--hint", "n=1")
     asked("-m", "crashhunt", "run", "h", "1", "1", "5", *words)
     assert 'witnesses = [\n    "x",\n    "y",\n]\n' in (toy.folder / "h" / "hunt.toml").read_text()
     assert "--warm-up S           driven before anything counts, in s; default: 2.5" in asked(
         "-m", "crashhunt", "run", "-h"
     )
-    (toy.folder / "suite.toml").write_text('[[hunts]]\nid="a"\nscenario="toy"\nwarm_up_s=5\nwitnesses=["z"]\n')
+    (toy.folder / "suite.toml").write_text(
+        '[[hunts]]\nid="a"\nscenario="toy"\nwarm_up_s=5\nwitnesses=["z"]\nhints={n=2}\n'
+    )
     assert json.loads(asked("-c", ASKS)) == {
-        "python": [4, ["a", "b"]],
+        "python": [4, ["a", "b"], {"n": 3}],
         "documented": True,
-        "suite.toml": [5.0, ["z"]],
-        "request.json": [5.0, ["z"]],
-        "hunt.toml": [3.0, ["x", "y"]],
+        "suite.toml": [5.0, ["z"], {"n": 2}],
+        "request.json": [5.0, ["z"], {"n": 2}],
+        "hunt.toml": [3.0, ["x", "y"], {"n": "1"}],
         "refused": "--warm-up is -1; give more",
     }
 
@@ -267,6 +274,9 @@ def test_what_has_no_such_option_says_what_it_has():
     for make, name in ((SuiteEntry, "SuiteEntry"), (RunSettings, "RunSettings"), (Request, "Request")):
         with pytest.raises(CallError, match=rf"{name}\(\) has no argument 'keep_gong'"):
             make(keep_gong=True)
+    for make in (SnapshotOptions, ReplayOptions, Suite):
+        with pytest.raises(CallError, match=rf"{make.__name__}\(\) has no argument 'tims'; "):
+            make(tims=3)
     with pytest.raises(CallError, match=r"Request\(\): missing a required.* call Request\(trials, max_steps"):
         Request()
     with pytest.raises(CallError, match=r"prepare\(\) has no argument 'timeout'; did you mean 'timeout_s'"):
