@@ -6,15 +6,21 @@ from pathlib import Path
 from typing import Final
 
 __all__ = [
+    "ANSWER",
     "ARCHIVE_INDEX",
+    "ARCHIVE_KEY",
     "BLACK_BOX",
+    "BUILDING",
+    "CODE",
     "CRASH",
     "CRASHES",
     "ENVIRONMENT",
     "ERROR_LOG",
+    "FILES",
     "FOXGLOVE_LAYOUT",
     "GIT_DIFF",
     "HUNT",
+    "JOB",
     "LEDGER",
     "LOG",
     "MANIFEST",
@@ -22,13 +28,17 @@ __all__ = [
     "NOTICES",
     "PACKAGE",
     "PARAMS",
+    "REPLACED",
     "REPORT",
     "REQUEST",
     "RUN_LOG",
     "SCENARIO",
+    "SCENARIO_FILES",
+    "SHOWN",
     "SNAPSHOTS",
     "STACK",
     "TRIALS",
+    "numbered",
 ]
 
 PACKAGE: Final = Path(__file__).resolve().parent.parent
@@ -57,11 +67,32 @@ ENVIRONMENT: Final = "environment.json"
 GIT_DIFF: Final = "git.diff"
 SCENARIO: Final = "scenario.toml"
 
-# Of an exported crash.
+CODE: Final = "code"
+FILES: Final = "files"  # which arguments name
+SCENARIO_FILES: Final = "scenario"
+
+# Of an exported crash; and of this user on this machine, what it is signed with.
 ARCHIVE_INDEX: Final = "archive.json"
+ARCHIVE_KEY: Final = "archive-key"
 
 # Of the scratch folder of a trial that runs; of the whole hunt's, the last one.
 BLACK_BOX: Final = "blackbox.bin"
 STACK: Final = "stack.txt"
 MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"
+JOB: Final = "job.json"
+ANSWER: Final = "answer.json"
+
+# What is not whole yet begins with a dot, and so does what only this process needs.
+SHOWN: Final = "[!.]*"
+"""The glob pattern of what is whole."""
+BUILDING: Final = ".building-"
+"""What the name of a snapshot begins with that is being made."""
+REPLACED: Final = ".replaced-"
+"""What stands in the name of a hunt that another one has taken the place of."""
+
+
+def numbered(number: int, name: str) -> str:
+    """Return the name of a file of one trial beside those of others, such as ``job-000012.json``."""
+    stem, dot, ending = name.partition(".")
+    return f"{stem}-{number:06d}{dot}{ending}"

@@ -119,14 +119,16 @@ def _outcomes(*, crashes: bool) -> list[str]:
 
 def _crashes(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     folder = vars(parsed_args).get("directory")
-    return sorted(path.parent.name for path in Path(folder).glob("crashes/*/crash.json")) if folder else []
+    return (
+        sorted(path.parent.name for path in Path(folder).glob(f"{layout.CRASHES}/*/{layout.CRASH}")) if folder else []
+    )
 
 
 def _runs(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     folder = vars(parsed_args).get("directory")
     if not folder:
         return []
-    return sorted(path.parent.relative_to(folder).as_posix() for path in Path(folder).glob("*/*/hunt.toml"))
+    return sorted(path.parent.relative_to(folder).as_posix() for path in Path(folder).glob(f"*/*/{layout.HUNT}"))
 
 
 def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]:

@@ -162,7 +162,7 @@ def _checked(archive: zipfile.ZipFile, index: dict[str, Any], path: Path) -> lis
         parts = PurePosixPath(name).parts
         if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or ":" in parts[0]:
             raise _refusal(path, f"the name {name!r} leads out of it")
-        if parts[0] not in (layout.HUNT, "crashes", "snapshots"):
+        if parts[0] not in (layout.HUNT, layout.CRASHES, layout.SNAPSHOTS):
             raise _refusal(path, f"it has {name!r}, which is no part of a crash")
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or name.endswith("/"):
@@ -210,7 +210,7 @@ def _signature(index: dict[str, Any]) -> str:
 def _key() -> bytes:
     """The secret of this user on this machine, made when it is first needed."""
     state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    file = Path(state) / "crashhunt" / "archive-key"
+    file = Path(state) / "crashhunt" / layout.ARCHIVE_KEY
     try:
         return file.read_bytes()
     except OSError:

@@ -267,7 +267,7 @@ def list_bundles(directory: Path) -> list[Bundle]:
 
 def _folders(directory: Path) -> list[Path]:
     """The folders of crashes, also of one that has lost its ``crash.json``."""
-    found = (path for path in (directory / layout.CRASHES).glob("[!.]*") if path.is_dir())
+    found = (path for path in (directory / layout.CRASHES).glob(layout.SHOWN) if path.is_dir())
     return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
 
 

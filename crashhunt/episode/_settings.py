@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.tolerance import ESSENTIAL, not_understood, required_in
 from crashhunt.base.version import __version__
@@ -145,4 +146,4 @@ def scratch_of(scratch: Path, number: int) -> Path:
 
 def answer_file(scratch: Path, number: int) -> Path:
     """Return the file for what came of a trial, where its process has no other way to say so."""
-    return scratch / f"answer-{number:06d}.json"
+    return scratch / layout.numbered(number, layout.ANSWER)

@@ -167,7 +167,7 @@ class FreshProcessExecutor:
         return TrialResult.from_json(answer["result"])
 
     def _job(self, number: int) -> Path:
-        return self._settings.scratch / f"job-{number:06d}.json"
+        return self._settings.scratch / layout.numbered(number, layout.JOB)
 
     def _log(self, number: int) -> Path:
         return self._settings.scratch / f"start-{number:06d}.log"

@@ -109,7 +109,7 @@ def check(directory: Path) -> list[Checked]:
 
 def intact_snapshots(hunt: Path) -> Iterator[Snapshot]:
     """Yield the snapshots of a hunt that are as they were written."""
-    for path in sorted((hunt / layout.SNAPSHOTS).glob("[!.]*")):
+    for path in sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN)):
         with suppress(CrashhuntError):
             snapshot = Snapshot(path)
             if not _snapshot_faults(snapshot):
@@ -220,15 +220,15 @@ def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, e
 def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
     """Bundles, snapshots and kept trials; returns the bundles that are whole."""
     bundles = {}
-    for folder in sorted((hunt / layout.CRASHES).glob("[!.]*")):
+    for folder in sorted((hunt / layout.CRASHES).glob(layout.SHOWN)):
         bundle = _check_bundle(found, folder)
         if bundle is not None:
             bundles[folder.name] = bundle
     needed = {bundle.snapshot: bundle.id for bundle in reversed(bundles.values())}
-    there = {path.name for path in (hunt / layout.SNAPSHOTS).glob("[!.]*")}
+    there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
     for name in sorted(there | needed.keys()):
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
-    for folder in sorted((hunt / layout.TRIALS).glob("[!.]*")):
+    for folder in sorted((hunt / layout.TRIALS).glob(layout.SHOWN)):
         for fault in read_params(folder):
             found.findings.append(Finding(str(folder), fault, "what the trial printed"))
     return bundles

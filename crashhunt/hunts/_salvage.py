@@ -49,7 +49,7 @@ def salvage(found: Checked, to: Path) -> dict[str, int]:
             shutil.copytree(snapshot.path, to / layout.SNAPSHOTS / snapshot.digest)
         for name in found.crashes:
             shutil.copytree(found.dir / layout.CRASHES / name, to / layout.CRASHES / name)
-        for name in ("trials", layout.REQUEST):
+        for name in (layout.TRIALS, layout.REQUEST):
             source = found.dir / name
             if source.is_dir():
                 shutil.copytree(source, to / name)

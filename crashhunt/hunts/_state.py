@@ -100,7 +100,7 @@ def find_hunts(directory: Path) -> list[Path]:
         for name in _SIGNS:
             for sign in directory.glob(f"{'*/' * depth}{name}"):
                 parts = sign.relative_to(directory).parts
-                if not any(part.startswith(".") or ".replaced-" in part for part in parts):
+                if not any(part.startswith(".") or layout.REPLACED in part for part in parts):
                     found.add(sign.parent)
     if not found:
         raise HuntDirectoryError(
@@ -116,7 +116,7 @@ def hunt_state(directory: Path) -> HuntState:
         HuntDirectoryError: it is not the directory of a hunt.
     """
     if not has_begun(directory / layout.LEDGER) and is_hunt(directory):
-        if any((directory / layout.SNAPSHOTS).glob("[!.]*")):  # which comes after the ledger
+        if any((directory / layout.SNAPSHOTS).glob(layout.SHOWN)):  # which comes after the ledger
             gone = damaged(directory / layout.LEDGER, "it is missing, or empty")
             return HuntState(str(directory), "error", str(gone), damaged=True)
         return HuntState(str(directory), "queued", trials_planned=_planned(directory / layout.REQUEST))
@@ -141,7 +141,7 @@ def _state(directory: Path, facts: dict[str, Any], outcomes: dict[str, int], las
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-    crashes = sum(1 for _ in (directory / layout.CRASHES).glob("[!.]*/crash.json"))
+    crashes = sum(1 for _ in (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}"))
     state: State = ("running" if alive else "killed") if said == "running" else _ENDED.get(said, "error")
     if state == "finished" and crashes:
         state = "crashed"

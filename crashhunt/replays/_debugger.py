@@ -93,7 +93,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             "window": look.window,
             "pause_before": min(look.until, max(1, rerun.bundle.result.steps)),
         }
-        (scratch / "job.json").write_text(json.dumps(job), encoding="utf-8")
+        (scratch / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
         kept = Kept(
             _module_in(settings.code),
             [folder],
@@ -112,7 +112,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             print(f"the window was closed, with signal {-code}", file=sys.stderr)
             raise KeyboardInterrupt
         try:
-            answer = json.loads((scratch / "answer.json").read_text(encoding="utf-8"))
+            answer = json.loads((scratch / layout.ANSWER).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             ended = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise CrashhuntError(
@@ -278,7 +278,7 @@ def _module_in(code: Sequence[str]) -> str:
 def main() -> None:
     """Run the trial that a file in a folder describes, with the terminal at hand."""
     folder = Path(sys.argv[1])
-    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
     try:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
         seal(settings)
@@ -306,7 +306,7 @@ def main() -> None:
         answer = {"result": result.to_json()}
     except CrashhuntError as error:
         answer = error.to_json()
-    (folder / "answer.json").write_text(json.dumps(answer), encoding="utf-8")
+    (folder / layout.ANSWER).write_text(json.dumps(answer), encoding="utf-8")
 
 
 def _opened(simulator: Simulator, job: Mapping[str, Any]) -> _Window:

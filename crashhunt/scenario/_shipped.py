@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.base.layout import PACKAGE
+from crashhunt.base.layout import PACKAGE, SCENARIO
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,4 +20,4 @@ def shipped_folder() -> Path:
 
 def shipped_scenarios() -> tuple[str, ...]:
     """Return the names of the scenarios that come with crashhunt."""
-    return tuple(sorted(path.parent.name for path in shipped_folder().glob("*/scenario.toml")))
+    return tuple(sorted(path.parent.name for path in shipped_folder().glob(f"*/{SCENARIO}")))

@@ -41,7 +41,7 @@ SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
 _MEGABYTE = 10**6
 _DESCRIBING = (layout.HUNT, layout.ENVIRONMENT, layout.GIT_DIFF)
-_PARTS = ("code", "files", "scenario")
+_PARTS = (layout.CODE, layout.FILES, layout.SCENARIO_FILES)
 # What Python might import, or run when it starts.
 _IMPORTABLE = {".py", ".pyc", ".pyo", ".so", ".pth", *importlib.machinery.all_suffixes()}
 
@@ -143,7 +143,7 @@ class Snapshot:
 
     @cached_property
     def _scenario(self) -> Scenario:
-        return load_scenario(self.path / "scenario" / layout.SCENARIO, kept=True)
+        return load_scenario(self.path / layout.SCENARIO_FILES / layout.SCENARIO, kept=True)
 
     def settings(self) -> HuntSettings:
         """Return the settings of the hunt as they were; they are read once."""
@@ -197,7 +197,7 @@ class Snapshot:
 
     def discard_compiled(self) -> None:
         """Remove what Python compiled, which it would take for the code beside it, whatever is in there."""
-        for path in (self.path / "code").rglob("__pycache__/*.pyc"):
+        for path in (self.path / layout.CODE).rglob("__pycache__/*.pyc"):
             if path.relative_to(self.path).as_posix() not in self.manifest["files"]:
                 with suppress(OSError):  # what cannot be removed is told as added
                     path.unlink()
@@ -249,7 +249,7 @@ def _see_that_all_is_inside(manifest: dict[str, Any]) -> None:
 
 def latest_snapshot(hunt: Path) -> Snapshot | None:
     """Return the snapshot that a hunt took last; None where it has none."""
-    found = sorted((hunt / layout.SNAPSHOTS).glob("[!.]*"), key=lambda path: path.stat().st_mtime)
+    found = sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN), key=lambda path: path.stat().st_mtime)
     return Snapshot(found[-1]) if found else None
 
 
@@ -270,7 +270,7 @@ def take_snapshot(
         SnapshotError: it is too large, or cannot be read or written.
     """
     options = options or SnapshotOptions()
-    building = snapshots / f".building-{os.getpid()}"
+    building = snapshots / f"{layout.BUILDING}{os.getpid()}"
     found = Sources(paths=[])
     if options.code:
         locators = [setup.agent for setup in scenario.agents.values()]
@@ -339,7 +339,7 @@ def _argument_files(settings: HuntSettings) -> dict[str, str]:
                 values = distribution.options
             for value in values:
                 if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
-                    found[value] = f"files/{len(found)}-{Path(value).name}"
+                    found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
     return found
 
 
@@ -378,17 +378,20 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
     texts = set(scenario.texts())
     relocated = scenario.backend.relocated
     for name in scenario.files():
-        place = f"scenario/{name}"
+        place = f"{layout.SCENARIO_FILES}/{name}"
         entries[place] = _store(scenario.folder / name, building / place)
         moved = relocated(scenario.folder / name) if relocated is not None and name in texts else None
         if moved is not None:
             (building / place).write_bytes(moved)
             entries[place] = {"size": len(moved), "blake2b": digest_of_file(building / place)}
-    (building / "scenario").mkdir(exist_ok=True)
-    resolved = building / "scenario" / layout.SCENARIO
+    (building / layout.SCENARIO_FILES).mkdir(exist_ok=True)
+    resolved = building / layout.SCENARIO_FILES / layout.SCENARIO
     text = "# The scenario as it was resolved for this hunt.\n" + tomli_w.dumps(as_plain_data(scenario))
     resolved.write_text(text, encoding="utf-8")
-    entries["scenario/scenario.toml"] = {"size": resolved.stat().st_size, "blake2b": digest_of_file(resolved)}
+    entries[f"{layout.SCENARIO_FILES}/{layout.SCENARIO}"] = {
+        "size": resolved.stat().st_size,
+        "blake2b": digest_of_file(resolved),
+    }
     return entries
 
 

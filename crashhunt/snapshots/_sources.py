@@ -35,7 +35,7 @@ class Sources:
     """
 
     files: dict[str, Path] = field(default_factory=dict)
-    paths: list[str] = field(default_factory=lambda: ["code"])
+    paths: list[str] = field(default_factory=lambda: [layout.CODE])
     trees: list[Path] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -128,14 +128,14 @@ def _take_module(name: str, found: Sources) -> None:
     file = getattr(module, "__file__", None)
     for folder in map(Path, getattr(module, "__path__", ())):
         for path in _walk(folder):
-            found.files[f"code/{name}/{path.relative_to(folder).as_posix()}"] = path
+            found.files[f"{layout.CODE}/{name}/{path.relative_to(folder).as_posix()}"] = path
         return
     if file is not None:
-        found.files[f"code/{Path(file).name}"] = Path(file)
+        found.files[f"{layout.CODE}/{Path(file).name}"] = Path(file)
 
 
 def _is_page(place: str) -> bool:
-    return place.startswith("code/crashhunt/guide/") and place.endswith(".md")
+    return place.startswith(f"{layout.CODE}/crashhunt/guide/") and place.endswith(".md")
 
 
 def _walk(folder: Path) -> Iterator[Path]:
@@ -204,7 +204,7 @@ def _take_tree(
 def _base_of(tree: Path, found: Sources) -> str:
     number = found.trees.index(tree)
     same = sum(other.name == tree.name for other in found.trees[:number])
-    return f"code/@{tree.name}" + (f"-{same + 1}" if same else "")
+    return f"{layout.CODE}/@{tree.name}" + (f"-{same + 1}" if same else "")
 
 
 def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> Iterator[tuple[str, Path]]:
@@ -230,7 +230,7 @@ def _resolved(tree: Path, name: str, listed: Sequence[str], found: Sources) -> I
 def _take_root(root: Path, found: Sources, without: Path | None) -> None:
     path = root.resolve()
     if path.is_file():
-        found.files[f"code/@{path.parent.name}/{path.name}"] = path
+        found.files[f"{layout.CODE}/@{path.parent.name}/{path.name}"] = path
         return
     if not path.is_dir():
         raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="mend the path")

@@ -173,7 +173,7 @@ def run_all(
 def set_aside(folder: Path) -> Path:
     """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now."""
     number = 0
-    while (aside := folder.with_name(f"{folder.name}.replaced-{number}")).exists():
+    while (aside := folder.with_name(f"{folder.name}{layout.REPLACED}{number}")).exists():
         number += 1
     folder.rename(aside)
     folder.mkdir()

@@ -283,4 +283,4 @@ def test_a_file_that_exists_outside_of_the_folder_is_refused(loop, tmp_path, out
 
 def test_a_way_out_and_in_again_is_inside(loop):
     change(loop, "sumo", "net", value="../own/loop.net.xml")
-    assert load_scenario(loop).sumo.net == "../own/loop.net.xml"
+    assert load_scenario(loop).tables["sumo"].net == "../own/loop.net.xml"
