@@ -7,6 +7,7 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
@@ -129,10 +130,13 @@ class Hunt:
         sampler = NamedSampler(settings.sampler, settings.space, points=settings.points)
         progress = Progress()
         finished = ledger.finished()
-        for bundle in list_bundles(self.directory):
-            if bundle.result.spec.number not in finished:  # it was killed between saving the one and the other
-                ledger.record(bundle.result, snapshot=bundle.snapshot)
-                finished.add(bundle.result.spec.number)
+        # It was killed between saving the one and the other. Where the trial is from, only its proposal says.
+        unrecorded = [bundle for bundle in list_bundles(self.directory) if bundle.result.spec.number not in finished]
+        proposed = {turn.spec.number: turn.spec for turn in ledger.turns()} if unrecorded else {}
+        for bundle in unrecorded:
+            spec = proposed.get(bundle.result.spec.number, bundle.result.spec)
+            ledger.record(replace(bundle.result, spec=spec), snapshot=bundle.snapshot)
+            finished.add(spec.number)
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         progress.crashes = list_bundles(self.directory)

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from crashhunt.hunts import Ledger
+
 HERE = Path(__file__).parent
 HUNT = ("2", "60", "20", "--scenario", "toy", "--seed", "3", "--keep-going", "--crash-on", "hang", "--json")
 
@@ -121,3 +123,14 @@ def test_what_is_wrong_with_a_sampler_is_one_line(own):
     done = own.crashhunt("run", "h", *HUNT[:-1], "--sampler", "climber:Bad", expect=2)
     assert "the sampler 'climber:Bad' fails when it is asked for trial 0: KeyError" in done.err
     assert "climber.py, line" in done.err
+
+
+def test_a_crash_without_a_row_gets_one_that_says_where_it_is_from(own):
+    words = ("1", "3", "20", "--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--keep-going")
+    own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")
+    before = trials(own.folder / "h")
+    assert before[1][0]["origin"] == "draw 0"
+    with closing(Ledger(own.folder / "h" / "ledger.sqlite", writable=True)) as ledger:
+        assert ledger.replace([1]) == 1
+    own.crashhunt("run", "h", *words, "--sampler", "climber:Climber")
+    assert trials(own.folder / "h") == before

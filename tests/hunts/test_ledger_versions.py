@@ -169,3 +169,14 @@ def test_a_ledger_of_later_that_asks_for_more_is_refused(tmp_path):
     for writable in (False, True):
         with pytest.raises(HuntDirectoryError, match="of version 99, and this crashhunt reads the versions up to"):
             Ledger(path, writable=writable)
+
+
+def test_a_proposal_that_is_gone_is_missed(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    write(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("DELETE FROM proposals WHERE turn = 2")
+    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="proposals are not those"):
+        list(ledger.turns())
+    with pytest.raises(HuntDirectoryError, match="missing or have changed"):
+        Ledger(path, writable=True)
