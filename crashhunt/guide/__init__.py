@@ -2,6 +2,7 @@
 
 from crashhunt.guide._api import describe_api
 from crashhunt.guide._commands import describe_commands
+from crashhunt.guide._keys import describe_keys
 from crashhunt.guide._pages import SECTIONS, Page, completed, find_page, for_terminal, list_pages, pages_folder
 
 __all__ = [
@@ -10,6 +11,7 @@ __all__ = [
     "completed",
     "describe_api",
     "describe_commands",
+    "describe_keys",
     "find_page",
     "for_terminal",
     "list_pages",

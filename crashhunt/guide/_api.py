@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["describe_api"]
+__all__ = ["as_markdown", "definition", "describe_api"]
 
 _OFFERED = {
     "crashhunt": "",
@@ -57,7 +57,7 @@ def _module(name: str, names: list[str]) -> Iterator[str]:
     yield f"## {name}\n"
     yield from _docstring(ast.get_docstring(_parsed(name)))
     for public in names or sorted(_door(name), key=str.lower):
-        found = _definition(name, public)
+        found = definition(name, public)
         if found is not None:
             yield from _described(f"{name}.{public}", found)
         elif names:
@@ -181,6 +181,11 @@ def _call(parts: list[str]) -> str:
     return line if len(line) <= 88 else "(\n" + "".join(f"    {part},\n" for part in parts) + ")"
 
 
+def as_markdown(docstring: str | None) -> str:
+    """Return a docstring in Google's style as Markdown."""
+    return "\n".join(_docstring(docstring))
+
+
 def _docstring(text: str | None) -> Iterator[str]:
     """A docstring in Google's style as Markdown: prose stays, its sections become lists, examples are code."""
     section = ""
@@ -238,11 +243,11 @@ def _listed(tree: ast.Module) -> list[str] | None:
     return None
 
 
-def _definition(module: str, name: str) -> _Definition | None:
+def definition(module: str, name: str) -> _Definition | None:
     """The class or function behind a name, wherever it is defined; None for anything else."""
     origin, known = _door(module).get(name, (module, name))
     if (origin, known) != (module, name):
-        return _definition(origin, known)
+        return definition(origin, known)
     return next((node for node in _parsed(module).body if isinstance(node, _Definition) and node.name == name), None)
 
 

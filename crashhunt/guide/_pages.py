@@ -11,6 +11,7 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.names import one_of
 from crashhunt.guide._api import describe_api
 from crashhunt.guide._commands import describe_commands
+from crashhunt.guide._keys import describe_keys
 
 if TYPE_CHECKING:
     import argparse
@@ -23,7 +24,7 @@ SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
     "agent", "scenario", "look-into-a-crash", "film", "hand-over", "suites", "compare", "train",
-    "commands", "api", "outcomes", "files", "json", "determinism", "security",
+    "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "contributing", "changelog",
 ]  # fmt: skip
 """What somebody needs first; what is not named here comes after it."""
@@ -90,10 +91,10 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
     """Return the text of a page with what is made from the code in its place.
 
     Args:
-        text: Markdown, in which ``<!-- made from the code: commands -->`` or ``api`` stands for it.
+        text: Markdown, in which ``<!-- made from the code: commands -->``, ``api`` or ``keys`` stands for it.
         parser: of the command line.
     """
-    makers = {"commands": lambda: describe_commands(parser), "api": describe_api}
+    makers = {"commands": lambda: describe_commands(parser), "api": describe_api, "keys": describe_keys}
     # What stands there for whoever reads the file as it is, up to the next blank line, goes.
     return re.sub(_MADE.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
 

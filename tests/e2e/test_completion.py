@@ -51,6 +51,7 @@ def press(toy):
         ("crashhunt replay h --code c", ["current"]),
         ("crashhunt show ", ["h/", "h.zip", "toy/"]),
         ("crashhunt export h f", ["faulty.py"]),
+        ("crashhunt guide det", ["determinism"]),
         ("crashhunt run out 1 1 9 --seed ", []),
     ],
 )

@@ -14,7 +14,7 @@ from pages import GUIDE
 
 from crashhunt.cli import make_parser
 from crashhunt.errors import UsageError
-from crashhunt.guide import describe_api, describe_commands, find_page, for_terminal, list_pages
+from crashhunt.guide import describe_api, describe_commands, describe_keys, find_page, for_terminal, list_pages
 
 TOPICS = [page.topic for page in list_pages()]
 
@@ -115,13 +115,25 @@ def test_the_python_reference_has_what_users_import():
     assert "(observation: Any, self" not in text
 
 
+def test_the_keys_are_those_of_the_files():
+    text = describe_keys()
+    scenario, _, suite = text.partition("## suite.toml")
+    for key in ("step_length_s", "warmup_s", "depart_lane", "net", "off_road", "reward_below", "features", "unit"):
+        assert f"- `{key}`: " in scenario
+    assert "not part of" not in scenario
+    assert "- `tables`" not in scenario
+    assert "- `folder`" not in scenario
+    for key in ("id", "runs", "trials", "arguments", "keep_going", "recycle_after", "oracles"):
+        assert suite.count(f"- `{key}`: ") == 1
+
+
 def test_a_topic_that_is_none_is_refused_from_python_too():
     with pytest.raises(UsageError, match="no topic 'x'"):
         find_page("x")
 
 
 def test_what_stands_for_the_reference_in_the_file_is_not_shown():
-    for topic in ("commands", "api"):
+    for topic in ("commands", "api", "toml"):
         page = find_page(topic)
         assert "shows them" in page.file.read_text()
         assert "shows them" not in page.text(make_parser())
