@@ -111,6 +111,9 @@ class Worker:
         """
         os.chdir(self._home)  # from wherever the last agent has gone
         box, folder = self._prepare(spec)
+        # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act. It
+        # counts, as the hunt does, from here on, with what the first trial of a worker has to make.
+        faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         began = time.monotonic()
         simulator = self._simulator
         if simulator is None:
@@ -124,8 +127,6 @@ class Worker:
         self._baseline.begin()
         self.used = True
         made = time.monotonic()
-        # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act.
-        faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
         try:
             result = run_episode(
                 spec,
