@@ -49,7 +49,7 @@ def _guide(options: argparse.Namespace, _words: list[str]) -> int:
     elif sys.stdout.isatty():
         _show(for_terminal(text))
     else:
-        print(for_terminal(text), end="")
+        print(for_terminal(text).rstrip())
     return 0
 
 

@@ -36,6 +36,8 @@ def test_every_page_has_a_topic_of_its_own():
 
 def test_a_page_in_a_pipe_is_plain_text(shell):
     out = shell.crashhunt("guide", "files").out
+    assert out.endswith("\n")
+    assert not out.endswith("\n\n")
     assert out.startswith("# What is on disk\n")
     assert "<!--" not in out
     assert "\x1b" not in out
