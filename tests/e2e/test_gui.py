@@ -61,7 +61,7 @@ def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
     process.stdin.write("\n")
     process.stdin.flush()
     read_until(process.stdout, "Press Enter to close the window: ")
-    out, _ = process.communicate("\n", timeout=60)
+    out, _ = process.communicate("\n", timeout=150)
     assert process.returncode == 0
     assert "reproduced" in out  # the window changes nothing, to the bit
 
@@ -69,7 +69,7 @@ def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
 def test_nobody_at_the_terminal_is_not_waited_for(crash, screen):
     crash.environment["DISPLAY"] = screen
     process = crash.start("replay", "h", "--gui", "--sleep", "0", "--until", "20", "--json", stdin=subprocess.DEVNULL)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=150)
     assert process.returncode == 0, err
     assert '"steps_replayed": 20' in out
 
@@ -78,7 +78,7 @@ def test_sleep_slows_it_down(crash, screen):
     crash.environment["DISPLAY"] = screen
     began = time.monotonic()
     process = crash.start("replay", "h", "--gui", "--sleep", "0.2", "--until", "20", stdin=subprocess.DEVNULL)
-    process.communicate(timeout=60)
+    process.communicate(timeout=150)
     assert time.monotonic() - began > 4
 
 
@@ -94,7 +94,7 @@ def test_a_closed_window_is_no_divergence(crash, screen):
         if len(found) and seen(screen)["ego"]:
             break
     subprocess.run([keys, "windowfocus", found[-1], "key", "ctrl+q"], env=crash.environment, check=True)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=150)
     assert process.returncode == 130, err
     assert "the window was closed" in err
     assert "diverged" not in out

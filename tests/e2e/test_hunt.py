@@ -28,7 +28,7 @@ def digests(folder: Path) -> dict[int, str]:
     return {number: json.loads(result)["digest"] for number, result in ledger(folder).items()}
 
 
-def wait_for(condition, timeout_s=60.0):
+def wait_for(condition, timeout_s=120.0):
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"

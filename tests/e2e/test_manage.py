@@ -95,8 +95,8 @@ def test_watching_ends_with_the_hunt(toy):
     time.sleep(1.5)
     assert watching.poll() is None
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=60)
-    out, _ = watching.communicate(timeout=60)
+    process.communicate(timeout=150)
+    out, _ = watching.communicate(timeout=150)
     assert watching.returncode == 0
     assert "interrupted" in out
 
@@ -125,8 +125,8 @@ def test_logs_follow_what_runs(toy):
     )  # fmt: skip
     time.sleep(1)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    out, _ = following.communicate(timeout=60)
+    process.communicate(timeout=150)
+    out, _ = following.communicate(timeout=150)
     assert out.count("running") == 1
     assert "interrupted" in out
 

@@ -25,7 +25,7 @@ FINE = ("--scenario", "toy", "--arg", "speed=5", "--seed", "3")
 SLOW = ("--set", "step_wall_s=0.02")
 
 
-def wait_for(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+def wait_for(condition: Callable[[], object], timeout_s: float = 120.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not come to that"

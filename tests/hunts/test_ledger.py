@@ -94,10 +94,10 @@ def test_whoever_sees_a_ledger_can_read_it(tmp_path):
     said = context.Queue()
     reader = context.Process(target=_read_when_there, args=(tmp_path, said))
     reader.start()
-    assert said.get(timeout=60) == "ready"
+    assert said.get(timeout=150) == "ready"
     for number in range(300):
         Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
-    assert said.get(timeout=60) == []
+    assert said.get(timeout=150) == []
     reader.join()
 
 
