@@ -78,7 +78,7 @@ def test_an_empty_file_is_no_ledger_yet(tmp_path):
 def _read_when_there(folder, said):
     said.put("ready")
     wrong = []
-    for number in range(300):
+    for number in range(120):
         path = folder / f"{number}.sqlite"
         while not path.exists():
             pass
@@ -95,7 +95,7 @@ def test_whoever_sees_a_ledger_can_read_it(tmp_path):
     reader = context.Process(target=_read_when_there, args=(tmp_path, said))
     reader.start()
     assert said.get(timeout=150) == "ready"
-    for number in range(300):
+    for number in range(120):
         Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
     assert said.get(timeout=150) == []
     reader.join()
