@@ -50,6 +50,14 @@ def test_a_rear_end_collision_within_a_step(turned):
     assert behind.share == pytest.approx(share, abs=1e-6)
 
 
+@pytest.mark.parametrize("seconds", [0.1, 0.5, 2.0])
+def test_a_step_may_be_of_any_length(seconds):
+    before = [(0, 0, 0, 15 / seconds), (12, 0, 0, 0)]
+    found = touched(0.0, before, [(15, 0, 0, 15 / seconds), (12, 0, 0, 0)], seconds=seconds)
+    assert found.share == pytest.approx(7 / 15, abs=1e-6)
+    assert found.time_s == pytest.approx(10 + seconds * 7 / 15, abs=1e-6)
+
+
 @pytest.mark.parametrize("turned", TURNS)
 def test_who_passes_beside_or_stays_behind_touches_nobody(turned):
     assert touched(turned, [(0, 0, 0, 20), (12, 2.01, 0, 4)], [(18, 0, 0, 16), (15, 2.01, 0, 2)]) is None
