@@ -99,3 +99,14 @@ def test_a_simulator_that_is_named_in_code_is_found(tmp_path):
         '"""SUMO."""\nimport gymnasium\nif x.sumo:\n    """highway"""\n    f(gym=1, y="a sumo")\n'
     )
     assert [line.partition(":")[0] for line in simulators_named(tmp_path / "m.py")] == ["3", "5", "5"]
+
+
+def test_no_module_is_longer_than_four_hundred_lines():
+    lengths = {file.relative_to(ROOT).as_posix(): len(file.read_text().splitlines()) for file in ROOT.rglob("*.py")}
+    assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
+
+
+def test_test_files_have_names_of_their_own():
+    # pytest imports two of the same name as one module, and collects neither.
+    names = [file.name for file in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(set(names)) == sorted(names)
