@@ -19,6 +19,7 @@ from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
+from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._export import add_export
 from crashhunt.cli._guide import add_guide
 from crashhunt.cli._list import add_lists
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _give_up_output()
         code = 0
     except KeyboardInterrupt:
-        code = 130
+        code = INTERRUPTED
     except Exception as error:
         code = _report(_explained(error), as_json="--json" in words)
     sys.exit(code)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json, integer
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._options import add_options, chosen_options
 
 if TYPE_CHECKING:
@@ -69,10 +70,10 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     if options.json:
         print(json.dumps(report.to_json()))
     if report.stopped_because == "no_valid_trial":
-        return 3
+        return NO_VALID_TRIAL
     if report.stopped_because == "interrupted":
-        return 130
-    return 1 if report.crashes and options.fail_on_crash else 0
+        return INTERRUPTED
+    return THE_ANSWER_IS_NO if report.crashes and options.fail_on_crash else DONE
 
 
 def _leave_at_once(*, as_json: bool) -> NoReturn:
@@ -80,4 +81,4 @@ def _leave_at_once(*, as_json: bool) -> NoReturn:
     if as_json:
         os.write(1, json.dumps(error.to_json()).encode() + b"\n")
     os.write(2, f"crashhunt: {error}\n".encode())
-    os._exit(130)
+    os._exit(INTERRUPTED)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json
+from crashhunt.cli._exit_codes import BAD_INPUT, DONE
 
 if TYPE_CHECKING:
     import argparse
@@ -110,4 +111,4 @@ def show_states(states: list[HuntState], console: Console) -> None:
 
 
 def _exit_code(states: list[HuntState]) -> int:
-    return 2 if any(state.damaged for state in states) else 0
+    return BAD_INPUT if any(state.damaged for state in states) else DONE

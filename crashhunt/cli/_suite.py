@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.cli._common import add_json, chosen_runs, integer, pairs, say
+from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
 from crashhunt.cli._options import add_options_of_machine, chosen_of_machine
 from crashhunt.cli._status import show_states, states_console, states_table
 
@@ -152,4 +153,4 @@ def _tell(states: list[HuntState], directory: Path, *, as_json: bool, replaced: 
         some = f"{len(errors)} hunt{'s' if len(errors) > 1 else ''} could not run"
         fix = f"see crashhunt logs {directory} --errors-only, then crashhunt rerun {directory}"
         console.print(f"{some}; {fix}", markup=False, soft_wrap=True)
-    return 1 if errors else 0
+    return THE_ANSWER_IS_NO if errors else DONE

@@ -11,4 +11,4 @@ from ._bundle import (
 )
 from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
 from ._escape import find_escape as find_escape, partner as partner
-from ._trust import refuse_side_effects as refuse_side_effects
+from ._side_effects import refuse_side_effects as refuse_side_effects

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import getpass
 import hashlib
-import hmac
 import json
-import os
-import secrets
 import socket
 import stat
 import tempfile
@@ -23,6 +20,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.watching import watched
+from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -94,7 +92,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
             "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
             "files": entries,
         }
-        index["signature"] = _signature(index)
+        index["signature"] = signature(index)
         archive.writestr(zipfile.ZipInfo(layout.ARCHIVE_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
     return target.stat().st_size
 
@@ -126,7 +124,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
             directory,
             str(index.get("made_by", "?")),
             str(index.get("made_at", "?")),
-            hmac.compare_digest(str(index.get("signature", "")), _signature(index)),
+            is_made_here(index),
         )
 
 
@@ -198,35 +196,3 @@ def _refusal(path: Path, message: str) -> BundleError:
 
 def _hash(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
-def _signature(index: dict[str, Any]) -> str:
-    """What only this user on this machine can know of an archive."""
-    content = {name: value for name, value in index.items() if name != "signature"}
-    text = json.dumps(content, sort_keys=True, default=str).encode()
-    return hmac.new(_key(), text, "sha256").hexdigest()
-
-
-def _key() -> bytes:
-    """The secret of this user on this machine, made when it is first needed."""
-    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    file = Path(state) / "crashhunt" / layout.ARCHIVE_KEY
-    try:
-        return file.read_bytes()
-    except OSError:
-        pass  # none yet, or it may not be read
-    key = secrets.token_bytes(32)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_name(f".{file.name}.{os.getpid()}")
-        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
-            opened.write(key)
-            opened.flush()
-            os.fsync(opened.fileno())
-        try:
-            os.link(temporary, file)  # the first of two wins
-        finally:
-            temporary.unlink()
-        return file.read_bytes()
-    except OSError:
-        return key  # nowhere to keep it: every archive is a stranger's

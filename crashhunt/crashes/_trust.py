@@ -1,50 +1,51 @@
-"""What a stranger's crash may make this process do when its recorded actions are driven: simulate, and nothing else."""
+"""Whose a bundle is: an archive that this user made on this machine is signed, and every other one is a stranger's."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import hmac
+import json
+import os
+import secrets
+from pathlib import Path
+from typing import Any
 
-from crashhunt.base.errors import UsageError
-from crashhunt.base.plugins import registered
-from crashhunt.oracles import oracle_name
-from crashhunt.scenario import backend_of
+from crashhunt.base import layout
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from crashhunt.base.plugins import Group
-    from crashhunt.plans import HuntSettings
-    from crashhunt.scenario import Scenario
-
-__all__ = ["refuse_side_effects"]
+__all__ = ["is_made_here", "signature"]
 
 
-def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
-    """Refuse a scenario that does anything but simulate, as far as is known; what nobody knows is refused.
-
-    Args:
-        scenario: of the crash.
-        settings: of its hunt.
-        values: of the scenario's arguments in the trial.
-
-    Raises:
-        UsageError: with what it would do.
-    """
-    names: list[tuple[Group, str]] = [("simulators", scenario.simulator)]
-    names += [("oracles", oracle_name(text)) for text in settings.oracles]
-    for group, name in names:
-        if name not in registered(group):
-            raise _refusal(f"it would import {name!r}")
-    for module in scenario.modules():
-        raise _refusal(f"it would import {module!r}")
-    backend = backend_of(scenario.simulator)
-    if backend is None or backend.side_effect is None:
-        raise _refusal(f"nobody knows what the simulator {scenario.simulator!r} does besides simulating")
-    asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
-    effect = backend.side_effect(scenario, values, asked)
-    if effect:
-        raise _refusal(effect)
+def is_made_here(index: dict[str, Any]) -> bool:
+    """Whether the signature of an archive is this user's."""
+    return hmac.compare_digest(str(index.get("signature", "")), signature(index))
 
 
-def _refusal(reason: str) -> UsageError:
-    return UsageError(f"the crash is a stranger's, and {reason}", fix="give --trust if you trust who made it")
+def signature(index: dict[str, Any]) -> str:
+    """What only this user on this machine can know of an archive."""
+    content = {name: value for name, value in index.items() if name != "signature"}
+    text = json.dumps(content, sort_keys=True, default=str).encode()
+    return hmac.new(_key(), text, "sha256").hexdigest()
+
+
+def _key() -> bytes:
+    """The secret of this user on this machine, made when it is first needed."""
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    file = Path(state) / "crashhunt" / layout.ARCHIVE_KEY
+    try:
+        return file.read_bytes()
+    except OSError:
+        pass  # none yet, or it may not be read
+    key = secrets.token_bytes(32)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = file.with_name(f".{file.name}.{os.getpid()}")
+        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+            opened.write(key)
+            opened.flush()
+            os.fsync(opened.fileno())
+        try:
+            os.link(temporary, file)  # the first of two wins
+        finally:
+            temporary.unlink()
+        return file.read_bytes()
+    except OSError:
+        return key  # nowhere to keep it: every archive is a stranger's

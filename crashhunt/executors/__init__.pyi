@@ -1,5 +1,5 @@
-from ._choice import make_executor as make_executor
 from ._fresh import FreshProcessExecutor as FreshProcessExecutor, fresh_environment as fresh_environment
+from ._make import make_executor as make_executor
 from ._pool import PoolExecutor as PoolExecutor
 from ._protocol import Executor as Executor, ExecutorFactory as ExecutorFactory, SizesItself as SizesItself
 from ._worker import (

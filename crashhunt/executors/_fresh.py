@@ -18,8 +18,9 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._baseline import OPEN_FILES
+from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, has_hung, hung, where_it_is
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._worker import Worker, worker_environment
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["FreshProcessExecutor", "fresh_environment"]
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
-_START_UP_S = 60.0  # for Python and the agent to be imported, before a trial counts as begun
 _ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
 
@@ -123,17 +123,15 @@ class FreshProcessExecutor:
 
     def _look(self, number: int) -> TrialResult | None:
         running = self._running[number]
-        exit_code, now = running.kept.process.poll(), time.monotonic()
+        exit_code = running.kept.process.poll()
         if exit_code is not None:
             del self._running[number]
             running.kept.end()
             return self._result(running, exit_code)
-        header = where_it_is(self._settings.scratch, number)
-        limit = self._settings.timeout_s
+        limit_s = self._settings.timeout_s
         if running.answer.exists():  # what is left to do is to find its escape, in trials that have limits of their own
-            limit = _ESCAPE_S + 2 * limit
-        began, allowed = (header.started, limit) if header else (running.began, limit + _START_UP_S)
-        if has_hung(self._settings.scratch, number, now - max(began, running.began) - allowed):
+            limit_s = _ESCAPE_S + 2 * limit_s
+        if has_hung(self._settings.scratch, number, given_at=running.began, limit_s=limit_s):
             running.killed = True
             running.kept.end()
         return None

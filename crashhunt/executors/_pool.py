@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import answer_file
+from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, has_hung, hung, where_it_is
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["PoolExecutor"]
 
 _LOOK_EVERY_S = 0.1  # whether somebody hangs; those who end make themselves heard
-_START_UP_S = 60.0  # for a new worker to get ready, before a trial counts as begun
 _RECEIVED = 1 << 16  # bytes at a time; a result is a few hundred
 
 
@@ -333,10 +333,7 @@ class PoolExecutor:
         for worker in self._workers.values():
             if worker.attempt is None or worker.killed or self._link is None:
                 continue
-            header = where_it_is(self._settings.scratch, worker.attempt.spec.number)
-            limit = self._settings.timeout_s
-            began, allowed = (header.started, limit) if header else (worker.given_at, limit + _START_UP_S)
-            over_s = now - max(began, worker.given_at) - allowed
-            if has_hung(self._settings.scratch, worker.attempt.spec.number, over_s):
+            number, limit_s = worker.attempt.spec.number, self._settings.timeout_s
+            if has_hung(self._settings.scratch, number, given_at=worker.given_at, limit_s=limit_s):
                 worker.killed = True
                 self._link.kill(worker.slot)

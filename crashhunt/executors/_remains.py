@@ -20,14 +20,12 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["DAMAGED", "Attempt", "damaged", "died", "has_hung", "hung", "signal_name", "where_it_is"]
+__all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "signal_name", "where_it_is"]
 
 DAMAGED = 79
 """The exit code of a worker that has run its trial to the end, and could not say what came of it."""
 _FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
 _ATTEMPTS = 3  # of a trial whose process is killed from outside; then somebody means it
-_LAST_WORDS_S = 0.2  # after its time limit, for a hung worker to write down where it is stuck
-_NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
 
 
 @dataclass(slots=True)
@@ -62,17 +60,6 @@ class Attempt:
         if seen or len(self.ends) >= _ATTEMPTS:
             return ""
         return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
-
-
-def has_hung(scratch: Path, number: int, over_s: float) -> bool:
-    """Whether a trial is to be ended that has been over its time limit for so long: it may still say where it is."""
-    if over_s <= _LAST_WORDS_S:
-        return False
-    try:
-        said = (scratch_of(scratch, number) / layout.STACK).stat().st_size > 0
-    except OSError:
-        said = False
-    return said or over_s > _NO_WORDS_S
 
 
 def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:

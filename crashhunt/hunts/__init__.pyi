@@ -4,7 +4,8 @@ from ._hunt import Hunt as Hunt
 from ._ledger import Ledger as Ledger, Turn as Turn, has_begun as has_begun
 from ._logs import LogKind as LogKind, LogReader as LogReader
 from ._preflight import Preflight as Preflight
-from ._progress import HuntReport as HuntReport, HuntStatus as HuntStatus
+from ._progress import HuntStatus as HuntStatus
+from ._report import HuntReport as HuntReport
 from ._results import (
     FACTS as FACTS,
     HuntResults as HuntResults,

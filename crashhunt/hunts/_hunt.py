@@ -21,7 +21,8 @@ from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._preflight import Preflight
-from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.hunts._progress import HuntStatus, Progress
+from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import draws_independently, this_process
 from crashhunt.hunts._trials import LAG, Trials
 from crashhunt.plans import with_settings

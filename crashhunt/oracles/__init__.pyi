@@ -8,18 +8,18 @@ from ._choice import (
     parse_oracle as parse_oracle,
 )
 from ._crashes import OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
-from ._events import (
-    OffRoute as OffRoute,
-    RedLight as RedLight,
-    Teleport as Teleport,
-    TrafficEvents as TrafficEvents,
-    WrongWay as WrongWay,
-)
 from ._protocol import (
     BringsOutcomes as BringsOutcomes,
     Finding as Finding,
     Oracle as Oracle,
     SeesMap as SeesMap,
     merge_findings as merge_findings,
+)
+from ._told import (
+    OffRoute as OffRoute,
+    RedLight as RedLight,
+    Teleport as Teleport,
+    TrafficEvents as TrafficEvents,
+    WrongWay as WrongWay,
 )
 from ._too_close import TooClose as TooClose

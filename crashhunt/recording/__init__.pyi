@@ -8,11 +8,12 @@ from ._blackbox import (
     read_header as read_header,
 )
 from ._compare import first_divergence as first_divergence, values_around as values_around
+from ._digest import digest_of as digest_of
 from ._divergence import Divergence as Divergence
+from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
 from ._log import read_log as read_log, write_log as write_log
 from ._reading import StepRecord as StepRecord
-from ._recording import Recording as Recording, digest_of as digest_of
-from ._views import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
+from ._recording import Recording as Recording
 from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
 from .records.actors import encode_actors as encode_actors
 from .records.events import encode_events as encode_events

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.base.errors import BundleError, RecorderError
+from crashhunt.recording._digest import is_evidence
 from crashhunt.recording.records import action, notes, observation, prologue, step as steps
-from crashhunt.recording.records._type import is_evidence
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """``log.mcap``: what is kept of an episode, in a file that other tools open too.
 
 Evidence channels hold our records, one message each, in their order; the message's sequence number is the record's.
-Reading them gives back the very same records, hence the same digest. View channels (see ``_views``) are for people.
+Reading them gives back the very same records, hence the same digest. View channels (see ``_foxglove``) are for people.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mcap.writer import Writer
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
+from crashhunt.recording._foxglove import write_views
 from crashhunt.recording._recording import Recording
 from crashhunt.recording._schemas import MESSAGES, NAMESPACE
-from crashhunt.recording._views import write_views
 from crashhunt.recording._writer import LogWriter, to_ns
 from crashhunt.recording.records import RECORD_TYPES, step
 from crashhunt.recording.records._type import BytesForm, TextForm

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,9 @@ import numpy as np
 
 from crashhunt.base.errors import BundleError
 from crashhunt.base.names import one_of
+from crashhunt.recording._digest import digest_of, is_evidence
 from crashhunt.recording._reading import Reading
 from crashhunt.recording.records import RECORD_TYPES, prologue
-from crashhunt.recording.records._type import is_evidence
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.recording.records.prologue import AgentChannel, Prologue
     from crashhunt.world import Actor, Scene
 
-__all__ = ["Recording", "digest_of"]
+__all__ = ["Recording"]
 
 
 class Recording:
@@ -112,11 +111,3 @@ def _read(records: tuple[Record, ...]) -> Reading:
     if current.observations or current.actions or current.more:
         reading.steps.append(current)  # the process ended in it
     return reading
-
-
-def digest_of(*records: bytes | memoryview) -> str:
-    """Return the trace digest of encoded records: BLAKE2b of 16 bytes, in hexadecimal."""
-    digest = hashlib.blake2b(digest_size=16)
-    for part in records:
-        digest.update(part)
-    return digest.hexdigest()

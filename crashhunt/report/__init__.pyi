@@ -6,7 +6,7 @@ from ._listing import (
     list_scenarios as list_scenarios,
 )
 from ._page import report_data as report_data, write_report as write_report
-from ._screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
 from ._show import Story as Story
+from ._status_screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
 from ._summary import describe_hunt as describe_hunt, describe_replay as describe_replay
 from ._table import check_fields as check_fields, format_table as format_table, steps_table as steps_table

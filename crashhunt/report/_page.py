@@ -18,8 +18,8 @@ from crashhunt.base.watching import watched
 from crashhunt.hunts import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
-from crashhunt.report._screen import format_arguments
 from crashhunt.report._show import Story
+from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
 from crashhunt.trial import Outcome
 from crashhunt.world import approaches

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base.text import in_lines
 from crashhunt.crashes import Encounter, last_escape
 from crashhunt.report._events import about_events
-from crashhunt.report._screen import format_arguments
+from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 
 if TYPE_CHECKING:

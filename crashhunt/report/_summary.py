@@ -7,7 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.report._screen import format_arguments, format_seconds
+from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
 if TYPE_CHECKING:

@@ -16,25 +16,15 @@ if TYPE_CHECKING:
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 
 __all__ = [
-    "FIRST_ASIDE",
     "SCENE",
     "BytesForm",
     "Form",
     "RecordType",
     "TextForm",
-    "is_evidence",
     "scene_texts",
 ]
 
-FIRST_ASIDE = 128
-"""Tags from here on are of records that are no evidence: whoever does not know a type knows what the digest is of."""
-_NOTES = 11  # the only type of the first eleven that is no evidence, from before there was that rule
 SCENE = "scene"
-
-
-def is_evidence(tag: int) -> bool:
-    """Whether records with this tag belong to the digest of the trial."""
-    return tag < FIRST_ASIDE and tag != _NOTES
 
 
 class Form:

@@ -17,8 +17,8 @@ from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators.sumo._events import SumoEvents
 from crashhunt.simulators.sumo._sight import Sight
+from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:

@@ -89,7 +89,7 @@ def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError |
 
 
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
-    from crashhunt.scenario.backends.sumo._trust import side_effect
+    from crashhunt.scenario.backends.sumo._side_effects import side_effect
 
     return side_effect(scenario, values, specifications)
 

@@ -1,0 +1,13 @@
+"""What a command's exit code says; 130 is the shell's own for Ctrl-C."""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = ["BAD_INPUT", "DONE", "INTERRUPTED", "NO_VALID_TRIAL", "THE_ANSWER_IS_NO"]
+
+DONE: Final = 0
+THE_ANSWER_IS_NO: Final = 1
+BAD_INPUT: Final = 2
+NO_VALID_TRIAL: Final = 3
+INTERRUPTED: Final = 130
