@@ -2,8 +2,6 @@ from ._archive import Archive as Archive, export_crash as export_crash, open_arc
 from ._bundle import (
     Bundle as Bundle,
     files_of as files_of,
-    find_bundle as find_bundle,
-    list_bundles as list_bundles,
     read_bundle as read_bundle,
     read_params as read_params,
     write_bundle as write_bundle,
@@ -11,4 +9,5 @@ from ._bundle import (
 )
 from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
 from ._escape import find_escape as find_escape, partner as partner
+from ._find import find_bundle as find_bundle, list_bundles as list_bundles
 from ._side_effects import refuse_side_effects as refuse_side_effects

@@ -13,7 +13,6 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
-from crashhunt.base.names import listed, near_path, one_of
 from crashhunt.base.tolerance import typed_where_there
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Bundle",
     "files_of",
-    "find_bundle",
-    "list_bundles",
     "read_bundle",
     "read_params",
     "write_bundle",
@@ -258,72 +255,6 @@ def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
         files,
         added={name: value for name, value in data.items() if name not in _KEYS},
     )
-
-
-def list_bundles(directory: Path) -> list[Bundle]:
-    """Return the crashes of a hunt, in order of their trials."""
-    return [read_bundle(folder) for folder in _folders(directory)]
-
-
-def _folders(directory: Path) -> list[Path]:
-    """The folders of crashes, also of one that has lost its ``crash.json``."""
-    found = (path for path in (directory / layout.CRASHES).glob(layout.SHOWN) if path.is_dir())
-    return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
-
-
-def find_bundle(directory: Path, crash: str = "") -> Bundle:
-    """Return one crash of a hunt: the one that is named, or the one with the fewest steps.
-
-    Args:
-        directory: of the hunt, or of the bundle itself.
-        crash: its id, the beginning of it, or its trial's number, with leading zeros or without.
-
-    Raises:
-        BundleError: there is no such crash.
-    """
-    if (directory / layout.CRASH).is_file() and not crash:
-        return read_bundle(directory)
-    bundles = _readable(directory, crash) if crash else list_bundles(directory)
-    if not bundles:
-        if not directory.is_dir():
-            fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
-            raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
-        raise BundleError(
-            "no crash was saved here", fix="give the directory of a hunt that found one", where=str(directory)
-        )
-    if not crash:
-        return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-    return _named(bundles, crash, directory)
-
-
-def _readable(directory: Path, crash: str) -> list[Bundle]:
-    """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
-    found = []
-    for path in _folders(directory):
-        try:
-            found.append(read_bundle(path))
-        except BundleError:
-            name = path.name
-            if name.startswith(crash) or name.partition("-")[0].lstrip("0") == crash.lstrip("0"):
-                raise
-    return found
-
-
-def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
-    """The one crash that somebody can mean; an id is exact, and else a number, before the beginning of an id."""
-    number = int(crash) if crash.isdecimal() else None
-    for meant in (
-        [bundle for bundle in bundles if bundle.id == crash],
-        [bundle for bundle in bundles if bundle.result.spec.number == number],
-        [bundle for bundle in bundles if bundle.id.startswith(crash)],
-    ):
-        if len(meant) == 1:
-            return meant[0]
-        if meant:
-            fix = f"give one of {listed(bundle.id for bundle in meant)}"
-            raise BundleError(f"{crash!r} may be several crashes", fix=fix, where=str(directory))
-    fix = one_of(crash, (bundle.id for bundle in bundles))
-    raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))
 
 
 def write_bundle(

@@ -4,9 +4,5 @@ from ._environment import (
     processor as processor,
     versions as versions,
 )
-from ._snapshot import (
-    Snapshot as Snapshot,
-    SnapshotOptions as SnapshotOptions,
-    latest_snapshot as latest_snapshot,
-    take_snapshot as take_snapshot,
-)
+from ._snapshot import Snapshot as Snapshot, latest_snapshot as latest_snapshot
+from ._take import SnapshotOptions as SnapshotOptions, take_snapshot as take_snapshot

@@ -1,0 +1,222 @@
+"""Taking a snapshot: the code, the scenario and the files of a hunt, copied and addressed by content."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.calls import clear_constructor
+from crashhunt.base.errors import BundleError, SnapshotError, UsageError
+from crashhunt.base.files import sync_folder, sync_tree
+from crashhunt.base.integrity import (
+    describe_files,
+    digest_of_data,
+    digest_of_file,
+)
+from crashhunt.oracles import modules_of
+from crashhunt.plans import HuntSettings, SnapshotChoices, write_settings
+from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
+from crashhunt.snapshots._environment import environment
+from crashhunt.snapshots._sources import Sources, find_sources, git
+from crashhunt.trial import Choice, Constant
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
+
+__all__ = ["SnapshotOptions", "take_snapshot"]
+
+_MEGABYTE = 10**6
+
+
+@clear_constructor
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotOptions:
+    """What a snapshot takes in.
+
+    Args:
+        code: whether it has code at all; without, a replay runs what is current.
+        roots: files and folders besides what is found.
+        limit_mb: how large it may be, in MB.
+
+    Raises:
+        UsageError: the limit is none.
+    """
+
+    code: bool = True
+    roots: tuple[Path, ...] = ()
+    limit_mb: float = 500.0
+
+    def __post_init__(self) -> None:
+        if not self.limit_mb > 0:  # nor what is not a number
+            raise UsageError(f"--snapshot-limit is {self.limit_mb:g}", fix="give MB above 0, or --no-snapshot")
+
+    @classmethod
+    def of(cls, choices: SnapshotChoices) -> SnapshotOptions:
+        """Return what the options of a hunt say.
+
+        Raises:
+            UsageError: the limit is none.
+        """
+        limit_mb = choices.snapshot_limit_mb
+        return cls(code=choices.snapshot_code, roots=tuple(map(Path, choices.snapshot_roots)), limit_mb=limit_mb)
+
+
+def take_snapshot(
+    snapshots: Path, scenario: Scenario, settings: HuntSettings, options: SnapshotOptions | None = None
+) -> Snapshot:
+    """Store the scenario, the agents' own projects, what their arguments name, and crashhunt itself.
+
+    The very same content is stored once.
+
+    Args:
+        snapshots: the folder of all snapshots of a hunt.
+        scenario: with its agents.
+        settings: of the hunt.
+        options: what to take in.
+
+    Raises:
+        SnapshotError: it is too large, or cannot be read or written.
+    """
+    options = options or SnapshotOptions()
+    building = snapshots / f"{layout.BUILDING}{os.getpid()}"
+    found = Sources(paths=[])
+    if options.code:
+        locators = [setup.agent for setup in scenario.agents.values()]
+        modules = [*scenario.modules(), *modules_of(settings.oracles)]
+        found = find_sources(locators, modules, roots=options.roots, without=snapshots.parent)
+    argument_files = _argument_files(settings) if options.code else {}
+    files = found.files | {argument_files[value]: Path(value) for value in argument_files}
+    _check_size(files, options.limit_mb)
+    try:
+        snapshots.mkdir(exist_ok=True)
+        shutil.rmtree(building, ignore_errors=True)
+        building.mkdir()
+        entries = {name: _store(path, building / name) for name, path in files.items()}
+        entries |= _store_scenario(scenario, building)
+        stored = {name: entry for name, entry in entries.items() if entry is not None}
+        manifest = {
+            "schema": SCHEMA,
+            "paths": found.paths,
+            "argument_files": argument_files,
+            "left_out": found.left_out,
+            "files": stored,
+        }
+        digest = digest_of_described(stored, says=[found.paths, argument_files])
+        final = snapshots / digest
+        if final.exists() and not _is_damaged(Snapshot(final)):
+            shutil.rmtree(building)
+            return Snapshot(final)
+        write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
+        facts = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
+        (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        manifest["described"] = describe_files(building)
+        manifest["integrity"] = digest_of_data(manifest)
+        (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        sync_tree(building)
+        if final.exists():  # what is in it is the same, but for the damage
+            shutil.rmtree(final)
+        building.rename(final)
+        sync_folder(snapshots)
+    except OSError as error:
+        shutil.rmtree(building, ignore_errors=True)
+        raise SnapshotError(
+            f"the snapshot cannot be made: {error.strerror or error}",
+            fix="free some space, make the file readable, or give --no-snapshot",
+            where=str(error.filename or snapshots),
+        ) from error
+    return Snapshot(final)
+
+
+def _is_damaged(snapshot: Snapshot) -> bool:
+    try:
+        return bool(snapshot.faults())
+    except BundleError:
+        return True
+
+
+def _argument_files(settings: HuntSettings) -> dict[str, str]:
+    """The files that arguments of agents name, such as the weights of a policy, and their place in the snapshot."""
+    found: dict[str, str] = {}
+    for agent in settings.agents.values():
+        for spec in agent.arguments.values():
+            distribution = spec.distribution
+            values: Sequence[object] = ()
+            if isinstance(distribution, Constant):
+                values = (distribution.value,)
+            elif isinstance(distribution, Choice):
+                values = distribution.options
+            for value in values:
+                if isinstance(value, str) and value not in found and os.path.isfile(value):  # noqa: PTH113
+                    found[value] = f"{layout.FILES}/{len(found)}-{Path(value).name}"
+    return found
+
+
+def _check_size(files: dict[str, Path], limit_mb: float) -> None:
+    sizes = {path: _size(path) for path in files.values()}
+    total = sum(sizes.values())
+    if total > limit_mb * _MEGABYTE:
+        largest = sorted(sizes, key=lambda path: -sizes[path])[:3]
+        names = ", ".join(f"{path} ({sizes[path] / _MEGABYTE:.3g} MB)" for path in largest)
+        raise SnapshotError(
+            f"the snapshot would have {total / _MEGABYTE:.3g} MB, above the limit of {limit_mb:g} MB; largest: {names}",
+            fix="have git ignore what the agent does not need, raise --snapshot-limit, or give --no-snapshot",
+        )
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _store(path: Path, copy: Path) -> dict[str, Any] | None:
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        shutil.copy(path, copy)
+    except FileNotFoundError:
+        return None  # deleted since it was listed
+    return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
+
+
+def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
+    import tomli_w
+
+    entries: dict[str, Any] = {}
+    texts = set(scenario.texts())
+    relocated = scenario.backend.relocated
+    for name in scenario.files():
+        place = f"{layout.SCENARIO_FILES}/{name}"
+        entries[place] = _store(scenario.folder / name, building / place)
+        moved = relocated(scenario.folder / name) if relocated is not None and name in texts else None
+        if moved is not None:
+            (building / place).write_bytes(moved)
+            entries[place] = {"size": len(moved), "blake2b": digest_of_file(building / place)}
+    (building / layout.SCENARIO_FILES).mkdir(exist_ok=True)
+    resolved = building / layout.SCENARIO_FILES / layout.SCENARIO
+    text = "# The scenario as it was resolved for this hunt.\n" + tomli_w.dumps(as_plain_data(scenario))
+    resolved.write_text(text, encoding="utf-8")
+    entries[f"{layout.SCENARIO_FILES}/{layout.SCENARIO}"] = {
+        "size": resolved.stat().st_size,
+        "blake2b": digest_of_file(resolved),
+    }
+    return entries
+
+
+def _describe_trees(trees: Sequence[Path], diff: Path) -> dict[str, str]:
+    """Write the uncommitted changes of work trees down; return their revisions."""
+    revisions = {}
+    for tree in trees:
+        revision = git(tree, "rev-parse", "HEAD")
+        if revision is not None:
+            revisions[str(tree)] = revision.decode().strip()
+            with diff.open("ab") as file:
+                file.write(git(tree, "diff", "HEAD", "--no-ext-diff", "--no-textconv", "--binary") or b"")
+    return revisions
