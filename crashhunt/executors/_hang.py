@@ -12,9 +12,9 @@ from crashhunt.executors._remains import where_it_is
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["has_hung"]
+__all__ = ["START_UP_S", "has_hung"]
 
-_START_UP_S = 60.0  # for Python and the agent to be imported, before a trial counts as begun
+START_UP_S = 60.0  # for Python and the agent to be imported, before a trial counts as begun
 _LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
 _NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
 
@@ -29,7 +29,7 @@ def has_hung(scratch: Path, number: int, *, given_at: float, limit_s: float) -> 
         limit_s: wall time that it may take from its beginning on, in s.
     """
     header = where_it_is(scratch, number)
-    began, allowed_s = (header.started, limit_s) if header else (given_at, limit_s + _START_UP_S)
+    began, allowed_s = (header.started, limit_s) if header else (given_at, limit_s + START_UP_S)
     over_s = time.monotonic() - max(began, given_at) - allowed_s
     if over_s <= _LAST_WORDS_S:
         return False
