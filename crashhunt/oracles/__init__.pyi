@@ -15,11 +15,11 @@ from ._protocol import (
     SeesMap as SeesMap,
     merge_findings as merge_findings,
 )
-from ._told import (
+from ._too_close import TooClose as TooClose
+from ._traffic_events import (
     OffRoute as OffRoute,
     RedLight as RedLight,
     Teleport as Teleport,
     TrafficEvents as TrafficEvents,
     WrongWay as WrongWay,
 )
-from ._too_close import TooClose as TooClose

@@ -27,7 +27,7 @@ _RED = ("r", "u")  # red, and red with yellow; after a stop, "s" may be passed
 _LINKS_AT_ONCE = 6  # that a vehicle crosses in one long step
 _DIRECTION_EVERY = 10  # steps; how often a vehicle that stays on its lane is asked which way it drives
 _AGAINST = -0.5  # cosine of the angle between a course and a lane
-_SIGHT_M = 150.0  # a collision further away has nothing to do with the agent
+_NEAR_M = 150.0  # a collision further away has nothing to do with the agent
 _CONSEQUENCE_S = 5.0  # after hard braking for the agent, a collision may be its consequence
 
 
@@ -155,7 +155,7 @@ class SumoEvents:
                 ((_gap(scene, agent, other), agent) for agent in agents if agent in index for other in pair),
                 default=None,
             )
-            if near is None or near[0] > _SIGHT_M:
+            if near is None or near[0] > _NEAR_M:
                 continue
             distance, agent = near
             what = f"{pair[0]} drove into {pair[1]}, {distance:.0f} m from {agent}"
@@ -179,7 +179,7 @@ class SumoEvents:
                 ),
                 default=None,
             )
-            if near is not None and near[0] <= _SIGHT_M:
+            if near is not None and near[0] <= _NEAR_M:
                 what = f"SUMO teleported {vehicle}, {near[0]:.0f} m from {near[1]}"
                 found.append(self._of(scene, near[1], "teleport", what, (vehicle,)))
 

@@ -1,6 +1,6 @@
+from ._allowed import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
 from ._backend import BACKEND as BACKEND
 from ._files import StagedFiles as StagedFiles, filled_in as filled_in
-from ._known import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
 from ._names import check_names as check_names
 from ._options import (
     HARMLESS as HARMLESS,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 from xml.parsers import expat
 
 from crashhunt.base.errors import ScenarioError
+from crashhunt.scenario.backends.sumo._allowed import ATTRIBUTES, ELEMENTS, LABELS
 from crashhunt.scenario.backends.sumo._files import filled_in
-from crashhunt.scenario.backends.sumo._known import ATTRIBUTES, ELEMENTS, LABELS
 from crashhunt.scenario.backends.sumo._options import HARMLESS, canonical, is_output, is_shown
 from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.scenario.backends.sumo._xml import READ, WRITTEN, read_xml

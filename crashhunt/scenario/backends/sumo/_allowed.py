@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = ["ATTRIBUTES", "ELEMENTS", "LABELS"]
 
-# From the schemas of SUMO 1.28 (data/xsd), without what names a file, which `_sumo_xml` knows.
+# From the schemas of SUMO 1.28 (data/xsd), without what names a file, which `_xml` knows.
 _ELEMENTS = """
 WAUT access add additional assignment bidiPredecessor busStop calibrator carFollowing-ACC carFollowing-BKerner
 carFollowing-CACC carFollowing-CC carFollowing-Daniel1 carFollowing-EIDM carFollowing-IDM carFollowing-IDMM
