@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 __all__ = [
+    "DISK",
+    "FULL",
     "ActionError",
     "ArgumentError",
     "BundleError",
@@ -45,6 +47,12 @@ __all__ = [
     "UsageError",
     "remedy",
 ]
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""What an `OSError` says where a disk, or somebody's share of it, is full."""
+
+DISK = FULL | {errno.EIO, errno.EROFS}
+"""What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
 
 
 class CrashhuntError(Exception):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.errors import FULL, HuntDirectoryError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,6 +82,5 @@ def _sync(path: Path) -> None:
 
 def cannot_write(path: Path, error: OSError) -> HuntDirectoryError:
     """Return the error for a file or folder that cannot be written."""
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    fix = "free some space and run the same command again" if full else "choose another place"
+    fix = "free some space and run the same command again" if error.errno in FULL else "choose another place"
     return HuntDirectoryError(f"cannot be written: {error.strerror or error}", fix=fix, where=str(path))

@@ -12,7 +12,7 @@ import traceback
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base.errors import CrashhuntError, UsageError, remedy
+from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
 from crashhunt.cli._check import add_check
@@ -103,7 +103,7 @@ def _explained(error: Exception) -> CrashhuntError:
     if os.environ.get("CRASHHUNT_TRACEBACK"):
         traceback.print_exc()
     if isinstance(error, OSError):
-        if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF, errno.EDQUOT):
+        if error.filename is None and error.errno in DISK | {errno.EBADF}:
             _give_up_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
         return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))

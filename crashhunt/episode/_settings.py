@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["WorkerSettings", "answer_file", "scratch_of"]
 
 
+_TIMEOUT_S = 60.0  # what leaving it out means, whatever the default of the option is some day
 _AUDIT = 1  # apart from what draws the trial itself
 
 
@@ -57,7 +58,7 @@ class WorkerSettings:
     scratch: Path
     code: tuple[str, ...] = ()
     argument_files: dict[str, str] = field(default_factory=dict)
-    timeout_s: float = 60.0
+    timeout_s: float = _TIMEOUT_S
     keep_trials: bool = False
     sealed: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
     find_escapes: bool = False
@@ -116,7 +117,7 @@ class WorkerSettings:
             scratch=Path(data["scratch"]),
             code=tuple(data.get("code", ())),
             argument_files=data.get("argument_files", {}),
-            timeout_s=data.get("timeout_s", 60.0),
+            timeout_s=data.get("timeout_s", _TIMEOUT_S),
             keep_trials=data.get("keep_trials", False),
             sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
             find_escapes=data.get("find_escapes", False),

@@ -17,13 +17,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
 from crashhunt.episode import WorkerSettings, answer_file, words_of
 from crashhunt.executors._remains import DAMAGED
 from crashhunt.executors._worker import Worker, loaded
-from crashhunt.recording import DISK
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
-from crashhunt.base.errors import RecorderError
+from crashhunt.base.errors import DISK, RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.files import whole_file
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors._baseline import Baseline
-from crashhunt.recording import DISK, BlackBox
+from crashhunt.recording import BlackBox
 from crashhunt.simulators import BrakesFully, HasMap, TellsNotices, Tidies
 from crashhunt.trial import Outcome
 from crashhunt.world import Lane

@@ -3,6 +3,7 @@ from ._directory import HuntDirectory as HuntDirectory
 from ._hunt import Hunt as Hunt
 from ._ledger import Ledger as Ledger, Turn as Turn, has_begun as has_begun
 from ._logs import LogKind as LogKind, LogReader as LogReader
+from ._next_trials import Trials as Trials, spec_of as spec_of
 from ._preflight import Preflight as Preflight
 from ._progress import HuntStatus as HuntStatus
 from ._report import HuntReport as HuntReport
@@ -17,4 +18,3 @@ from ._results import (
 from ._salvage import salvage as salvage
 from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
 from ._tables import write_parquet as write_parquet, write_text as write_text
-from ._trials import Trials as Trials, spec_of as spec_of

@@ -20,11 +20,11 @@ from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
+from crashhunt.hunts._next_trials import LAG, Trials
 from crashhunt.hunts._preflight import Preflight
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
-from crashhunt.hunts._state import draws_independently, this_process
-from crashhunt.hunts._trials import LAG, Trials
+from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
 from crashhunt.plans import with_settings
 from crashhunt.replays import confirm
 from crashhunt.samplers import NamedSampler
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
 _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
-_HEARTBEAT_S = 1.0  # another machine takes a hunt for dead after a minute of silence
 _INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
@@ -237,7 +236,7 @@ class Hunt:
                 if self._hopeless(progress, finished):
                     return "no_valid_trial"
                 self._listen(executor, audit, ledger, progress)
-                if time.monotonic() - heartbeat > _HEARTBEAT_S:
+                if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
                     ledger.note(heartbeat=time.time())

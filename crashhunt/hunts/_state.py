@@ -23,12 +23,22 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import HuntSettings
 
-__all__ = ["HuntState", "State", "draws_independently", "find_hunts", "hunt_state", "is_hunt", "this_process"]
+__all__ = [
+    "HEARTBEAT_S",
+    "HuntState",
+    "State",
+    "draws_independently",
+    "find_hunts",
+    "hunt_state",
+    "is_hunt",
+    "this_process",
+]
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
 _SIGNS = (layout.LEDGER, layout.REQUEST, layout.HUNT)  # of a hunt, or of one that is planned
 _DEPTH = 2  # of hunts below the directory of a suite
+HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "all_trials": "finished", "no_valid_trial": "error", "interrupted": "interrupted",

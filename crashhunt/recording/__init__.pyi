@@ -1,5 +1,4 @@
 from ._blackbox import (
-    DISK as DISK,
     BlackBox as BlackBox,
     BlackBoxHeader as BlackBoxHeader,
     Phase as Phase,

@@ -8,7 +8,6 @@ length) and its payload, padded to 8 bytes. Everything is little-endian. Only wh
 
 from __future__ import annotations
 
-import errno
 import mmap
 import os
 import struct
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.base.errors import BundleError, RecorderError
+from crashhunt.base.errors import DISK, BundleError, RecorderError
 from crashhunt.recording._digest import is_evidence
 from crashhunt.recording.records import action, notes, observation, prologue, step as steps
 from crashhunt.world import joined_frame
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Frame, Roster, Scene
 
-__all__ = ["DISK", "BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
+__all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
 
 _MAGIC = b"CRASHBB1"
 _HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
@@ -43,8 +42,6 @@ _FIRST = 64  # where records begin; the header has room to grow
 _HEAD = struct.Struct("<BxHI")
 _CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
 _MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves every view
-DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
 
 
 class Phase(IntEnum):

@@ -4,6 +4,7 @@ from ._actions import (
     SpaceAction as SpaceAction,
     SpeedAndLaneChange as SpeedAndLaneChange,
 )
+from ._foreign_spaces import action_form as action_form, native as native
 from ._kinematics import Kinematics as Kinematics
 from ._protocol import (
     FACULTIES as FACULTIES,
@@ -22,4 +23,3 @@ from ._protocol import (
     TellsNotices as TellsNotices,
     Tidies as Tidies,
 )
-from ._spaces import action_form as action_form, native as native

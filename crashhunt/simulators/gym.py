@@ -15,8 +15,8 @@ from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
+from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, native
 from crashhunt.simulators._options import as_tables, merge
-from crashhunt.simulators._spaces import ObservationForm, action_form, native
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:

@@ -107,4 +107,5 @@ class TrialResult:
         return f"{self.outcome} after {self.steps} steps"
 
 
+# A field with a plain value is written and read if it is named here.
 _PLAIN = ("steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept")

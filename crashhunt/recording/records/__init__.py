@@ -1,4 +1,4 @@
-"""The types of records, a file each: tag, codec, topic in the log, reading and comparison.
+"""The types of records, a file each: tag, codec, topic of the evidence in the log, reading and comparison.
 
 To add one, write its file and name it here; whoever has something to record calls `BlackBox.append` with its tag.
 """

@@ -29,9 +29,9 @@ from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
 from crashhunt.simulators._actions import MetaAction
+from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, native
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators._spaces import ObservationForm, action_form, native
 from crashhunt.simulators._standstill import Standstill
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
