@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from crashhunt.trial import TrialResult, TrialSpec
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 
@@ -195,7 +198,7 @@ def bench_parallel() -> Iterator[Figure]:
 
 
 def bench_orchestration() -> Iterator[Figure]:
-    """Everything that is not the episode, with few and with many trials in the ledger."""
+    """What a trial costs besides its steps, with few and with many trials in the ledger."""
     from crashhunt.hunts import Ledger
     from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -215,11 +218,8 @@ def bench_orchestration() -> Iterator[Figure]:
             ledger.close()
             few = hunt(directory, 1, already + 1, 1, *options)["wall_s"]
             many = hunt(directory, 1, already + 1 + trials, 1, *options)["wall_s"]
-            ledger = Ledger(directory / "ledger.sqlite")
-            episodes = sum(result.wall_s for result in ledger.results() if result.spec.number > already)
-            ledger.close()
-            costs[already] = 1e3 * (many - few - episodes) / trials
-            note = f"ms of wall time a trial beyond its episode, {already} trials in the ledger"
+            costs[already] = 1e3 * (many - few) / trials
+            note = f"ms of wall time of a trial of one step that costs nothing, {already} trials in the ledger"
             yield Figure(f"orchestration_{already}", costs[already], "ms", "lower", 2.0, note)
     yield Figure("orchestration_growth", costs[100_000] / costs[100], "x", "lower", 1.5, "100,000 against 100 trials")
 
@@ -397,6 +397,63 @@ def bench_replay() -> Iterator[Figure]:
         found = in_child("child_replay", str(place / "h"))
     note = f"2,000 steps in {found['replay']:.2f} s; process, warm-up and comparison take {found['rest']:.2f} s"
     yield Figure("replay_speed", found["hunt"] / found["replay"], "of the hunt's", "higher", 0.9, note)
+
+
+class Costless:
+    """An executor of thousands of workers whose trials cost nothing, so that what is left is the hunt itself."""
+
+    def __init__(self, settings: object, *, parallel: int, recycle_after: int) -> None:
+        self.capacity = parallel
+        self._waiting: deque[TrialSpec] = deque()
+
+    def submit(self, spec: TrialSpec) -> None:
+        """Queue a trial."""
+        self._waiting.append(spec)
+
+    def completed(self, timeout_s: float) -> Iterator[TrialResult]:
+        """End as many as run at a time."""
+        from crashhunt.trial import Outcome, TrialResult
+
+        for _ in range(min(self.capacity, len(self._waiting))):
+            yield TrialResult(self._waiting.popleft(), Outcome.SURVIVED, steps=100, sim_time_s=10.0, digest="0" * 32)
+
+    def cancel(self, *, above: int = -1) -> None:
+        """Nothing is left to run."""
+        self._waiting.clear()
+
+    def where(self) -> dict[int, object]:
+        """Nobody is anywhere."""
+        return {}
+
+    def notes(self) -> list[str]:
+        """There is nothing to say."""
+        return []
+
+    def close(self) -> None:
+        """Nothing has been started."""
+
+
+def bench_ceiling() -> Iterator[Figure]:
+    """How many trials a second a hunt can hand out, take back and write down, whoever runs them."""
+    spent: dict[int, tuple[float, float]] = {}
+    for trials in (100_000, 1_000_000):
+        with folder() as place:
+            words = ["run", str(place / "h"), "1000", str(trials), "100", "--json", "--seed", "1"]
+            words += ["--scenario", str(_toy(place)), "--executor", "bench:Costless"]
+            child = subprocess.Popen(
+                [str(CRASHHUNT), *words], cwd=Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            )
+            with closing(child.stdout) as output:  # type: ignore[type-var]
+                found = json.load(output)  # type: ignore[arg-type]
+            _, status, used = os.wait4(child.pid, 0)
+            assert (status, found["trials_run"]) == (0, trials)
+            child.returncode = 0
+            spent[trials] = found["wall_s"], used.ru_maxrss / 1024
+    (small, small_memory), (large, memory) = spent[100_000], spent[1_000_000]
+    note = f"a million trials; {100_000 / small:.0f} the first hundred thousand"
+    yield Figure("ceiling", 1_000_000 / large, "trials/s", "higher", 5000, note)
+    note = f"{memory:.0f} MiB at a million trials, {small_memory:.0f} at a hundred thousand"
+    yield Figure("ceiling_memory_growth", memory / small_memory, "x", "lower", 1.1, note)
 
 
 def _large_ledger(directory: Path, trials: int) -> None:
@@ -658,6 +715,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "parallel": bench_parallel,
     "orchestration": bench_orchestration,
+    "ceiling": bench_ceiling,
     "waves": bench_waves,
     "help": bench_help,
     "memory": bench_memory,

@@ -221,16 +221,17 @@ class Hunt:
                     in_flight.add(spec.number)
                 if not in_flight:
                     break
-                for result in executor.completed(_TICK_S):
-                    in_flight.discard(result.spec.number)
-                    for known in preflight.sift(audit.add(result)):
-                        self._take(known, ledger, snapshot, trials, progress)
-                    if result.outcome in settings.crash_on and not run.keep_going:
-                        above = min(progress.found) if run.deterministic else -1
-                        executor.cancel(above=above)
-                        in_flight = {number for number in in_flight if number <= above}
-                        if not run.deterministic:
-                            break
+                with ledger.together():
+                    for result in executor.completed(_TICK_S):
+                        in_flight.discard(result.spec.number)
+                        for known in preflight.sift(audit.add(result)):
+                            self._take(known, ledger, snapshot, trials, progress)
+                        if result.outcome in settings.crash_on and not run.keep_going:
+                            above = min(progress.found) if run.deterministic else -1
+                            executor.cancel(above=above)
+                            in_flight = {number for number in in_flight if number <= above}
+                            if not run.deterministic:
+                                break
                 if self._stops:
                     break
                 if self._hopeless(progress, finished):

@@ -87,6 +87,25 @@ class Ledger(LedgerReader):
         )
         self._insert(row)
 
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Write what is recorded meanwhile at once, at the end: thousands of trials a second can be recorded so.
+
+        Nobody else sees it before, and a kill loses it: those trials run again.
+
+        Raises:
+            HuntDirectoryError: the disk is full.
+        """
+        try:
+            self._database.execute("BEGIN")  # which locks nothing until the first of them
+            try:
+                yield
+            finally:  # what has been recorded has happened, whatever keeps the rest from it
+                if self._database.in_transaction:  # which an error of the disk may have ended
+                    self._database.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise explained(self._path, error) from error
+
     def copy(self, row: tuple[Any, ...]) -> None:
         """Add a row that `intact_rows` of another ledger has yielded."""
         self._insert(row)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from crashhunt.base.tolerance import known_values
@@ -30,7 +30,8 @@ class ClosestApproach:
 
     def to_json(self) -> dict[str, float | None]:
         """Return plain numbers; JSON has no infinity, so an approach that never happened is null."""
-        return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
+        values = {name: getattr(self, name) for name in self.__slots__}  # asdict takes ten times as long
+        return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
     @classmethod
     def from_json(cls, data: Mapping[str, float | None]) -> ClosestApproach:

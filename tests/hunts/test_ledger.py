@@ -4,7 +4,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, suppress
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -38,6 +38,25 @@ def test_what_was_recorded_is_read_while_it_is_written(tmp_path):
     assert reader.snapshot_of(2) == "abc"
     writer.close()
     reader.close()
+
+
+def test_what_is_recorded_together_is_there_at_once_and_whatever_happens(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    with closing(Ledger(path, writable=True)) as writer, closing(Ledger(path)) as reader:
+        with writer.together():
+            with closing(sqlite3.connect(path, timeout=0.0)) as other:
+                other.execute("BEGIN IMMEDIATE")  # nobody is locked out before something is recorded
+            writer.record(result(1), snapshot="")
+            writer.record(result(2), snapshot="")
+            assert reader.finished() == set()
+            assert writer.finished() == {1, 2}
+        assert reader.finished() == {1, 2}
+        with suppress(KeyError), writer.together():
+            writer.record(result(3), snapshot="")
+            raise KeyError
+        assert reader.finished() == {1, 2, 3}
+        writer.note(heartbeat=1.0)
+        assert reader.facts()["heartbeat"] == 1.0
 
 
 def test_what_is_replaced_is_kept(tmp_path):
