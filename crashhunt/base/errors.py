@@ -22,10 +22,7 @@
 from __future__ import annotations
 
 import errno
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from typing import TypedDict, final
 
 __all__ = [
     "DISK",
@@ -37,6 +34,8 @@ __all__ = [
     "CallError",
     "CrashhuntError",
     "EpisodeError",
+    "ErrorData",
+    "ErrorWords",
     "HuntDirectoryError",
     "InvalidEpisodeError",
     "PluginError",
@@ -53,6 +52,21 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 DISK = FULL | {errno.EIO, errno.EROFS}
 """What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
+
+
+class ErrorWords(TypedDict):
+    """What an error says."""
+
+    message: str
+    fix: str
+    where: str
+
+
+@final
+class ErrorData(TypedDict):
+    """The shape that every command prints under ``--json``."""
+
+    error: ErrorWords
 
 
 class CrashhuntError(Exception):
@@ -81,12 +95,12 @@ class CrashhuntError(Exception):
         """Keep the three parts when the error crosses a process boundary."""
         return _rebuild, (type(self), self.message, self.fix, self.where)
 
-    def to_json(self) -> dict[str, dict[str, str]]:
+    def to_json(self) -> ErrorData:
         """Return the shape that every command prints under ``--json``."""
         return {"error": {"message": self.message, "fix": self.fix, "where": self.where}}
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> CrashhuntError:
+    def from_json(cls, data: ErrorData) -> CrashhuntError:
         """Rebuild what `to_json` returned, of any version."""
         said = data["error"]
         return cls(str(said.get("message", "")), fix=str(said.get("fix", "")), where=str(said.get("where", "")))

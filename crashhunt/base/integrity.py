@@ -8,13 +8,16 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from typing import TYPE_CHECKING, Any, get_args, get_origin
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, cast, get_args, get_origin
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
+    from crashhunt.base.plain import Plain
+
 __all__ = [
+    "FILES",
+    "FileEntry",
     "changed_file",
     "describe_files",
     "digest_of_data",
@@ -25,15 +28,29 @@ __all__ = [
     "typed",
 ]
 
+T = TypeVar("T")
 
-def digest_of_row(values: tuple[Any, ...]) -> int:
+
+class FileEntry(TypedDict):
+    """What is written down of a file.
+
+    Args:
+        size: in bytes.
+        blake2b: the digest of its content, in hexadecimal.
+    """
+
+    size: int
+    blake2b: str
+
+
+def digest_of_row(values: tuple[object, ...]) -> int:
     """Return the digest of a row of a table: 64 bits, with a sign, as SQLite keeps them in the least space."""
     text = "\0".join(map(str, values))  # a trial's cost is counted in microseconds, and JSON would take twice as long
     digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return int.from_bytes(digest, "little", signed=True)
 
 
-def digest_of_data(data: Mapping[str, Any]) -> str:
+def digest_of_data(data: Plain) -> str:
     """Return the digest of a JSON object, in hexadecimal, however it is laid out and ordered."""
     text = json.dumps(data, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -49,7 +66,7 @@ def digest_of_file(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
-def describe_files(folder: Path) -> dict[str, dict[str, Any]]:
+def describe_files(folder: Path) -> dict[str, FileEntry]:
     """Return size and digest of every file of a folder, by its name.
 
     Raises:
@@ -62,7 +79,7 @@ def describe_files(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def changed_file(path: Path, entry: Mapping[str, Any]) -> str:
+def changed_file(path: Path, entry: FileEntry) -> str:
     """Say what has become of a file of which size and digest were written down; empty where it is as it was."""
     try:
         if path.is_symlink() or not path.is_file():
@@ -73,18 +90,26 @@ def changed_file(path: Path, entry: Mapping[str, Any]) -> str:
     return "" if same else "has changed"
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_object(path: Path, shape: type[T]) -> T:
     """Read a JSON object.
+
+    Args:
+        path: of the file.
+        shape: the `TypedDict` that it should be; whoever reads it sees with `typed` to what it takes for granted.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: it is not one, with the reason in one line.
     """
-    return parse_object(path.read_bytes())
+    return parse_object(path.read_bytes(), shape)
 
 
-def parse_object(text: bytes) -> dict[str, Any]:
+def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the type checker
     """Return the JSON object that a text is.
+
+    Args:
+        text: in UTF-8.
+        shape: as for `read_object`.
 
     Raises:
         ValueError: it is not one, with the reason in one line.
@@ -95,14 +120,14 @@ def parse_object(text: bytes) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(found, dict):
         raise ValueError(f"it holds {type(found).__name__}, not an object")
-    return found
+    return cast("T", found)
 
 
 FILES = dict[str, dict[str, int | str]]
 """The type of what `describe_files` returns, for `typed`."""
 
 
-def typed(data: Mapping[str, Any], types: Mapping[str, Any]) -> None:
+def typed(data: Plain, types: Plain) -> None:
     """See that an object has some keys, and of which types their values are.
 
     Args:
@@ -119,7 +144,7 @@ def typed(data: Mapping[str, Any], types: Mapping[str, Any]) -> None:
             raise ValueError(f"{key} is {_short(data[key])}, not {_words(kind)}")
 
 
-def _is(value: Any, kind: Any) -> bool:
+def _is(value: object, kind: Any) -> bool:
     origin, inner = get_origin(kind), get_args(kind)
     if origin is list:
         return isinstance(value, list) and all(_is(item, inner[0]) for item in value)
@@ -134,10 +159,10 @@ def _is(value: Any, kind: Any) -> bool:
     return isinstance(value, kind)
 
 
-def _words(kind: Any) -> str:
+def _words(kind: object) -> str:
     return re.sub(r"<class '([^']+)'>", r"\1", str(kind))
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value) if not isinstance(value, int) or abs(value) < 2**64 else "a number that is too large"
     return text if len(text) <= 60 else f"{text[:57]}…"

@@ -11,7 +11,9 @@ from crashhunt.base.integrity import typed
 from crashhunt.base.names import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable
+
+    from crashhunt.base.plain import Plain
 
 __all__ = [
     "ESSENTIAL",
@@ -26,25 +28,31 @@ __all__ = [
     "typed_where_there",
 ]
 
-ESSENTIAL: Mapping[str, Any] = {"essential": True}
+ESSENTIAL: Plain = {"essential": True}
 """Metadata of a field that another version must know where it is not at its default, or refuse: without it, what
 crosses to that version would mean something else."""
 
 
-def known_values(kind: type, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that a dataclass has fields for; what a later version has added is left out."""
+def known_values(kind: type, data: Plain, *, null: object = None) -> dict[str, Any]:
+    """Return the values that a dataclass has fields for; what a later version has added is left out.
+
+    Args:
+        kind: the dataclass.
+        data: what there is.
+        null: what a null stands for.
+    """
     known = {item.name for item in fields(kind)}
-    return {name: value for name, value in data.items() if name in known}
+    return {name: null if value is None else value for name, value in data.items() if name in known}
 
 
-def known_part(kind: Any, data: Any) -> tuple[Any, Any]:
+def known_part(kind: Any, data: object) -> tuple[Any, Any]:
     """Return what of plain data a dataclass and those inside it have fields for, and the rest, laid out alike.
 
     Of a list, what is not known in its items is left out; of the rest nothing is lost. The rest of what is known
     altogether is an empty dict.
     """
     if is_dataclass(kind) and isinstance(data, dict):
-        hints = _hints_of(cast(Any, kind))
+        hints = _hints_of(cast("Any", kind))
         return _split({name: hints[name] for name in data if name in hints}, data)
     origin, inner = get_origin(kind), get_args(kind)
     if origin is dict and isinstance(data, dict):
@@ -58,15 +66,16 @@ def known_part(kind: Any, data: Any) -> tuple[Any, Any]:
 
 
 @cache
-def _hints_of(kind: type) -> dict[str, Any]:
+def _hints_of(kind: Any) -> dict[str, object]:
     try:
         return get_type_hints(kind)
     except NameError:  # of a type that is imported for the checker only, and so is no table of a file
         return dict.fromkeys((item.name for item in fields(kind)), Any)
 
 
-def _split(kinds: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    known, rest = {}, {name: value for name, value in data.items() if name not in kinds}
+def _split(kinds: Plain, data: Plain) -> tuple[dict[str, object], dict[str, object]]:
+    known: dict[str, object] = {}
+    rest = {name: value for name, value in data.items() if name not in kinds}
     for name, kind in kinds.items():
         known[name], more = known_part(kind, data[name])
         if more:
@@ -74,18 +83,18 @@ def _split(kinds: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[dict[str,
     return known, rest
 
 
-def merged(data: Mapping[str, Any], rest: Mapping[str, Any]) -> dict[str, Any]:
+def merged(data: Plain, rest: Plain) -> dict[str, Any]:
     """Return plain data with what was left aside of it, where nothing else has taken its place."""
     found = dict(data)
     for name, value in rest.items():
         if name not in found:
             found[name] = value
-        elif isinstance(value, dict) and isinstance(found[name], dict):
-            found[name] = merged(found[name], value)
+        elif isinstance(value, dict) and isinstance(there := found[name], dict):
+            found[name] = merged(there, value)
     return found
 
 
-def slip(rest: Mapping[str, Any], known: Mapping[str, Any], kind: Any) -> str:
+def slip(rest: Plain, known: Plain, kind: type) -> str:
     """Return a key that is not known and looks like one that is missing: somebody's slip, or damage; else nothing.
 
     Args:
@@ -97,7 +106,7 @@ def slip(rest: Mapping[str, Any], known: Mapping[str, Any], kind: Any) -> str:
     return next((name for name in rest if name not in known and did_you_mean(name, missing)), "")
 
 
-def typed_where_there(data: Mapping[str, Any], types: Mapping[str, Any]) -> None:
+def typed_where_there(data: Plain, types: Plain) -> None:
     """See of which types the values of some keys are, of those that are there.
 
     Raises:
@@ -112,23 +121,22 @@ def essentials(*kinds: Any) -> frozenset[str]:
     for kind in kinds:
         if is_dataclass(kind):
             found |= {item.name for item in fields(kind) if "essential" in item.metadata}
-            found |= essentials(*_hints_of(cast(Any, kind)).values())
+            found |= essentials(*_hints_of(cast("Any", kind)).values())
         found |= essentials(*get_args(kind))
     return frozenset(found)
 
 
-def not_understood(data: Mapping[str, Any], *kinds: Any) -> list[str]:
-    """Return what plain data says that its reader must know, and none of some dataclasses has."""
-    needed = data.get("requires") or ()
+def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:
+    """Return what plain data says that its reader must know (``requires``), and none of some dataclasses has."""
     return sorted(set(needed) - essentials(*kinds)) if needed else []
 
 
-def required_of(value: Any) -> list[str]:
+def required_of(value: object) -> list[str]:
     """Return the names of the essential fields of an object that are not at their default; not of those inside it."""
-    return [name for name, default in _essential(cast(Any, type(value))) if getattr(value, name) != default]
+    return [name for name, default in _essential(cast("Any", type(value))) if getattr(value, name) != default]
 
 
-def required_in(value: Any) -> list[str]:
+def required_in(value: object) -> list[str]:
     """Return the same of an object and of all those inside it."""
     if isinstance(value, dict):
         value = list(value.values())
@@ -141,5 +149,5 @@ def required_in(value: Any) -> list[str]:
 
 
 @cache
-def _essential(kind: type) -> list[tuple[str, Any]]:
+def _essential(kind: Any) -> list[tuple[str, object]]:
     return [(item.name, item.default) for item in fields(kind) if "essential" in item.metadata]

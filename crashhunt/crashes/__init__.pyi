@@ -7,6 +7,7 @@ from ._bundle import (
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
+from ._data import CrashData as CrashData, CrashSummary as CrashSummary
 from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
 from ._escape import find_escape as find_escape, partner as partner
 from ._find import find_bundle as find_bundle, list_bundles as list_bundles

@@ -13,19 +13,21 @@ import zipfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.watching import watched
+from crashhunt.crashes._data import ArchiveIndex
 from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.base.integrity import FileEntry
     from crashhunt.base.watching import Watch
     from crashhunt.crashes._bundle import Bundle
 
@@ -77,7 +79,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     # Of the snapshot what its manifest names: an agent may have left data beside its code.
     files += [snapshot.path / name for name in snapshot.manifest["files"]]
     files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
-    entries: dict[str, dict[str, Any]] = {}
+    entries: dict[str, FileEntry] = {}
     with whole_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in watched(files, len(files), watch):
             if path.is_file() and not path.is_symlink():
@@ -85,7 +87,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
                 data = path.read_bytes()
                 entries[name] = {"size": len(data), "blake2b": _hash(data)}
                 archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
-        index = {
+        index: ArchiveIndex = {
             "schema": SCHEMA,
             "crash": bundle.id,
             "made_by": f"{getpass.getuser()}@{socket.gethostname()}",
@@ -128,12 +130,12 @@ def open_archive(path: Path) -> Iterator[Archive]:
         )
 
 
-def _read_index(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
+def _read_index(archive: zipfile.ZipFile, path: Path) -> ArchiveIndex:
     try:
         info = archive.getinfo(layout.ARCHIVE_INDEX)
         if info.file_size > 50 * 10**6:
             raise _refusal(path, f"its {layout.ARCHIVE_INDEX} is too large")
-        index = parse_object(archive.read(info))
+        index = parse_object(archive.read(info), ArchiveIndex)
         typed(index, {"schema": int})
         if index["schema"] != SCHEMA:
             raise BundleError(
@@ -147,7 +149,7 @@ def _read_index(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     return index
 
 
-def _checked(archive: zipfile.ZipFile, index: dict[str, Any], path: Path) -> list[zipfile.ZipInfo]:
+def _checked(archive: zipfile.ZipFile, index: ArchiveIndex, path: Path) -> list[zipfile.ZipInfo]:
     """The entries to unpack, or a refusal."""
     entries = [entry for entry in archive.infolist() if entry.filename != layout.ARCHIVE_INDEX]
     names = [entry.filename for entry in entries]
@@ -173,9 +175,7 @@ def _checked(archive: zipfile.ZipFile, index: dict[str, Any], path: Path) -> lis
     return entries
 
 
-def _extract(
-    archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, listed: dict[str, Any], path: Path
-) -> None:
+def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, listed: FileEntry, path: Path) -> None:
     target = directory / entry.filename
     target.parent.mkdir(parents=True, exist_ok=True)
     digest, size = hashlib.blake2b(digest_size=16), 0

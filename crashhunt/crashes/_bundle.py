@@ -7,22 +7,27 @@ import re
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
-from crashhunt.base.tolerance import typed_where_there
+from crashhunt.base.tolerance import known_part, merged, typed_where_there
+from crashhunt.crashes._data import CrashData, Protected
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
 from crashhunt.trial import Collision, Escape, Failure, TrialResult, TrialSpec, check_parts, outcome_of
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.base.integrity import FileEntry
+    from crashhunt.base.plain import Plain
+    from crashhunt.crashes._data import CrashSummary
+    from crashhunt.recording import DivergenceData
     from crashhunt.world import Lane
 
 __all__ = [
@@ -37,11 +42,11 @@ __all__ = [
 SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of itself and of the files beside it
 _KNOWN = bool | float | str | None
-_NEEDED: dict[str, Any] = {
+_NEEDED: Plain = {
     **dict.fromkeys(("trial", "seed", "max_steps", "step"), int),
     **dict.fromkeys(("outcome", "digest", "snapshot"), str),
 }
-_TYPES: dict[str, Any] = {
+_TYPES: Plain = {
     "hunt_seed": int,
     "arguments": dict[str, dict[str, _KNOWN]],
     "scenario_arguments": dict[str, _KNOWN],
@@ -49,9 +54,9 @@ _TYPES: dict[str, Any] = {
     "confirmed": bool | None,
     "divergence": dict | None,
 }
-_KEYS = {
-    *_NEEDED, *_TYPES, "schema", "id", "category", "summary", "collision", "failure", "escape", "event", "events",
-    "closest_approach", "versions", "files", "integrity",
+_KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
+_PARTS: Mapping[str, type] = {
+    "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
 }  # fmt: skip
 _UNDAMAGED = "get an undamaged copy, or see with crashhunt check what can be saved"
 
@@ -76,9 +81,9 @@ class Bundle:
     hunt_seed: int
     snapshot: str
     confirmed: bool | None = None
-    divergence: dict[str, Any] | None = None
-    files: dict[str, dict[str, Any]] = field(default_factory=dict)
-    added: dict[str, Any] = field(default_factory=dict)
+    divergence: DivergenceData | None = None
+    files: Mapping[str, FileEntry] = field(default_factory=dict)
+    added: Plain = field(default_factory=dict)
 
     @property
     def id(self) -> str:
@@ -125,7 +130,7 @@ class Bundle:
             found += [f"{name} was not there" for name in sorted(names - self.files.keys()) if name[0] != "."]
         return found
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> CrashSummary:
         """Return the shape that ``run --json`` prints."""
         plain = self.result.to_json()
         spec = plain["spec"]
@@ -148,29 +153,37 @@ class Bundle:
         result = self.result
         plain = result.to_json()
         spec = plain["spec"]
-        data = {
+        data: CrashData = {
             "schema": SCHEMA,
             "id": self.id,
             "hunt_seed": self.hunt_seed,
             "trial": spec["number"],
-            **{name: spec[name] for name in ("seed", "max_steps", "arguments", "scenario_arguments")},
+            "seed": spec["seed"],
+            "max_steps": spec["max_steps"],
+            "arguments": spec["arguments"],
+            "scenario_arguments": spec["scenario_arguments"],
             "outcome": plain["outcome"],
             "category": result.outcome.category,
             "summary": result.summary,
             "step": plain["steps"],
-            **{name: plain[name] for name in ("sim_time_s", "collision", "failure", "escape", "event", "events")},
+            "sim_time_s": plain["sim_time_s"],
+            "collision": plain["collision"],
+            "failure": plain["failure"],
+            "escape": plain["escape"],
+            "event": plain["event"],
+            "events": plain["events"],
             "closest_approach": plain["closest"],
             "digest": plain["digest"],
             "snapshot": self.snapshot,
             "versions": versions(),
             "confirmed": self.confirmed,
             "divergence": self.divergence,
-            "files": self.files or _files_beside(folder),
-            **self.added,
+            "files": dict(self.files) or _files_beside(folder),
         }
-        data["integrity"] = digest_of_data(data)
+        whole = merged(data, self.added)
+        whole["integrity"] = digest_of_data(whole)
         with whole_file(folder / layout.CRASH) as temporary:
-            text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+            text = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
             temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
 
 
@@ -182,7 +195,7 @@ def read_bundle(path: Path) -> Bundle:
     """
     file = path / layout.CRASH
     try:
-        data = read_object(file)
+        data = read_object(file, CrashData)
         typed(data, {"schema": int})
         if not 1 <= data["schema"] <= SCHEMA:
             raise BundleError(
@@ -202,7 +215,7 @@ def read_bundle(path: Path) -> Bundle:
         raise BundleError(f"not an undamaged crash.json: {reason}", fix=_UNDAMAGED, where=str(file)) from None
 
 
-def _see_that_it_is_whole(data: dict[str, Any]) -> None:
+def _see_that_it_is_whole(data: Protected) -> None:
     typed(data, {"integrity": str, "files": FILES})
     said = data.pop("integrity")
     if digest_of_data(data) != said:
@@ -213,10 +226,10 @@ def _see_that_it_is_whole(data: dict[str, Any]) -> None:
             raise ValueError(f"the file {name!r} is not beside it")
 
 
-def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
+def _bundle(path: Path, data: CrashData) -> Bundle:
     typed(data, _NEEDED)
     typed_where_there(data, _TYPES)
-    hit, failure, event, escape = (data.get(name) for name in ("collision", "failure", "event", "escape"))
+    hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
     closest = data.get("closest_approach", {})
     check_parts(closest, hit, failure, escape, event)
     typed({"events": data.get("events")}, {"events": dict[str, int] | None})
@@ -253,8 +266,18 @@ def _bundle(path: Path, data: dict[str, Any]) -> Bundle:
         data.get("confirmed"),
         data.get("divergence"),
         files,
-        added={name: value for name, value in data.items() if name not in _KEYS},
+        added=_added(data),
     )
+
+
+def _added(data: CrashData) -> dict[str, object]:
+    """What a later version says, of the crash and inside its parts."""
+    added: dict[str, object] = {name: value for name, value in data.items() if name not in _KEYS}
+    for name, kind in _PARTS.items():
+        _, rest = known_part(kind, data.get(name))
+        if rest:
+            added[name] = rest
+    return added
 
 
 def write_bundle(
@@ -304,11 +327,11 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-def files_of(folder: Path) -> dict[str, dict[str, Any]]:
+def files_of(folder: Path) -> dict[str, FileEntry]:
     """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
     for name in (layout.CRASH, layout.PARAMS):
         with suppress(OSError, ValueError):
-            data = read_object(folder / name)
+            data = read_object(folder / name, Protected)
             if "integrity" in data:
                 _see_that_it_is_whole(data)
                 return dict(data["files"])
@@ -318,7 +341,7 @@ def files_of(folder: Path) -> dict[str, dict[str, Any]]:
 def read_params(folder: Path) -> list[str]:
     """Return what of a trial that was kept is not as it was written."""
     try:
-        data = read_object(folder / layout.PARAMS)
+        data = read_object(folder / layout.PARAMS, Protected)
         if "integrity" in data:  # which earlier versions did not write
             _see_that_it_is_whole(data)
         files = data.get("files", {}).items()
@@ -327,7 +350,7 @@ def read_params(folder: Path) -> list[str]:
         return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
 
 
-def _files_beside(folder: Path) -> dict[str, dict[str, Any]]:
+def _files_beside(folder: Path) -> dict[str, FileEntry]:
     found = describe_files(folder)
     return {
         name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."

@@ -7,19 +7,22 @@ import json
 import os
 import secrets
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+
+if TYPE_CHECKING:
+    from crashhunt.crashes._data import ArchiveIndex
 
 __all__ = ["is_made_here", "signature"]
 
 
-def is_made_here(index: dict[str, Any]) -> bool:
+def is_made_here(index: ArchiveIndex) -> bool:
     """Whether the signature of an archive is this user's."""
     return hmac.compare_digest(str(index.get("signature", "")), signature(index))
 
 
-def signature(index: dict[str, Any]) -> str:
+def signature(index: ArchiveIndex) -> str:
     """What only this user on this machine can know of an archive."""
     content = {name: value for name, value in index.items() if name != "signature"}
     text = json.dumps(content, sort_keys=True, default=str).encode()

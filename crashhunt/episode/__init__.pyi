@@ -5,6 +5,7 @@ from ._observer import Observer as Observer
 from ._parts import Braking as Braking, Parts as Parts, require_origin as require_origin, seal as seal
 from ._recorder import Recorder as Recorder
 from ._settings import (
+    SettingsData as SettingsData,
     WorkerSettings as WorkerSettings,
     answer_file as answer_file,
     scratch_of as scratch_of,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -16,12 +16,13 @@ from crashhunt.scenario import as_in_file
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Sequence
 
+    from crashhunt.base.plain import Plain
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["WorkerSettings", "answer_file", "scratch_of"]
+__all__ = ["SettingsData", "WorkerSettings", "answer_file", "scratch_of"]
 
 
 _TIMEOUT_S = 60.0  # what leaving it out means, whatever the default of the option is some day
@@ -29,6 +30,25 @@ _AUDIT = 1  # apart from what draws the trial itself
 
 
 _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
+
+
+class SettingsData(TypedDict):
+    """The plain data of `WorkerSettings`; what may be missing has come since the first version."""
+
+    schema: int
+    requires: NotRequired[list[str]]
+    scenario: Plain
+    oracles: Sequence[str]
+    crash_on: Sequence[str]
+    scratch: str
+    code: NotRequired[Sequence[str]]
+    argument_files: NotRequired[dict[str, str]]
+    timeout_s: NotRequired[float]
+    keep_trials: NotRequired[bool]
+    sealed: NotRequired[Sequence[str] | None]
+    find_escapes: NotRequired[bool]
+    audit: NotRequired[float]
+    hunt_seed: NotRequired[int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,23 +92,33 @@ class WorkerSettings:
         draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
         return bool(draw < self.audit * 2**32)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> SettingsData:
         """Return plain dicts, strings and numbers."""
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
         scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file)))
         requires = required_in(self)
-        return {
-            **{item.name: getattr(self, item.name) for item in fields(self)},
+        data: SettingsData = {
             "schema": _SCHEMA,
-            **({"requires": requires} if requires else {}),
             "scenario": {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)},
-            "scratch": str(self.scratch),
+            "oracles": self.oracles,
             "crash_on": [str(outcome) for outcome in self.crash_on],
+            "scratch": str(self.scratch),
+            "code": self.code,
+            "argument_files": self.argument_files,
+            "timeout_s": self.timeout_s,
+            "keep_trials": self.keep_trials,
+            "sealed": self.sealed,
+            "find_escapes": self.find_escapes,
+            "audit": self.audit,
+            "hunt_seed": self.hunt_seed,
         }
+        if requires:
+            data["requires"] = requires
+        return data
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
+    def from_json(cls, data: SettingsData) -> WorkerSettings:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
 
         Raises:
@@ -97,7 +127,7 @@ class WorkerSettings:
         from crashhunt.scenario import Scenario, installed_backends, scenario_from_dict
 
         tables = [backend.table for _, backend in installed_backends()] if data.get("requires") else []
-        unknown = not_understood(data, cls, Scenario, *tables)
+        unknown = not_understood(data.get("requires") or (), cls, Scenario, *tables)
         if data.get("schema") != _SCHEMA or unknown:
             how = f"with {', '.join(unknown)}, which this one does not know" if unknown else "in another way"
             raise CrashhuntError(
@@ -105,13 +135,10 @@ class WorkerSettings:
                 f"{how}",
                 fix=f"pip install crashhunt=={__version__}, or replay with --code current",
             )
-        scenario = dict(data["scenario"])
-        folder = Path(scenario.pop("folder"))
-        notes = tuple(scenario.pop("notes", ()))
+        scenario, sealed = dict(data["scenario"]), data.get("sealed")
+        folder = Path(str(scenario.pop("folder")))
         return cls(
-            scenario=scenario_from_dict(
-                {**scenario, "notes": notes}, where="worker settings", folder=folder, tolerant=True
-            ),
+            scenario=scenario_from_dict(scenario, where="worker settings", folder=folder, tolerant=True),
             oracles=tuple(data["oracles"]),
             crash_on=tuple(Outcome(name) for name in data["crash_on"]),
             scratch=Path(data["scratch"]),
@@ -119,14 +146,14 @@ class WorkerSettings:
             argument_files=data.get("argument_files", {}),
             timeout_s=data.get("timeout_s", _TIMEOUT_S),
             keep_trials=data.get("keep_trials", False),
-            sealed=tuple(data["sealed"]) if data.get("sealed") is not None else None,
+            sealed=tuple(sealed) if sealed is not None else None,
             find_escapes=data.get("find_escapes", False),
             audit=data.get("audit", 0.0),
             hunt_seed=data.get("hunt_seed", 0),
         )
 
 
-def _asked(value: Any) -> Any:
+def _asked(value: object) -> Any:
     """Plain data, in which a dataclass has only the fields that are not at their default."""
     if is_dataclass(value):
         pairs = ((item, getattr(value, item.name)) for item in fields(value))
@@ -136,7 +163,7 @@ def _asked(value: Any) -> Any:
     return [_asked(held) for held in value] if isinstance(value, list | tuple) else value
 
 
-def _default(item: Field[Any]) -> Any:
+def _default(item: Field[object]) -> object:
     return item.default_factory() if item.default_factory is not MISSING else item.default
 
 

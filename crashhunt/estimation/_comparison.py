@@ -12,8 +12,9 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.plain import finite_values
 from crashhunt.hunts import HuntResults, Ledger
-from crashhunt.trial import Constant, Outcome, finite
+from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -135,8 +136,8 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """Return the shape that ``compare --json`` prints; what is no finite number is null."""
         return {
-            "hunts": [finite(asdict(hunt)) for hunt in self.hunts],
-            "pairs": [{**finite(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
+            "hunts": [finite_values(asdict(hunt)) for hunt in self.hunts],
+            "pairs": [{**finite_values(asdict(pair)), "verdict": pair.verdict} for pair in self.pairs],
         }
 
     def write_csv(self, out: TextIO) -> None:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
@@ -28,6 +28,7 @@ from crashhunt.trial import TrialResult, TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from crashhunt.executors._messages import Answer, FreshJob
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import Escape
 
@@ -108,7 +109,11 @@ class FreshProcessExecutor:
             answer = answer_file(self._settings.scratch, number)
             answer.unlink(missing_ok=True)
             job, log_file = self._job(number), self._log(number)
-            content = {"settings": self._settings.to_json(), "spec": attempt.spec.to_json(), "answer": str(answer)}
+            content: FreshJob = {
+                "settings": self._settings.to_json(),
+                "spec": attempt.spec.to_json(),
+                "answer": str(answer),
+            }
             job.write_text(json.dumps(content), encoding="utf-8")
             with log_file.open("wb") as log, job.open("rb") as described:
                 kept = Kept(
@@ -141,7 +146,7 @@ class FreshProcessExecutor:
         if running.killed and not running.answer.exists():
             return hung(spec, scratch, self._settings.timeout_s)
         try:
-            answer = json.loads(running.answer.read_text(encoding="utf-8"))
+            answer: Answer = json.loads(running.answer.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             if exit_code > 0 and where_it_is(scratch, spec.number) is None:
                 log = self._log(spec.number)
@@ -162,6 +167,8 @@ class FreshProcessExecutor:
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
+        if "result" not in answer:
+            raise KeyError("result")
         return TrialResult.from_json(answer["result"])
 
     def _job(self, number: int) -> Path:
@@ -184,10 +191,10 @@ def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
 def main() -> None:
     """Run the one trial that a file describes; what comes of it goes into another one."""
     dumps, write, rename, leave = json.dumps, Path.write_text, os.replace, os._exit  # apart from what an agent damages
-    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    job: FreshJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     temporary = Path(f"{job['answer']}.part")
 
-    def answer(content: dict[str, Any]) -> None:
+    def answer(content: Answer) -> None:
         write(temporary, dumps(content), encoding="utf-8")
         rename(temporary, job["answer"])
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.episode import WorkerSettings
+    from crashhunt.executors._messages import Answer
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialSpec
 
@@ -239,10 +240,10 @@ class PoolExecutor:
         if attempt is None:
             return  # it was given up meanwhile
         try:
-            answer = json.loads(line)
+            answer: Answer = json.loads(line)
             if "error" in answer:
                 raise CrashhuntError.from_json(answer)
-            change = answer.get("change", True)
+            change: object = answer.get("change", True)
             if "result" in answer:
                 result = TrialResult.from_json(answer["result"])
                 if result.spec.number != attempt.spec.number:

@@ -15,7 +15,7 @@ import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.plugins import locate, registered
@@ -26,9 +26,9 @@ from crashhunt.executors._worker import Worker, loaded
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+    from crashhunt.base.errors import ErrorData
     from crashhunt.episode import Parts
+    from crashhunt.executors._messages import Answer, FromTemplate, TemplateJob, ToTemplate
 
 __all__ = ["main"]
 
@@ -45,7 +45,7 @@ _dumps, _loads, _leave = json.dumps, json.loads, os._exit
 def main() -> None:
     """Be the template; standard error is a log."""
     control = socket.socket(fileno=int(sys.argv[1]))
-    job = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
+    job: TemplateJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
     sys.path[:] = job["sys_path"]
     for number in _NOT_OURS:
         signal.signal(number, signal.SIG_IGN)
@@ -79,7 +79,7 @@ def _serve(control: socket.socket, settings: WorkerSettings, parts: Parts | None
             data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 1)
             if not data:
                 return  # the keeper ends everybody
-            message = json.loads(data)
+            message: ToTemplate = json.loads(data)
             if "kill" in message:
                 for pid in [pid for pid, slot in slots.items() if slot == message["kill"]]:
                     kill(pid)
@@ -118,7 +118,7 @@ def _be_worker(pool: socket.socket, settings: WorkerSettings, parts: Parts | Non
         os.setsid()  # what a terminal or a batch system tells everybody is for the hunt
         die_with(_template)
         worker = None
-        answer: Mapping[str, object]
+        answer: Answer
         place = os.fstat(own := pool.fileno())
         with pool.makefile("rb") as specs:
             for line in specs:
@@ -143,7 +143,7 @@ def _be_worker(pool: socket.socket, settings: WorkerSettings, parts: Parts | Non
         _leave(code)
 
 
-def _explained(error: BaseException, *, used: bool) -> dict[str, Any]:
+def _explained(error: BaseException, *, used: bool) -> Answer:
     """What came of a trial that raised what it should not: of its agent's doing where there was one, or our own."""
     said = f"{type(error).__name__}: {words_of(error)}"
     if used and not (isinstance(error, OSError) and error.errno in DISK):
@@ -170,7 +170,7 @@ def _can_be_forked() -> bool:
     return threads == 1 and not (torch is not None and torch.cuda.is_initialized())
 
 
-def _send(control: socket.socket, message: Mapping[str, object]) -> None:
+def _send(control: socket.socket, message: FromTemplate | ErrorData) -> None:
     with suppress(OSError):  # nobody is there any more, which is seen elsewhere
         control.send(json.dumps(message).encode())
 

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
@@ -19,6 +19,7 @@ from crashhunt.executors._worker import worker_environment
 
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
+    from crashhunt.executors._messages import FromTemplate, TemplateJob
 
 __all__ = ["TemplateLink"]
 
@@ -46,7 +47,7 @@ class TemplateLink:
         self.unfit = False
         number = next(_numbers)
         job = settings.scratch / f"template-{number}.json"
-        content = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
+        content: TemplateJob = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
         job.write_text(json.dumps(content), encoding="utf-8")
         self._log = settings.scratch / f"template-{number}.log"
         # Messages stay apart from each other, and file descriptors with theirs.
@@ -73,13 +74,13 @@ class TemplateLink:
         with suppress(OSError):
             self.control.send(json.dumps({"kill": slot}).encode())
 
-    def receive(self) -> list[dict[str, Any]] | None:
+    def receive(self) -> list[FromTemplate] | None:
         """Return which workers have ended, and how; None where the template itself is gone.
 
         Raises:
             CrashhuntError: what trials need cannot be imported.
         """
-        ended: list[dict[str, Any]] = []
+        ended: list[FromTemplate] = []
         while True:
             try:
                 data = self.control.recv(_MESSAGE)
@@ -89,7 +90,7 @@ class TemplateLink:
                 data = b""
             if not data:
                 return None
-            message = json.loads(data)
+            message: FromTemplate = json.loads(data)
             if "error" in message:
                 raise CrashhuntError(**message["error"])
             if "slot" in message:

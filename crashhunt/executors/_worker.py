@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import DISK, RecorderError
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.simulators import FullBraking, Simulator
-    from crashhunt.trial import Overruled, TrialResult, TrialSpec
+    from crashhunt.trial import Overruled, TrialResult, TrialSpec, Value
 
 __all__ = [
     "Worker",
@@ -189,7 +189,9 @@ class Worker:
         """Return how a vehicle of the last trial brakes as hard as it can, where its simulator says."""
         return self._simulator.full_braking(agent) if offers(self._simulator, BrakesFully) else None
 
-    def _overruled(self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+    def _overruled(
+        self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
+    ) -> Agent:
         made = self._parts.agent(agent, simulator, arguments)
         return Braking(made, simulator, agent, overruled.after) if agent == overruled.agent else made
 

@@ -8,7 +8,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor
+    from crashhunt.hunts._data import Facts
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
@@ -268,7 +269,7 @@ class Hunt:
             return "no_valid_trial"
         return "all_trials"
 
-    def _lag(self, before: Mapping[str, Any]) -> int:
+    def _lag(self, before: Facts) -> int:
         """By how many trials a sampler that learns is told late."""
         under_way = _under_way(self._parallel_here)
         return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way

@@ -11,7 +11,7 @@ import json
 import sqlite3
 import time
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from crashhunt.hunts._data import Facts, Noted, Row
     from crashhunt.trial import TrialResult
 
 __all__ = ["Ledger", "Turn", "has_begun"]
@@ -106,7 +107,7 @@ class Ledger(LedgerReader):
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
 
-    def copy(self, row: tuple[Any, ...]) -> None:
+    def copy(self, row: Row) -> None:
         """Add a row that `intact_rows` of another ledger has yielded."""
         self._insert(row)
 
@@ -130,7 +131,7 @@ class Ledger(LedgerReader):
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
 
-    def note(self, **facts: Any) -> None:
+    def note(self, **facts: Unpack[Facts]) -> None:
         """Set facts about the hunt itself, such as its state; None removes one.
 
         When this returns, everything that was recorded so far is on the disk, and stays there if the power goes. It is
@@ -143,7 +144,7 @@ class Ledger(LedgerReader):
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
 
-    def enter(self, state: str, detail: str = "", **facts: Any) -> None:
+    def enter(self, state: str, detail: str = "", **facts: Unpack[Noted]) -> None:
         """Set the state of the hunt, and write down when it got there and why."""
         self.note(state=state, detail=detail or None, **facts)
         self._event(state, detail)
@@ -201,14 +202,14 @@ class Ledger(LedgerReader):
             self._writable = False
         self._database.close()
 
-    def _insert(self, row: tuple[Any, ...]) -> None:
+    def _insert(self, row: Row) -> None:
         values = (*row, digest_of_row(row))
         try:
             self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
 
-    def _note(self, key: str, value: Any) -> None:
+    def _note(self, key: str, value: object) -> None:
         if value is None:
             self._database.execute("DELETE FROM hunt WHERE key = ?", (key,))
         else:

@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
@@ -16,12 +16,15 @@ from crashhunt.trial import check_plain
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from crashhunt.hunts._data import Row
+    from crashhunt.trial import ResultData
+
 __all__ = ["checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
 
 _CHECK = "crashhunt check {} says what can be saved"
 
 
-def checked(row: tuple[Any, ...], what: str, path: Path) -> tuple[Any, ...]:
+def checked(row: Row, what: str, path: Path) -> Row:
     """Return a row, once it is sure that it is what its digest, in the last column, was made of.
 
     Raises:
@@ -32,14 +35,14 @@ def checked(row: tuple[Any, ...], what: str, path: Path) -> tuple[Any, ...]:
     return row
 
 
-def plain_trial(row: tuple[Any, ...], path: Path, *, trusted: bool) -> dict[str, Any]:
+def plain_trial(row: Row, path: Path, *, trusted: bool) -> ResultData:
     """Return the trial of a whole row as plain data.
 
     Raises:
         HuntDirectoryError: it is none; where the row had no digest, also where two places contradict each other.
     """
     try:
-        data: dict[str, Any] = json.loads(row[10])
+        data: ResultData = json.loads(row[10])
         if not trusted:
             check_plain(data)
             spec, closest = data["spec"], data["closest"]

@@ -6,18 +6,22 @@ import hashlib
 import json
 import sqlite3
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.hunts._data import Facts
 from crashhunt.hunts._ledger_file import checked, damaged, explained, plain_trial
 from crashhunt.hunts._ledger_schema import OWN_FACTS, SEAL, WITH_EVENTS
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
+    from crashhunt.base.plain import Plain
+    from crashhunt.hunts._data import Row, Seal
     from crashhunt.hunts._ledger_schema import Shape
+    from crashhunt.trial import ResultData
 
 __all__ = ["LedgerReader", "Turn"]
 
@@ -102,13 +106,13 @@ class LedgerReader:
             pass
         return found
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         """Return the facts about the hunt itself."""
         seal = self._seal()
         rows = [self._checked(row, "a fact") for row in self._select(self._shape.select("hunt"))]
         self._compare_seal(seal, "facts", sum(row[0] != SEAL for row in rows))
         try:
-            return {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS}
+            return cast(Facts, {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS})
         except (ValueError, TypeError, RecursionError) as error:
             raise damaged(self._path, f"a fact cannot be read: {error}") from None
 
@@ -143,7 +147,7 @@ class LedgerReader:
         """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
         return map(self._result, self.plain_results(outcomes=outcomes))
 
-    def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
+    def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[ResultData]:
         """Yield the same as plain data, which takes a third of the time.
 
         Raises:
@@ -159,7 +163,7 @@ class LedgerReader:
             if count != sum(said.values()) and self._seal() == seal:
                 raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
 
-    def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, tuple[Any, ...] | None]]:
+    def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, Row | None]]:
         """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
         for number in numbers:
             try:
@@ -234,23 +238,23 @@ class LedgerReader:
         row = next(self._select(f"{self._shape.select('trials')} ORDER BY number DESC LIMIT 1"), None)
         return float(row[8]) if row and self._plain(row) else None
 
-    def _select(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    def _select(self, query: str, values: Row = ()) -> Iterator[Row]:
         try:
             for row in self._database.execute(query, values):  # noqa: UP028 - it would close the cursor, maybe too late
                 yield row
         except sqlite3.Error as error:  # also in the middle of a file that is damaged
             raise explained(self._path, error) from error
 
-    def _row(self, number: int) -> tuple[Any, ...] | None:
+    def _row(self, number: int) -> Row | None:
         return next(self._select(f"{self._shape.select('trials')} WHERE number = ?", (number,)), None)
 
-    def _checked(self, row: tuple[Any, ...], what: str) -> tuple[Any, ...]:
+    def _checked(self, row: Row, what: str) -> Row:
         return checked(row, what, self._path) if self.protected else row
 
-    def _plain(self, row: tuple[Any, ...]) -> dict[str, Any]:
+    def _plain(self, row: Row) -> ResultData:
         return plain_trial(self._checked(row, f"trial {row[0]}"), self._path, trusted=self.protected)
 
-    def _result(self, data: dict[str, Any]) -> TrialResult:
+    def _result(self, data: ResultData) -> TrialResult:
         try:
             return TrialResult.from_json(data)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -260,23 +264,23 @@ class LedgerReader:
     def _proposing(self) -> bool:
         return "proposals" in self._shape.columns
 
-    def _turn(self, row: tuple[Any, ...]) -> Turn:
+    def _turn(self, row: Row) -> Turn:
         try:
             _, _, told, spec, *_ = self._checked(row, f"the proposal of trial {row[1]}")
             return Turn(tuple(json.loads(told)), TrialSpec.from_json(json.loads(spec)))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise damaged(self._path, f"a proposal cannot be read: {type(error).__name__}: {error}") from None
 
-    def _seal(self) -> dict[str, Any] | None:
+    def _seal(self) -> Seal | None:
         if not self.protected:
             return None
         row = next(self._select(f"{self._shape.select('hunt')} WHERE key = ?", (SEAL,)), None)
         if row is None:
             return None
-        found: dict[str, Any] = json.loads(self._checked(row, "its seal")[1])
+        found: Seal = json.loads(self._checked(row, "its seal")[1])
         return found
 
-    def _make_seal(self) -> dict[str, Any]:
+    def _make_seal(self) -> Seal:
         said = hashlib.blake2b(digest_size=16)
         for rows in self._chunks():
             said.update(_as_text(rows))
@@ -290,12 +294,13 @@ class LedgerReader:
             "facts": self._count(f"hunt WHERE key <> '{SEAL}'"),
         }
 
-    def _fits(self, seal: Mapping[str, Any]) -> bool:
+    def _fits(self, seal: Seal) -> bool:
         """Whether what is there is what was sealed, by a version that knew less or more, too."""
-        found = self._make_seal()
-        return all(found[name] == seal[name] for name in found.keys() & seal.keys())
+        found: Plain = self._make_seal()
+        said: Plain = seal
+        return all(found[name] == said[name] for name in found.keys() & said.keys())
 
-    def _compare_seal(self, seal: dict[str, Any] | None, name: str, found: object) -> None:
+    def _compare_seal(self, seal: Seal | None, name: str, found: object) -> None:
         # A writer may have come meanwhile; then it is another seal, or none. One of before may say less.
         if seal is not None and found != seal.get(name, found) and self._seal() == seal:
             raise damaged(self._path, f"{name} are not those that were written")
@@ -309,7 +314,7 @@ class LedgerReader:
     def _steps(self) -> int:
         return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
 
-    def _chunks(self) -> Iterator[list[tuple[Any, ...]]]:
+    def _chunks(self) -> Iterator[list[Row]]:
         try:
             cursor = self._database.execute(
                 "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
@@ -321,5 +326,5 @@ class LedgerReader:
             raise explained(self._path, error) from error
 
 
-def _as_text(rows: list[tuple[Any, ...]]) -> bytes:
+def _as_text(rows: list[Row]) -> bytes:
     return "".join(map(repr, rows)).encode()

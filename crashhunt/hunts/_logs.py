@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
@@ -17,6 +17,8 @@ from crashhunt.hunts._state import hunt_state, is_hunt
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from crashhunt.base.integrity import FileEntry
 
 __all__ = ["LogKind", "LogReader"]
 
@@ -39,7 +41,7 @@ class LogReader:
         self._kinds = kinds
         self._trial = trial
         self._read: dict[Path, int] = {}
-        self._files: dict[Path, dict[str, dict[str, Any]]] = {}
+        self._files: dict[Path, dict[str, FileEntry]] = {}
         self._told = 0
 
     def fresh(self) -> Iterator[tuple[str, str]]:

@@ -19,8 +19,7 @@ from crashhunt.hunts._ledger_file import damaged
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+    from crashhunt.hunts._data import Facts, Owner
     from crashhunt.plans import HuntSettings
 
 __all__ = [
@@ -147,7 +146,7 @@ def hunt_state(directory: Path) -> HuntState:
         return HuntState(str(directory), "error", str(wrong), damaged=True)
 
 
-def _state(directory: Path, facts: dict[str, Any], outcomes: dict[str, int], last: float | None) -> HuntState:
+def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float | None) -> HuntState:
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
@@ -175,7 +174,7 @@ def _state(directory: Path, facts: dict[str, Any], outcomes: dict[str, int], las
     )
 
 
-def draws_independently(facts: Mapping[str, Any], settings: HuntSettings) -> bool:
+def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     """Whether every trial of a hunt was drawn independently of the others, as its sampler said when it ran.
 
     Args:
@@ -185,7 +184,7 @@ def draws_independently(facts: Mapping[str, Any], settings: HuntSettings) -> boo
     return bool(facts.get("independent", settings.sampler == "random"))
 
 
-def this_process() -> dict[str, Any]:
+def this_process() -> Owner:
     """Return what tells this process from every other, so that anybody can see later whether it is still there."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
 
@@ -197,7 +196,7 @@ def _planned(request: Path) -> int:
         return 0
 
 
-def _is_alive(owner: dict[str, Any], heartbeat: float) -> bool:
+def _is_alive(owner: Owner, heartbeat: float) -> bool:
     if owner["host"] != socket.gethostname():
         return time.time() - heartbeat < _SILENCE_S
     return bool(_started(owner["pid"]) == owner["started"])  # a process id is given to another one some day
@@ -220,6 +219,6 @@ def _started(pid: int) -> int:
     return 0 if stat[0] == "Z" else int(stat[19])
 
 
-def _in_order(path: Path) -> tuple[Any, ...]:
+def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Runs by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)

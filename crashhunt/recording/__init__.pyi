@@ -8,7 +8,7 @@ from ._blackbox import (
 )
 from ._compare import first_divergence as first_divergence, values_around as values_around
 from ._digest import digest_of as digest_of
-from ._divergence import Divergence as Divergence
+from ._divergence import Divergence as Divergence, DivergenceData as DivergenceData
 from ._foxglove import foxglove_layout as foxglove_layout, lane_borders as lane_borders, read_lanes as read_lanes
 from ._log import read_log as read_log, write_log as write_log
 from ._reading import StepRecord as StepRecord

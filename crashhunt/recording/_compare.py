@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.recording._divergence import Divergence
 from crashhunt.recording.records import RECORD_TYPES
@@ -39,7 +39,7 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
 
 def values_around(
     recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int = 2
-) -> list[tuple[int, Any, Any]]:
+) -> list[tuple[int, object, object]]:
     """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
 
     Nothing where the divergence is not about one value; None where a recording does not have the step.
@@ -53,7 +53,7 @@ def values_around(
     ]
 
 
-def _value(recording: Recording, number: int, divergence: Divergence) -> Any:
+def _value(recording: Recording, number: int, divergence: Divergence) -> object:
     if divergence.place is None or number >= len(recording.all_steps):
         return None
     name, index = divergence.place

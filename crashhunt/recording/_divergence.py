@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Divergence", "first_difference"]
+    from crashhunt.base.plain import Json
+
+__all__ = ["Divergence", "DivergenceData", "first_difference"]
+
+
+class DivergenceData(TypedDict):
+    """The plain data of a `Divergence`."""
+
+    step: int
+    agent: str
+    field: str
+    recorded: Json
+    replayed: Json
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +42,15 @@ class Divergence:
     step: int
     agent: str
     field: str
-    recorded: Any
-    replayed: Any
+    recorded: object
+    replayed: object
     place: tuple[str, tuple[int, ...]] | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> DivergenceData:
         """Return the shape that ``replay --json`` prints."""
         facts = asdict(self)
         del facts["place"]
-        data: dict[str, Any] = json.loads(json.dumps(facts, default=float))
+        data: DivergenceData = json.loads(json.dumps(facts, default=float))
         return data
 
     def __str__(self) -> str:
@@ -46,7 +58,7 @@ class Divergence:
         return f"step {self.step}, {who}{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}"
 
 
-def first_difference(left: NDArray[Any], right: NDArray[Any]) -> tuple[int, ...]:
+def first_difference(left: NDArray[np.generic], right: NDArray[np.generic]) -> tuple[int, ...]:
     """Return the index at which two arrays of one shape first differ to the bit, where they do."""
     size = left.itemsize
     was, now = left.tobytes(), right.tobytes()

@@ -11,7 +11,7 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, final
 
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
@@ -27,15 +27,17 @@ from crashhunt.simulators import HasMeanings, HasWindow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.episode import Episode
+    from crashhunt.base.errors import ErrorData
+    from crashhunt.episode import Episode, SettingsData
     from crashhunt.replays._prepare import Rerun
     from crashhunt.simulators import Simulator
+    from crashhunt.trial import ResultData, SpecData
     from crashhunt.world import Scene
 
 __all__ = ["Look", "debug", "main"]
@@ -83,13 +85,13 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
     with tempfile.TemporaryDirectory(prefix="crashhunt-debug-") as folder:
         scratch = Path(folder)
         settings = replace(rerun.worker, scratch=scratch)
-        job = {
+        job: _Job = {
             "settings": settings.to_json(),
             "spec": replace(rerun.spec, max_steps=look.until).to_json(),
             "stop_at": look.stop_at,
             "agent": rerun.bundle.driver,
             "other": next(iter(involved - {rerun.bundle.driver}), ""),
-            "panels": [look.panels[0], str(look.panels[1].resolve())] if look.panels is not None else None,
+            "panels": (look.panels[0], str(look.panels[1].resolve())) if look.panels is not None else None,
             "window": look.window,
             "pause_before": min(look.until, max(1, rerun.bundle.result.steps)),
         }
@@ -112,7 +114,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             print(f"the window was closed, with signal {-code}", file=sys.stderr)
             raise KeyboardInterrupt
         try:
-            answer = json.loads((scratch / layout.ANSWER).read_text(encoding="utf-8"))
+            answer: ErrorData | _Done = json.loads((scratch / layout.ANSWER).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             ended = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise CrashhuntError(
@@ -212,6 +214,35 @@ class _Panels(Observer):
         save_panels(self._folder, step, panels)
 
 
+@final
+class _Done(TypedDict):
+    result: ResultData
+
+
+class _Job(TypedDict):
+    """What the process of a look is to do.
+
+    Args:
+        settings: where it runs.
+        spec: the trial, to the step up to which it runs.
+        stop_at: the step in which the debugger stops; 0 for none.
+        agent: who is looked at.
+        other: the other party of a collision; empty where there was none.
+        panels: the step of which panels are shown, and the folder for them.
+        window: how long a step takes in a window, in s; None for none.
+        pause_before: the step before which a window waits.
+    """
+
+    settings: SettingsData
+    spec: SpecData
+    stop_at: int
+    agent: str
+    other: str
+    panels: tuple[int, str] | None
+    window: float | None
+    pause_before: int
+
+
 class _Window(Observer):
     """Slows a simulator down that shows what happens in a window of its own, and follows who crashes.
 
@@ -220,7 +251,7 @@ class _Window(Observer):
         job: who is followed, how long a step takes, and before which step to pause.
     """
 
-    def __init__(self, simulator: HasWindow, job: Mapping[str, Any]) -> None:
+    def __init__(self, simulator: HasWindow, job: _Job) -> None:
         self._simulator = simulator
         self._job = job
         simulator.open_window()
@@ -231,7 +262,7 @@ class _Window(Observer):
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         if step:
             self._follow()
-            time.sleep(self._job["window"])
+            time.sleep(self._job["window"] or 0.0)
         if step + 1 == self._job["pause_before"]:
             self._pause(f"step {step + 1} is next. Press Enter to see what happens: ")
 
@@ -278,7 +309,7 @@ def _module_in(code: Sequence[str]) -> str:
 def main() -> None:
     """Run the trial that a file in a folder describes, with the terminal at hand."""
     folder = Path(sys.argv[1])
-    job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
+    job: _Job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
     try:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
         seal(settings)
@@ -303,13 +334,13 @@ def main() -> None:
         )
         if window is not None:
             window.leave()
-        answer = {"result": result.to_json()}
+        answer: ErrorData | _Done = {"result": result.to_json()}
     except CrashhuntError as error:
         answer = error.to_json()
     (folder / layout.ANSWER).write_text(json.dumps(answer), encoding="utf-8")
 
 
-def _opened(simulator: Simulator, job: Mapping[str, Any]) -> _Window:
+def _opened(simulator: Simulator, job: _Job) -> _Window:
     if not offers(simulator, HasWindow):
         raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
     return _Window(simulator, job)

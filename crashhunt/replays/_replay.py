@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.crashes import Bundle
+    from crashhunt.recording import DivergenceData
     from crashhunt.replays._debugger import Look
     from crashhunt.replays._prepare import Rerun
     from crashhunt.replays._verdict import ReplayReport
@@ -68,7 +69,7 @@ def confirm(bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bund
     except _StoppedError:
         return None
     except CrashhuntError as error:
-        failure = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
+        failure: DivergenceData = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure)
     divergence = report.divergence.to_json() if report.divergence else None
     confirmed = report.verdict == "reproduced"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.snapshots import environment_changes
-from crashhunt.trial import finite
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.crashes import Bundle
+    from crashhunt.recording import AgentChannel, Prologue
     from crashhunt.replays._prepare import Code, Rerun
     from crashhunt.trial import TrialResult
 
@@ -41,7 +41,7 @@ class ReplayReport:
     replayed: TrialResult
     recording: Recording
     divergence: Divergence | None = None
-    around: tuple[tuple[int, Any, Any], ...] = ()
+    around: tuple[tuple[int, object, object], ...] = ()
     reason: str = ""
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
 
@@ -124,7 +124,7 @@ def _judge(
     return "diverged", ""
 
 
-def _prologue_change(was: Any, now: Any) -> str:
+def _prologue_change(was: Prologue, now: Prologue) -> str:
     if was.step_length_s != now.step_length_s:
         return f"the step length was {was.step_length_s:g} s and is {now.step_length_s:g} s"
     for left, right in zip(was.agents, now.agents, strict=False):
@@ -133,7 +133,7 @@ def _prologue_change(was: Any, now: Any) -> str:
     return f"the agents were {', '.join(a.id for a in was.agents)} and are {', '.join(a.id for a in now.agents)}"
 
 
-def _channel(agent: Any) -> str:
+def _channel(agent: AgentChannel) -> str:
     return f"{agent.observation_shape} {agent.observation_dtype} → {agent.action_shape} {agent.action_dtype}"
 
 
@@ -152,12 +152,14 @@ def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergenc
         return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
     if was.steps != now.steps:
         return Divergence(now.steps, "", "steps", was.steps, now.steps)
-    left, right = ({} if hit is None else finite(asdict(hit)) for hit in (was.collision, now.collision))
+    left, right = (dict(hit.to_json()) if hit else {} for hit in (was.collision, now.collision))
     # Another crashhunt may know more about the same collision, or measure it in another way, but not who hit whom.
     for name in {**left, **right}:
         always = name in ("agent", "role", "collider", "victim")
         if (code == "snapshot" or always) and left.get(name) != right.get(name):
-            return Divergence(now.steps, left.get("agent", ""), f"collision.{name}", left.get(name), right.get(name))
+            return Divergence(
+                now.steps, str(left.get("agent", "")), f"collision.{name}", left.get(name), right.get(name)
+            )
     return None
 
 

@@ -11,6 +11,7 @@ from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
 if TYPE_CHECKING:
+    from crashhunt.base.plain import Plain
     from crashhunt.crashes import Bundle
     from crashhunt.hunts import HuntReport
     from crashhunt.replays import ReplayReport
@@ -155,7 +156,7 @@ def _describe_crash(bundle: Bundle) -> list[str]:
     lines += [f"  {line}" for line in _evidence(result)]
     lines.append(f"  saved in {bundle.path}")
     if bundle.confirmed is not None:
-        first = bundle.divergence or {}
+        first: Plain = bundle.divergence or {}
         diverged = f"first difference at step {first.get('step')}, {first.get('agent')} {first.get('field')}"
         lines.append(
             "  confirmed: a fresh process did the same to the bit"

@@ -1,3 +1,4 @@
+from ._data import Environment as Environment, Manifest as Manifest
 from ._environment import (
     environment as environment,
     environment_changes as environment_changes,

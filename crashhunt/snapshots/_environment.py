@@ -7,9 +7,12 @@ import platform
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from crashhunt.scenario import installed_backends
+
+if TYPE_CHECKING:
+    from crashhunt.snapshots._data import Environment
 
 __all__ = ["environment", "environment_changes", "processor", "versions"]
 
@@ -17,7 +20,7 @@ _VERSIONED = ("crashhunt", "numpy")  # besides those of simulators
 _VARIABLES = ("PYTHONHASHSEED", "PYTHONPATH", "OMP_NUM_THREADS", "VIRTUAL_ENV")
 
 
-def environment() -> dict[str, Any]:
+def environment() -> Environment:
     """Return the content of ``environment.json``.
 
     ``loaded`` are the distributions of which something has been imported by now: with the simulator's, those on which
@@ -90,16 +93,15 @@ def _variables() -> tuple[str, ...]:
     return (*_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
 
 
-def environment_changes(recorded: dict[str, Any]) -> dict[str, tuple[str, str]]:
+def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
     """Return what is another version here than in an ``environment.json``: name to (then, now)."""
     changes = {}
-    for name, now in (
-        ("python", platform.python_version()),
-        ("implementation", platform.python_implementation()),
-        ("machine", platform.machine()),
+    for name, then, now in (
+        ("python", recorded.get("python"), platform.python_version()),
+        ("implementation", recorded.get("implementation"), platform.python_implementation()),
+        ("machine", recorded.get("machine"), platform.machine()),
     ):
-        then = recorded.get(name, now)
-        if then != now:
+        if then not in (None, now):
             changes[name] = (str(then), now)
     distributions = recorded.get("distributions", {})
     for name in recorded.get("loaded", ()):

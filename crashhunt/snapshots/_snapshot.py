@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.machinery
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
@@ -16,8 +16,10 @@ from crashhunt.base.integrity import (
     read_object,
     typed,
 )
+from crashhunt.base.tolerance import typed_where_there
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
+from crashhunt.snapshots._data import Environment, Manifest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +49,7 @@ class Snapshot:
         self.digest = path.name
 
     @cached_property
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> Manifest:
         """Return the manifest.
 
         Raises:
@@ -55,7 +57,7 @@ class Snapshot:
         """
         file = self.path / layout.MANIFEST
         try:
-            found = read_object(file)
+            found = read_object(file, Manifest)
             typed(found, {"schema": int, "paths": list[str], "files": FILES})
             if not 1 <= found["schema"] <= SCHEMA:
                 raise BundleError(
@@ -106,7 +108,7 @@ class Snapshot:
     def _settings(self) -> HuntSettings:
         return read_settings(self.path / layout.HUNT)
 
-    def environment(self) -> dict[str, Any]:
+    def environment(self) -> Environment:
         """Return what was installed; it is read once.
 
         Raises:
@@ -115,13 +117,13 @@ class Snapshot:
         return self._environment
 
     @cached_property
-    def _environment(self) -> dict[str, Any]:
+    def _environment(self) -> Environment:
         file = self.path / layout.ENVIRONMENT
         try:
-            found = read_object(file)
-            known = {"distributions": dict[str, str], "loaded": list[str]}
+            found = read_object(file, Environment)
+            known: dict[str, object] = {"distributions": dict[str, str], "loaded": list[str]}
             known |= dict.fromkeys(("python", "implementation", "machine", "cpu"), str)
-            typed(found, {key: kind for key, kind in known.items() if key in found})
+            typed_where_there(found, known)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise BundleError(f"cannot be read: {reason}", fix=_UNDAMAGED, where=str(file)) from None
@@ -186,7 +188,7 @@ class Snapshot:
 _UNDAMAGED = "get an undamaged copy of the hunt's directory"
 
 
-def _see_that_all_is_inside(manifest: dict[str, Any]) -> None:
+def _see_that_all_is_inside(manifest: Manifest) -> None:
     """See that no name in a manifest leads out of the snapshot."""
     names = [*manifest["files"], *manifest["paths"], *manifest["argument_files"].values()]
     for name in names:

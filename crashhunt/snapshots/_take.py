@@ -7,7 +7,7 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
@@ -27,6 +27,9 @@ from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from crashhunt.base.integrity import FileEntry
+    from crashhunt.snapshots._data import Environment, Manifest
 
 from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
 
@@ -101,7 +104,7 @@ def take_snapshot(
         entries = {name: _store(path, building / name) for name, path in files.items()}
         entries |= _store_scenario(scenario, building)
         stored = {name: entry for name, entry in entries.items() if entry is not None}
-        manifest = {
+        manifest: Manifest = {
             "schema": SCHEMA,
             "paths": found.paths,
             "argument_files": argument_files,
@@ -114,7 +117,7 @@ def take_snapshot(
             shutil.rmtree(building)
             return Snapshot(final)
         write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
-        facts = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
+        facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
         (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
         manifest["described"] = describe_files(building)
         manifest["integrity"] = digest_of_data(manifest)
@@ -177,7 +180,7 @@ def _size(path: Path) -> int:
         return 0
 
 
-def _store(path: Path, copy: Path) -> dict[str, Any] | None:
+def _store(path: Path, copy: Path) -> FileEntry | None:
     copy.parent.mkdir(parents=True, exist_ok=True)
     try:
         shutil.copy(path, copy)
@@ -186,10 +189,10 @@ def _store(path: Path, copy: Path) -> dict[str, Any] | None:
     return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
 
 
-def _store_scenario(scenario: Scenario, building: Path) -> dict[str, Any]:
+def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry | None]:
     import tomli_w
 
-    entries: dict[str, Any] = {}
+    entries: dict[str, FileEntry | None] = {}
     texts = set(scenario.texts())
     relocated = scenario.backend.relocated
     for name in scenario.files():

@@ -81,6 +81,7 @@ class BackendContract:
         assert is_dataclass(backend.table)
         key = fields(backend.table)[0].name
         table = as_plain_data(load_scenario(scenario))[name]
+        assert isinstance(table, dict)
         with pytest.raises(ScenarioError) as caught:
             self._loaded_with(scenario, tmp_path, {name: {**table, f"{key}x": 1}})
         assert f"unknown key '{name}.{key}x'" in str(caught.value)

@@ -1,4 +1,11 @@
-from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure, finite as finite
+from ._data import (
+    CollisionData as CollisionData,
+    EscapeData as EscapeData,
+    FailureData as FailureData,
+    ResultData as ResultData,
+    SpecData as SpecData,
+)
+from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (
     CRASHES as CRASHES,
     EVENTS as EVENTS,

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from crashhunt.base.plain import finite
 from crashhunt.base.text import encodable
 from crashhunt.base.tolerance import known_values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from crashhunt.base.plain import Plain
+    from crashhunt.trial._data import CollisionData, EscapeData, FailureData
 
-__all__ = ["Collision", "Escape", "Failure", "finite"]
+__all__ = ["Collision", "Escape", "Failure"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +51,27 @@ class Collision:
     time_s: float = math.nan
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Collision:
+    def from_json(cls, data: Plain) -> Collision:
         """Rebuild it from plain data, in which null stands for a number that nobody knows."""
-        known = known_values(cls, data)
-        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in known.items()}
-        return cls(**values | {"seen_by": tuple(data.get("seen_by", ()))})
+        known = known_values(cls, data, null=math.nan)
+        return cls(**known | {"seen_by": tuple(known.get("seen_by", ()))})
+
+    def to_json(self) -> CollisionData:
+        """Return plain data, in which null stands for a number that nobody knows."""
+        return {
+            "agent": self.agent,
+            "role": self.role,
+            "collider": self.collider,
+            "victim": self.victim,
+            "seen_by": self.seen_by,
+            "kind": self.kind,
+            "x": finite(self.x),
+            "y": finite(self.y),
+            "lane": self.lane,
+            "collider_speed": finite(self.collider_speed),
+            "victim_speed": finite(self.victim_speed),
+            "time_s": finite(self.time_s),
+        }
 
     @property
     def other(self) -> str:
@@ -80,9 +98,13 @@ class Escape:
     how: str
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Escape:
+    def from_json(cls, data: EscapeData) -> Escape:
         """Rebuild it from plain data."""
         return cls(data.get("step"), data.get("too_late"), data.get("braking"), data.get("how", ""))
+
+    def to_json(self) -> EscapeData:
+        """Return plain data."""
+        return {"step": self.step, "too_late": self.too_late, "braking": self.braking, "how": self.how}
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,18 +128,22 @@ class Failure:
     last_output: str = ""
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Failure:
+    def from_json(cls, data: Plain) -> Failure:
         """Rebuild it from plain data."""
         return cls(**{"kind": "", "message": "", **known_values(cls, data)})
+
+    def to_json(self) -> FailureData:
+        """Return plain data."""
+        return {
+            "kind": self.kind,
+            "message": self.message,
+            "traceback": self.traceback,
+            "agent": self.agent,
+            "exit_code": self.exit_code,
+            "last_output": self.last_output,
+        }
 
     def __post_init__(self) -> None:
         # It goes into JSON, a log and onto terminals, and what an exception says may be no valid text.
         for name in ("kind", "message", "traceback", "last_output"):
             object.__setattr__(self, name, encodable(getattr(self, name)))
-
-
-def finite(data: dict[str, Any]) -> dict[str, Any]:
-    """Return plain data for JSON, which has no infinity and no NaN: null instead."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in data.items()
-    }

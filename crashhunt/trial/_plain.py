@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.integrity import typed
 from crashhunt.base.tolerance import typed_where_there
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from crashhunt.base.plain import Plain
+    from crashhunt.trial._data import ResultData
 
 __all__ = ["check_parts", "check_plain"]
 
@@ -17,9 +18,6 @@ _TEXT_OR_NUMBER = bool | float | str | None
 
 
 _SPEC = {
-    "number": int,
-    "seed": int,
-    "max_steps": int,
     "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
     "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
 }
@@ -28,7 +26,7 @@ _SPEC = {
 _CLOSEST = dict.fromkeys(("time_to_collision_s", "gap_m", "required_deceleration"), float | None)
 
 
-_COLLISION: dict[str, Any] = {
+_COLLISION: Plain = {
     **dict.fromkeys(("agent", "role", "collider", "victim", "kind", "lane"), str),
     **dict.fromkeys(("x", "y", "collider_speed", "victim_speed", "time_s"), float | None),
     "seen_by": list[str],
@@ -41,7 +39,7 @@ _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_outp
 _ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
 
 
-_EVENT: dict[str, Any] = {
+_EVENT: Plain = {
     **dict.fromkeys(("kind", "agent", "what", "lane"), str),
     **dict.fromkeys(("x", "y", "speed"), float | None),
     "others": list[str],
@@ -51,7 +49,7 @@ _EVENT: dict[str, Any] = {
 _NEEDED = {"collision": ("agent", "role", "collider"), "event": ("kind", "agent", "what")}
 
 
-def check_plain(data: Mapping[str, Any]) -> None:
+def check_plain(data: ResultData) -> None:
     """See that plain data has the types that `TrialResult.from_json` takes for granted.
 
     Raises:
@@ -59,17 +57,20 @@ def check_plain(data: Mapping[str, Any]) -> None:
     """
     typed(data, {"outcome": str, "steps": int, "spec": dict})
     typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
-    typed(data["spec"], dict.fromkeys(("number", "seed", "max_steps"), int))
-    typed_where_there(data["spec"], _SPEC)
+    spec = data["spec"]
+    typed(spec, dict.fromkeys(("number", "seed", "max_steps"), int))
+    typed_where_there(spec, _SPEC)
     typed({"events": data.get("events")}, {"events": dict | None})
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
-    parts = (data.get(name) for name in ("collision", "failure", "escape", "event"))
+    parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
-    if min(data["steps"], *(data["spec"][name] for name in ("number", "seed", "max_steps"))) < 0:
+    if min(data["steps"], spec["number"], spec["seed"], spec["max_steps"]) < 0:
         raise ValueError("a number is below 0")
 
 
-def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, event: Any = None) -> None:
+def check_parts(
+    closest: object, collision: object, failure: object, escape: object = None, event: object = None
+) -> None:
     """See the same of what a trial ended with, where anything is there.
 
     Raises:
@@ -81,6 +82,6 @@ def check_parts(closest: Any, collision: Any, failure: Any, escape: Any = None, 
         ("event", event, _EVENT),
     ):  # fmt: skip
         typed({name: part}, {name: dict if name == "closest" else dict | None})
-        if part is not None:
+        if isinstance(part, dict):
             typed(part, {key: types[key] for key in _NEEDED.get(name, ())})
             typed_where_there(part, types)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from crashhunt.trial._evidence import Collision, Escape, Failure, finite
+from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from crashhunt.trial._data import ResultData
 
 __all__ = ["TrialResult"]
 
@@ -54,26 +56,35 @@ class TrialResult:
     event: Event | None = None
     events: Mapping[str, int] | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
-        data = {name: getattr(self, name) for name in _PLAIN}
-        return {
-            **data,
+        data: ResultData = {
+            "steps": self.steps,
+            "sim_time_s": self.sim_time_s,
+            "digest": self.digest,
+            "wall_s": self.wall_s,
+            "setup_s": self.setup_s,
+            "worker": self.worker,
+            "kept": self.kept,
             "outcome": str(self.outcome),
-            **({"category": self.outcome.category} if self.outcome.is_own else {}),
+            "category": self.outcome.category,
             "spec": self.spec.to_json(),
             "closest": self.closest.to_json(),
-            "collision": finite(asdict(self.collision)) if self.collision else None,
-            "failure": asdict(self.failure) if self.failure else None,
-            "escape": asdict(self.escape) if self.escape else None,
+            "collision": self.collision.to_json() if self.collision else None,
+            "failure": self.failure.to_json() if self.failure else None,
+            "escape": self.escape.to_json() if self.escape else None,
             "event": self.event.to_json() if self.event else None,
             "events": dict(self.events) if self.events is not None else None,
         }
+        if not self.outcome.is_own:
+            del data["category"]
+        return data
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> TrialResult:
+    def from_json(cls, data: ResultData) -> TrialResult:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default."""
-        hit, failure, event, escape = (data.get(name) for name in ("collision", "failure", "event", "escape"))
+        hit, failure = data.get("collision"), data.get("failure")
+        event, escape = data.get("event"), data.get("escape")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=outcome_of(data),
@@ -83,7 +94,13 @@ class TrialResult:
             escape=Escape.from_json(escape) if escape else None,
             event=Event.from_json(event) if event else None,
             events=data.get("events"),
-            **{name: data[name] for name in _PLAIN if name in data},
+            steps=data.get("steps", 0),
+            sim_time_s=data.get("sim_time_s", 0.0),
+            digest=data.get("digest", ""),
+            wall_s=data.get("wall_s", 0.0),
+            setup_s=data.get("setup_s", 0.0),
+            worker=data.get("worker", 0),
+            kept=data.get("kept", False),
         )
 
     @property
@@ -105,7 +122,3 @@ class TrialResult:
                 return f"{whose}{failure.kind}: {failure.message}"
             return failure.message
         return f"{self.outcome} after {self.steps} steps"
-
-
-# A field with a plain value is written and read if it is named here.
-_PLAIN = ("steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.tolerance import ESSENTIAL, known_values, not_understood, required_of
@@ -12,6 +12,7 @@ from crashhunt.base.version import __version__
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from crashhunt.trial._data import SpecData, SpecExtras
     from crashhunt.trial._space import Value
 
 __all__ = ["Overruled", "TrialSpec"]
@@ -54,29 +55,34 @@ class TrialSpec:
     parent: int | None = None
     origin: str = ""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> SpecData:
         """Return plain dicts and numbers."""
-        requires = required_of(self)
+        more: SpecExtras = {}
+        if self.overruled:
+            more["overruled"] = {"agent": self.overruled.agent, "after": self.overruled.after}
+        if self.parent is not None:
+            more["parent"] = self.parent
+        if self.origin:
+            more["origin"] = self.origin
+        if requires := required_of(self):
+            more["requires"] = requires
         return {
             "number": self.number,
             "seed": self.seed,
             "arguments": {agent: dict(values) for agent, values in self.arguments.items()},
             "scenario_arguments": dict(self.scenario_arguments),
             "max_steps": self.max_steps,
-            **({"overruled": asdict(self.overruled)} if self.overruled else {}),
-            **({"parent": self.parent} if self.parent is not None else {}),
-            **({"origin": self.origin} if self.origin else {}),
-            **({"requires": requires} if requires else {}),
+            **more,
         }
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> TrialSpec:
+    def from_json(cls, data: SpecData) -> TrialSpec:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
 
         Raises:
             CrashhuntError: it needs what this version does not know.
         """
-        unknown = not_understood(data, cls)
+        unknown = not_understood(data.get("requires") or (), cls)
         if unknown:
             raise CrashhuntError(
                 f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not know",

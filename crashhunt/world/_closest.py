@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
+from crashhunt.base.plain import finite
 from crashhunt.base.tolerance import known_values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from crashhunt.base.plain import Plain
 
-__all__ = ["ClosestApproach"]
+__all__ = ["ClosestApproach", "ClosestData"]
+
+
+class ClosestData(TypedDict):
+    """The plain data of a `ClosestApproach`."""
+
+    time_to_collision_s: float | None
+    gap_m: float | None
+    required_deceleration: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +37,15 @@ class ClosestApproach:
     gap_m: float = math.inf
     required_deceleration: float = 0.0
 
-    def to_json(self) -> dict[str, float | None]:
+    def to_json(self) -> ClosestData:
         """Return plain numbers; JSON has no infinity, so an approach that never happened is null."""
-        values = {name: getattr(self, name) for name in self.__slots__}  # asdict takes ten times as long
-        return {name: value if math.isfinite(value) else None for name, value in values.items()}
+        return {
+            "time_to_collision_s": finite(self.time_to_collision_s),
+            "gap_m": finite(self.gap_m),
+            "required_deceleration": finite(self.required_deceleration),
+        }
 
     @classmethod
-    def from_json(cls, data: Mapping[str, float | None]) -> ClosestApproach:
+    def from_json(cls, data: Plain) -> ClosestApproach:
         """Rebuild what `to_json` returned; what a later version has added is left out."""
-        return cls(**{name: math.inf if value is None else value for name, value in known_values(cls, data).items()})
+        return cls(**known_values(cls, data, null=math.inf))

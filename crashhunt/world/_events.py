@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.base.plain import finite
+from crashhunt.base.tolerance import known_values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
-__all__ = ["EVENT_WORDS", "LIMITS", "Event", "event_counts"]
+    from crashhunt.base.plain import Plain
+
+__all__ = ["EVENT_WORDS", "LIMITS", "Event", "EventData", "event_counts"]
 
 EVENT_WORDS = {
     "red_light": ("red light run", "red lights run"),
@@ -25,6 +30,19 @@ EVENT_WORDS = {
 LIMITS: Mapping[str, tuple[float, str]] = {"not_moving": (60.0, "s"), "hard_braking": (math.nan, "m/s²")}
 """The kinds that have a limit, which may be asked for as ``KIND:LIMIT``: what it is by default, and its unit. NaN
 stands for the ``decel`` of the braking vehicle's own type."""
+
+
+class EventData(TypedDict):
+    """The plain data of an `Event`."""
+
+    kind: str
+    agent: str
+    what: str
+    others: Sequence[str]
+    lane: str
+    x: float | None
+    y: float | None
+    speed: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,20 +69,23 @@ class Event:
     y: float = math.nan
     speed: float = math.nan
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> EventData:
         """Return plain strings and numbers; what is not a finite number is null."""
-        data = {**asdict(self), "others": list(self.others)}
         return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in data.items()
+            "kind": self.kind,
+            "agent": self.agent,
+            "what": self.what,
+            "others": list(self.others),
+            "lane": self.lane,
+            "x": finite(self.x),
+            "y": finite(self.y),
+            "speed": finite(self.speed),
         }
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Event:
+    def from_json(cls, data: Plain) -> Event:
         """Rebuild what `to_json` returned; what a later version has added is left out."""
-        known: dict[str, Any] = {
-            name: math.nan if value is None else value for name, value in data.items() if name in cls.__slots__
-        }
+        known = known_values(cls, data, null=math.nan)
         return cls(**{**known, "others": tuple(known.get("others", ()))})
 
 

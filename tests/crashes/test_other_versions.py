@@ -55,6 +55,10 @@ def grown(data, draw):
     return found | {f"later {number}": draw(values) for number in range(draw(st.integers(0, 2)))}
 
 
+def later_keys(data):
+    return {name: value for name, value in data.items() if name.startswith("later")}
+
+
 @pytest.fixture
 def hunt(tmp_path):
     shutil.copytree(HUNT, tmp_path / "hunt")
@@ -75,12 +79,14 @@ def test_a_crash_json_of_a_later_version_is_read_and_its_keys_are_kept(hunt, dat
     later = signed(grown(written, data.draw))
     file.write_text(json.dumps(later))
     found = read_bundle(bundle.path)
-    added = {name: value for name, value in later.items() if name.startswith("later")}
+    parts = ("collision", "failure", "escape", "event", "closest_approach")
+    inside = {name: later_keys(later[name]) for name in parts if isinstance(later.get(name), dict)}
     assert dataclasses.replace(found, added={}) == bundle
-    assert found.added == added
+    assert found.added == {**later_keys(later), **{name: keys for name, keys in inside.items() if keys}}
     found.write()
     again = json.loads(file.read_text())
-    assert {name: again.get(name) for name in added} == added
+    assert later_keys(again) == later_keys(later)
+    assert {name: later_keys(again[name]) for name in inside} == inside
     assert read_bundle(bundle.path) == found
     file.write_text(json.dumps({**later, "later x": 1}))
     with pytest.raises(BundleError, match="it has changed since it was written"):

@@ -1,0 +1,71 @@
+"""The shapes of what a ledger says besides trials."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["Facts", "Noted", "Owner", "Row", "Seal"]
+
+Row: TypeAlias = tuple[Any, ...]
+"""As SQLite returns one; whoever asks for it knows which columns there are."""
+
+
+class Owner(TypedDict):
+    """What tells a process from every other: ``started`` is in ticks since its machine did."""
+
+    host: str
+    pid: int
+    started: int
+
+
+class Noted(TypedDict, total=False):
+    """What is noted of a hunt besides its state; None where something no longer holds.
+
+    Args:
+        owner: who runs it, while somebody does.
+        began: when it was begun or resumed, in s since the epoch.
+        heartbeat: when it was there last, likewise.
+        done_before: how many trials had ended when it began.
+        planned: how many trials it has.
+        hunt_seed: what its trials are drawn from.
+        independent: whether they were drawn independently of each other.
+        lag: by how many trials a sampler that learns is told late.
+        origins: whether its sampler says where trials come from.
+    """
+
+    owner: Owner | None
+    began: float
+    heartbeat: float
+    done_before: int
+    planned: int
+    hunt_seed: int
+    independent: bool
+    lag: int | None
+    origins: bool
+
+
+class Facts(Noted, total=False):
+    """All facts of a hunt.
+
+    Args:
+        state: as it was entered last, one of ``running``, ``error`` or why it stopped.
+        detail: why.
+    """
+
+    state: str
+    detail: str | None
+
+
+class Seal(TypedDict):
+    """What a ledger held when it was closed; earlier versions said less."""
+
+    outcomes: Mapping[str, int]
+    steps: int
+    table: str
+    events: int
+    replaced: int
+    proposals: NotRequired[int]
+    facts: int

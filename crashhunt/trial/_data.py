@@ -1,0 +1,100 @@
+"""The shapes of a trial's plain data, as it crosses between processes and stands in ledgers and bundles.
+
+What an earlier version did not write need not be there, and what a later one has added may be there as well.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NotRequired, TypedDict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.trial._space import Value
+    from crashhunt.world import ClosestData, EventData
+
+__all__ = ["CollisionData", "EscapeData", "FailureData", "OverruledData", "ResultData", "SpecData", "SpecExtras"]
+
+
+class OverruledData(TypedDict):
+    """Of an `Overruled`."""
+
+    agent: str
+    after: int
+
+
+class SpecExtras(TypedDict, total=False):
+    """What of a `TrialSpec` is left out where there is none; ``requires`` names what another version must know."""
+
+    overruled: OverruledData
+    parent: int
+    origin: str
+    requires: list[str]
+
+
+class SpecData(SpecExtras):
+    """Of a `TrialSpec`."""
+
+    number: int
+    seed: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    max_steps: int
+
+
+class CollisionData(TypedDict):
+    """Of a `Collision`; null where nobody knows a number."""
+
+    agent: str
+    role: str
+    collider: str
+    victim: str
+    seen_by: Sequence[str]
+    kind: str
+    x: float | None
+    y: float | None
+    lane: str
+    collider_speed: float | None
+    victim_speed: float | None
+    time_s: float | None
+
+
+class FailureData(TypedDict):
+    """Of a `Failure`."""
+
+    kind: str
+    message: str
+    traceback: str
+    agent: str
+    exit_code: int | None
+    last_output: str
+
+
+class EscapeData(TypedDict):
+    """Of an `Escape`."""
+
+    step: int | None
+    too_late: int | None
+    braking: float | None
+    how: str
+
+
+class ResultData(TypedDict):
+    """Of a `TrialResult`; ``category`` is that of an outcome which an oracle has brought."""
+
+    steps: int
+    sim_time_s: float
+    digest: str
+    wall_s: float
+    setup_s: float
+    worker: int
+    kept: bool
+    outcome: str
+    category: NotRequired[str]
+    spec: SpecData
+    closest: ClosestData
+    collision: CollisionData | None
+    failure: FailureData | None
+    escape: NotRequired[EscapeData | None]
+    event: NotRequired[EventData | None]
+    events: NotRequired[dict[str, int] | None]
