@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import Annotated
 
@@ -51,6 +52,20 @@ def test_everything_that_is_registered_can_be_imported():
         assert names, group
         for name in names:
             assert callable(locate(group, name))
+
+
+def test_what_is_installed_or_removed_meanwhile_is_seen(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    os.utime(tmp_path, (1, 1))  # the clock of a file system may stand still for some milliseconds
+    assert "mine" not in registered("agents")
+    about = tmp_path / "mine-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[crashhunt.agents]\nmine = mine:Agent\n")
+    assert registered("agents")["mine"].value == "mine:Agent"
+    about.rename(tmp_path / "mine-1.0.removed")
+    os.utime(tmp_path, (2, 2))
+    assert "mine" not in registered("agents")
 
 
 @pytest.mark.parametrize(
