@@ -6,7 +6,6 @@ it changes reaches the next. What it does not show is how Python starts; `Shell.
 
 from __future__ import annotations
 
-import atexit
 import gc
 import importlib
 import json
@@ -16,10 +15,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-import traceback
-from contextlib import suppress
+import types
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
+
+from warm import Warm, at_start, leave_after, path_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 # What `run` and `replay` import; the rest of a command's modules is imported by its fork.
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
-# What Python and its libraries look at when they start.
-_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _MESSAGE = 1 << 20
 
 
@@ -40,7 +38,7 @@ class Commands:
     """
 
     def __init__(self, environment: Mapping[str, str]) -> None:
-        self._at_start = _at_start(environment)
+        self._at_start = at_start(environment)
         self._lock = threading.Lock()
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
@@ -54,9 +52,9 @@ class Commands:
 
     def fits(self, environment: Mapping[str, str]) -> bool:
         """Whether a process that is started with these variables begins as the forks do."""
-        return _at_start(environment) == self._at_start and not any(
+        return at_start(environment) == self._at_start and not any(
             Path(place, f"{name}.py").exists() or Path(place, name).exists()
-            for place in _path(environment)
+            for place in path_of(environment)
             for name in ("sitecustomize", "usercustomize", "crashhunt")
         )
 
@@ -96,16 +94,6 @@ def _text(data: bytes) -> str:
     return data.decode().replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    found = {name: value for name, value in environment.items() if name.startswith(_AT_START)}
-    found.pop("PYTHONPATH", None)
-    return found
-
-
-def _path(environment: Mapping[str, str]) -> list[str]:
-    return [place for place in environment.get("PYTHONPATH", "").split(os.pathsep) if place]
-
-
 def _serve(control: socket.socket) -> None:
     while True:
         data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 2)
@@ -124,31 +112,17 @@ def _serve(control: socket.socket) -> None:
 
 def _be_command(request: dict, out: int, err: int) -> NoReturn:
     """Do what the script `crashhunt` does, and end as a process of Python ends."""
-    code = 1
-    try:
-        for descriptor, copy in ((out, 1), (err, 2)):
-            os.dup2(descriptor, copy)
-            os.close(descriptor)
-        os.environ.clear()
-        os.environ.update(request["environment"])
-        os.chdir(request["folder"])
-        sys.path[1:1] = [place for place in map(os.path.abspath, _path(os.environ)) if place not in sys.path]
-        sys.argv = [str(CRASHHUNT), *request["words"]]
-        from crashhunt.cli import main
+    for descriptor, copy in ((out, 1), (err, 2)):
+        os.dup2(descriptor, copy)
+        os.close(descriptor)
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    os.chdir(request["folder"])
+    sys.path[1:1] = [place for place in map(os.path.abspath, path_of(os.environ)) if place not in sys.path]
+    sys.argv = [str(CRASHHUNT), *request["words"]]
+    from crashhunt.cli import main
 
-        try:
-            main()
-        except SystemExit as leaving:
-            code = leaving.code if isinstance(leaving.code, int) else 1 if leaving.code else 0
-        except BaseException:
-            traceback.print_exc()
-        threading._shutdown()  # type: ignore[attr-defined]
-        atexit._run_exitfuncs()
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(ValueError):
-                stream.flush()
-    finally:
-        os._exit(code)
+    leave_after(main)
 
 
 if __name__ == "__main__":
@@ -157,6 +131,12 @@ if __name__ == "__main__":
         module = importlib.import_module(f"crashhunt.{package}")
         for name in module.__all__:
             getattr(module, name)  # which imports what it lies in
+    del sys.modules["warm"]  # else a snapshot would have it, as whatever has been imported and is not installed
+    started = Warm(os.environ)
+    importlib.import_module("crashhunt.base.keeper").subprocess = types.SimpleNamespace(
+        Popen=started.popen, TimeoutExpired=subprocess.TimeoutExpired
+    )
     gc.collect()
     gc.freeze()
     _serve(socket.socket(fileno=int(sys.argv[1])))
+    started.close()

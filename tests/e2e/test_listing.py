@@ -36,7 +36,7 @@ def test_every_listed_scenario_says_what_it_is(shell):
 
 def test_listed_agents_can_be_hunted_by_name(shell):
     for agent in ("car-following", "lane-changer", "random"):
-        found = shell.crashhunt("run", f"out-{agent}", "1", "1", "3", "--agent", agent, "--json")
+        found = shell.crashhunt("run", f"out-{agent}", "1", "1", "3", "--agent", agent, "--seed", "1", "--json")
         assert found.json["trials_run"] == 1
         assert set(found.json["outcomes"]) <= {"survived", "off_road"}
 

@@ -1,0 +1,280 @@
+"""What a command starts, in processes that are there already: of what is installed, all is imported; of ours, nothing.
+
+A hunt starts a template for its workers, and a process for every confirmation; so does a replay. They are forks of a
+process that has imported NumPy, and where a simulator is needed that one. crashhunt, whichever the snapshot has, and
+the agents each of them imports as ever; only that a file of crashhunt which is the same here need not be compiled.
+Keepers, lifelines, signals and exit codes are real; what this does not show is how Python starts, which every command
+that a test starts by `Shell.process` or `Shell.start` does.
+"""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import gc
+import importlib
+import importlib.util
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+import types
+from contextlib import suppress
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+# What Python and its libraries look at when they start.
+_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
+_SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
+_OF_SIMULATORS = {"gym": "gymnasium", "highway": "highway_env", "sumo": "libsumo"}
+_MESSAGE = 1 << 20
+_FREE = 500  # where a process has no files of its own
+
+
+_compiled: dict[bytes, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
+
+
+def at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables that tell how a process of Python begins."""
+    found = {name: value for name, value in environment.items() if name.startswith(_AT_START)}
+    return {name: value for name, value in found.items() if name not in _SET_LATER}
+
+
+def path_of(environment: Mapping[str, str]) -> list[str]:
+    """Return the folders of PYTHONPATH."""
+    return [place for place in environment.get("PYTHONPATH", "").split(os.pathsep) if place]
+
+
+def leave_after(call: Callable[[], object]) -> NoReturn:
+    """Call something, and end as a process of Python ends."""
+    code = 1
+    try:
+        try:
+            call()
+            code = 0
+        except SystemExit as leaving:
+            code = leaving.code if isinstance(leaving.code, int) else 1 if leaving.code else 0
+        except BaseException:
+            traceback.print_exc()
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(ValueError):
+                stream.flush()
+    finally:
+        os._exit(code)
+
+
+class Warm:
+    """The process of which keepers are forks.
+
+    Args:
+        environment: of whatever a command starts.
+    """
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        from crashhunt.executors._worker import worker_environment
+
+        environment = {**environment, **worker_environment()}
+        self._at_start = at_start(environment)
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", __file__, str(theirs.fileno())], pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment,
+            )  # fmt: skip
+
+    def close(self) -> None:
+        """End it."""
+        self._control.close()
+        self._process.wait(10)
+
+    def popen(self, words: Sequence[str], **options: Any) -> Forked | subprocess.Popen[bytes]:
+        """Start a keeper as `subprocess.Popen` does, in a fork where that comes to the same."""
+        environment, folders = options["env"], path_of(options["env"])
+        there = {path.name.partition(".")[0] for folder in folders for path in Path(folder).glob("*")}
+        fits = at_start(environment) == self._at_start and options["start_new_session"]
+        if not fits or not there.isdisjoint({"sitecustomize", "usercustomize", "numpy", *sys.stdlib_module_names}):
+            return subprocess.Popen(words, **options)
+        return Forked(self._control, words, **options)
+
+
+class Forked:
+    """A fork, as far as crashhunt uses a `subprocess.Popen`."""
+
+    def __init__(
+        self, control: socket.socket, words: Sequence[str], *, env: Mapping[str, str], pass_fds: Sequence[int],
+        start_new_session: bool, **streams: Any,
+    ) -> None:  # fmt: skip
+        self.returncode: int | None = None
+        self._reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        numbers = [0, 1, 2, *pass_fds]
+        with theirs, open(os.devnull, "r+b") as nothing:
+            given = [
+                number if (stream := streams[name]) is None
+                else nothing.fileno() if stream == subprocess.DEVNULL
+                else stream if isinstance(stream, int) else stream.fileno()
+                for number, name in enumerate(("stdin", "stdout", "stderr"))
+            ]  # fmt: skip
+            request = {
+                "words": words[2:], "environment": dict(env), "folder": str(Path.cwd()), "numbers": numbers,
+                "simulator": _simulator_of(words[-1]),
+            }  # fmt: skip
+            socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), *given, *pass_fds])
+        self.pid = int(self._reply.recv(_MESSAGE))
+
+    def poll(self) -> int | None:
+        """Return how it has ended, if it has."""
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end."""
+        if self.returncode is None:
+            ready, _, _ = select.select([self._reply], [], [], timeout)
+            if not ready:
+                raise subprocess.TimeoutExpired([], timeout or 0)
+            self.returncode = int(self._reply.recv(_MESSAGE) or -signal.SIGKILL)
+            self._reply.close()
+        return self.returncode
+
+    def kill(self) -> None:
+        """Kill it, if it is there."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+
+
+def _simulator_of(job: str) -> str:
+    try:
+        simulator = json.loads(Path(job).read_text(encoding="utf-8"))["settings"]["scenario"]["simulator"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    return simulator if simulator in _OF_SIMULATORS else ""
+
+
+class _Known(SourceFileLoader):
+    """Takes what has been compiled of the same text."""
+
+    def get_code(self, fullname: str) -> types.CodeType | None:
+        known = _compiled.get(self.get_data(self.path))
+        return super().get_code(fullname) if known is None else _of_file(known, self.path)
+
+    @classmethod
+    def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
+        if name.partition(".")[0] != "crashhunt":
+            return None
+        spec = PathFinder.find_spec(name, path)
+        if spec is not None and type(spec.loader) is SourceFileLoader:
+            spec.loader = cls(name, spec.loader.path)
+        return spec
+
+
+def _of_file(code: types.CodeType, file: str) -> types.CodeType:
+    inner = (_of_file(part, file) if isinstance(part, types.CodeType) else part for part in code.co_consts)
+    return code.replace(co_filename=file, co_consts=tuple(inner))
+
+
+def _compile() -> None:
+    import crashhunt
+
+    for folder in crashhunt.__path__:
+        for file in Path(folder).rglob("*.py"):
+            code = SourceFileLoader("", str(file)).get_code("")
+            if code is not None:
+                _compiled[file.read_bytes()] = code
+
+
+def _serve(control: socket.socket, simulator: str = "") -> None:
+    """Fork for whoever asks, and tell how the forks end; one for each simulator does the same, with that imported."""
+    running: dict[int, tuple[int, socket.socket]] = {}  # what the kernel tells the end of a process by
+    others: dict[str, socket.socket] = {}
+    while True:
+        ready, _, _ = select.select([control, *running], [], [])
+        for ended in running.keys() & set(ready):
+            pid, reply = running.pop(ended)
+            _, status = os.waitpid(pid, 0)
+            os.close(ended)
+            with reply, suppress(OSError):
+                reply.send(str(os.waitstatus_to_exitcode(status)).encode())
+        if control not in ready:
+            continue
+        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 16)
+        if not data:
+            return
+        request = json.loads(data)
+        if request["simulator"] != simulator:
+            if request["simulator"] not in others:
+                others[request["simulator"]] = _with_simulator(request["simulator"])
+            socket.send_fds(others[request["simulator"]], [data], descriptors)
+        else:
+            pid = os.fork()
+            if pid == 0:
+                _be_keeper(request, descriptors[1:])
+            reply = socket.socket(fileno=os.dup(descriptors[0]))
+            reply.send(str(pid).encode())
+            running[os.pidfd_open(pid)] = pid, reply
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _with_simulator(simulator: str) -> socket.socket:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+    with theirs:
+        if os.fork() == 0:
+            os.closerange(3, theirs.fileno())
+            os.closerange(theirs.fileno() + 1, _FREE)
+            leave_after(lambda: (_import(_OF_SIMULATORS[simulator]), _serve(theirs, simulator)))
+    return ours
+
+
+def _import(*names: str) -> None:
+    for name in names:
+        importlib.import_module(name)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "crashhunt"]:
+        del sys.modules[name]
+    gc.collect()
+    gc.freeze()
+
+
+def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
+    """Begin as Python does with ``-P`` and a script."""
+    kept = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, _FREE) for descriptor in descriptors]
+    os.closerange(3, _FREE)
+    for descriptor, number in zip(kept, request["numbers"], strict=True):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    os.setsid()
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    os.chdir(request["folder"])
+    sys.dont_write_bytecode = bool(os.environ.get("PYTHONDONTWRITEBYTECODE"))
+    sys.path[:0] = map(os.path.abspath, path_of(os.environ))
+    script, *_ = sys.argv = request["words"]
+    if "numpy" in sys.modules:
+        sys.modules["numpy"].random.seed()
+    sys.meta_path.insert(0, _Known)
+    spec = importlib.util.spec_from_file_location("__main__", script)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules["__main__"] = importlib.util.module_from_spec(spec)
+    loader = spec.loader
+    leave_after(lambda: loader.exec_module(module))
+
+
+if __name__ == "__main__":
+    _compile()
+    _import("crashhunt.executors._template", "crashhunt.executors._fresh", "crashhunt.simulators.toy", "tomli_w")
+    _serve(socket.socket(fileno=int(sys.argv[1])))
