@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import fcntl
 import functools
+import gc
 import json
 import os
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,11 @@ from crashhunt.base.integrity import describe_files, digest_of_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
+
+# Every worker, and every process that a test starts, would compile the same files again: seconds each. What is imported
+# from now on is kept, as it is for users.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
 hypothesis.settings.register_profile(
@@ -89,15 +96,18 @@ def _ended(words: tuple[str, ...], done: Done, expect: int | None) -> Done:
 
 
 def _usual_environment() -> dict[str, str]:
-    # Users have Python keep what it compiled; without, every process would compile crashhunt again.
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-    kept.pop("PYTHONDONTWRITEBYTECODE", None)
-    return kept
+    return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
 
 
 @functools.cache
 def _commands() -> Commands:
     return Commands(_usual_environment())
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Thousands of tests and their modules live to the end: the garbage collector need not walk them each time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
