@@ -40,8 +40,7 @@ from crashhunt.scenario import load_scenario, with_action
 from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.testing import SimulatorContract
 
-@pytest.mark.parametrize("form", ["continuous", "meta"])
-@pytest.mark.parametrize("name", ["loop", "loop-two-agents", "merge", "intersection"])
+@pytest.mark.parametrize(("name", "form"), CASES)
 class TestSumo(SimulatorContract):
     @pytest.fixture
     def make(self, tmp_path, name, form):
@@ -61,14 +60,22 @@ class TestSumo(SimulatorContract):
 """
 
 
+# How an agent acts and where it drives have nothing to do with each other: by day each scenario comes once, and each
+# form on a road that is a ring and on one that ends.
+BY_DAY = [("loop", "continuous"), ("loop-two-agents", "meta"), ("merge", "meta"), ("intersection", "continuous")]
+BY_NIGHT = [(name, form) for name, _ in BY_DAY for form in ("continuous", "meta") if (name, form) not in BY_DAY]
+
+
 @pytest.mark.timeout(600)
-def test_sumo_keeps_the_contract(tmp_path):
+@pytest.mark.parametrize("cases", [BY_DAY, pytest.param(BY_NIGHT, marks=pytest.mark.nightly)], ids=["day", "night"])
+def test_sumo_keeps_the_contract(tmp_path, cases):
     """In a process of its own: libsumo is one simulation per process."""
-    (tmp_path / "test_sumo.py").write_text(SUMO)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "test_sumo.py"]
+    (tmp_path / "test_sumo.py").write_text(SUMO.replace("CASES", repr(cases)))
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    command += ["--basetemp", str(tmp_path / "temporary"), "test_sumo.py"]  # or it tidies up after everybody else
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=590, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"^112 passed in", done.stdout, re.MULTILINE)
+    assert re.search(r"^56 passed in", done.stdout, re.MULTILINE)
 
 
 SPACE = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 UNHARMED = "survived"
 HARM = {
+    "hangs_with_program": "hang",  # first: the others run while it is waited for
     "exits_in_init": "invalid",
     "exits_in_reset": "invalid",
     "exits_in_close": UNHARMED,
@@ -57,7 +59,6 @@ HARM = {
     "terminates_itself": "process_died",
     "terminates_group": "process_died",
     "kills_parent": "process_died",
-    "hangs_with_program": "hang",
 }
 
 
@@ -72,11 +73,11 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerSettings:
 
 
 @pytest.fixture
-def start(settings: WorkerSettings) -> Iterator[Callable[[Callable[..., Executor], int], Executor]]:
+def start(settings: WorkerSettings) -> Iterator[Callable[..., Executor]]:
     started: list[Executor] = []
 
-    def make(kind: Callable[..., Executor], parallel: int) -> Executor:
-        started.append(kind(settings, parallel=parallel))
+    def make(kind: Callable[..., Executor], parallel: int, chosen: WorkerSettings = settings) -> Executor:
+        started.append(kind(chosen, parallel=parallel))
         return started[-1]
 
     yield make
@@ -136,8 +137,9 @@ def test_harm_costs_its_own_trial_only_and_nothing_of_it_stays(start):
 @pytest.mark.parametrize(
     "what", ["daemon", "dies_with_program", "hangs_with_program", "closes_everything", "surrogate"]
 )
-def test_a_fresh_process_leaves_nothing_either(start, what):
-    fresh = start(FreshProcessExecutor, 1)
+def test_a_fresh_process_leaves_nothing_either(start, settings, what):
+    timeout_s = 1.0 if HARM[what] == "hang" else settings.timeout_s
+    fresh = start(FreshProcessExecutor, 1, replace(settings, timeout_s=timeout_s))
     fresh.submit(spec(0, what))
     assert str(collect(fresh, 1)[0].outcome) == HARM[what]
     assert programs() == []
