@@ -272,6 +272,8 @@ def test_whoever_arrives_is_gone_and_the_others_go_on(tmp_path):
         for (*_,) in drive(simulator, "FASTER", 150, seed, {"arguments": argument_values(scenario)}):
             acting.append(len(simulator.agents))
         lengths.add(tuple(sorted(set(acting), reverse=True)))
+        if (2, 1, 0) in lengths:
+            break
     assert (2, 1, 0) in lengths
 
 
@@ -320,4 +322,6 @@ def test_outlines_and_highway_env_agree_on_most_crashes(tmp_path):
         for _ in drive(simulator, "FASTER", 150, seed):
             for oracle in (ReportedCollision(), Overlap()):
                 seen[oracle.name] += bool(oracle.check(simulator.scene(), ("agent-0",)))
+        if seen["reported"] >= 3:
+            break
     assert seen["reported"] >= 3
