@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+import re
 import sys
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.blame import place_of
 from crashhunt.base.errors import PluginError
@@ -17,9 +18,12 @@ from crashhunt.base.names import did_you_mean, one_of
 
 if TYPE_CHECKING:
     import types
+    from collections.abc import Iterator
+    from importlib.metadata import Distribution, EntryPoint
 
 __all__ = [
     "Group",
+    "distributions",
     "import_module",
     "load_attribute",
     "load_object",
@@ -32,22 +36,41 @@ Group = Literal["agents", "backends", "executors", "oracles", "samplers", "simul
 
 def registered(group: Group) -> dict[str, EntryPoint]:
     """Return the entry points of a group, by name; nothing is imported."""
-    points = _entry_points(tuple((place, _changed_at(place)) for place in sys.path))
-    return {point.name: point for point in points[group]}
+    found: dict[str, EntryPoint] = {}
+    seen: set[str] = set()
+    for distribution in distributions():
+        name, points = _points_of(distribution)
+        if name not in seen:  # of two versions, the first is the one that is imported
+            seen.add(name)
+            found |= points.get(group, {})
+    return dict(sorted(found.items()))
 
 
-@lru_cache(maxsize=4)
-def _entry_points(places: tuple[tuple[str, int], ...]) -> dict[str, list[EntryPoint]]:  # noqa: ARG001 - as of when
-    # Reads through all that is installed, which takes milliseconds; a hunt asks some twenty times.
-    found = entry_points()
-    return {
-        group: sorted(found.select(group=f"crashhunt.{group}"), key=lambda point: point.name)
-        for group in get_args(Group)
-    }
+def distributions() -> Iterator[Distribution]:
+    """Yield what is installed, as `importlib.metadata` does, but the very same objects again until that changes."""
+    # To look through all that is installed takes milliseconds, and a hunt asks some twenty times.
+    for place in sys.path:
+        yield from _lying_in(place, _changed_at(place))
+
+
+@lru_cache(maxsize=64)
+def _lying_in(place: str, changed_at: int) -> list[Distribution]:  # noqa: ARG001 - as of when
+    return list(metadata.distributions(path=[place]))
+
+
+@lru_cache(maxsize=1024)
+def _points_of(distribution: Distribution) -> tuple[str, dict[str, dict[str, EntryPoint]]]:
+    """The name of a distribution, and its entry points for us: group to name to entry point."""
+    found: dict[str, dict[str, EntryPoint]] = {}
+    for point in distribution.entry_points:
+        package, _, group = point.group.partition(".")
+        if package == "crashhunt":
+            found.setdefault(group, {})[point.name] = point
+    return (re.sub(r"[-_.]+", "-", distribution.name).lower() if found else ""), found
 
 
 def _changed_at(place: str) -> int:
-    """When something was last installed or removed there."""
+    """When something was last installed or removed there, in ns."""
     try:
         return Path(place).stat().st_mtime_ns
     except OSError:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base.plugins import distributions as installed
 from crashhunt.scenario import installed_backends
 
 if TYPE_CHECKING:
@@ -30,12 +32,12 @@ def environment() -> Environment:
     distributions: dict[str, str] = {}
     named = versions()
     loaded: set[str] = set()
-    for distribution in metadata.distributions():
-        name, version = _name_and_version(distribution)
+    for distribution in installed():
+        name, version, theirs = _facts_of(distribution)
         if not name:
             continue
         distributions[name] = version
-        if name in named or not modules.isdisjoint(_top_level_modules(distribution)):
+        if name in named or not modules.isdisjoint(theirs):
             loaded.add(name)
     return {
         "schema": 1,
@@ -49,6 +51,11 @@ def environment() -> Environment:
         "loaded": sorted(loaded, key=str.lower),
         "variables": {name: os.environ[name] for name in _variables() if name in os.environ},
     }
+
+
+@lru_cache(maxsize=1024)
+def _facts_of(distribution: metadata.Distribution) -> tuple[str, str, set[str]]:
+    return *_name_and_version(distribution), _top_level_modules(distribution)
 
 
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
