@@ -10,6 +10,7 @@ import gc
 import importlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import tempfile
 import threading
 import types
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import IO, TYPE_CHECKING, NoReturn
 
 from warm import Warm, at_start, leave_after, path_of
 
@@ -125,17 +126,73 @@ def _be_command(request: dict, out: int, err: int) -> NoReturn:
     leave_after(main)
 
 
+class Hunt:
+    """The process of a hunt of a suite: a fork of the command, as far as `run_all` uses a `subprocess.Popen`."""
+
+    def __init__(self, words: Sequence[str], *, cwd: str | None, stdout: IO[bytes], **_: object) -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.pid = os.fork()
+        self.returncode: int | None = None
+        if self.pid == 0:
+            os.setsid()
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            for name in sys.modules.keys() - AT_FIRST:
+                if not name.startswith("crashhunt."):
+                    del sys.modules[name]  # what the command itself has imported for its user
+            sys.path[:] = [place for place in map(os.path.abspath, path_of(os.environ)) if place not in PATH] + PATH
+            os.chdir(cwd or ".")
+            for descriptor in (1, 2):
+                os.dup2(stdout.fileno(), descriptor)
+            script, folder, run, parent = words[3:]
+            sys.argv = [script, folder, run, parent]
+            main = importlib.import_module(script)._main
+            leave_after(lambda: main(Path(folder), json.loads(run), int(parent)))
+
+    def poll(self) -> int | None:
+        """Return how it has ended, if it has."""
+        return self._ended(os.WNOHANG)
+
+    def wait(self) -> int | None:
+        """Wait for its end."""
+        return self._ended(0)
+
+    def send_signal(self, number: int) -> None:
+        """Tell it something, if it is there."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Kill it, if it is there."""
+        self.send_signal(signal.SIGKILL)
+
+    def _ended(self, options: int) -> int | None:
+        if self.returncode is None:
+            pid, status = os.waitpid(self.pid, options)
+            self.returncode = os.waitstatus_to_exitcode(status) if pid else None
+        return self.returncode
+
+
 if __name__ == "__main__":
     sys.path[0] = str(CRASHHUNT.parent)  # where the script lies, and not these tests
+    import crashhunt.base.keeper
+    import crashhunt.suites._processes
+
     for package in IMPORTED:
         module = importlib.import_module(f"crashhunt.{package}")
         for name in module.__all__:
             getattr(module, name)  # which imports what it lies in
     del sys.modules["warm"]  # else a snapshot would have it, as whatever has been imported and is not installed
     started = Warm(os.environ)
-    importlib.import_module("crashhunt.base.keeper").subprocess = types.SimpleNamespace(
+    crashhunt.base.keeper.subprocess = types.SimpleNamespace(
         Popen=started.popen, TimeoutExpired=subprocess.TimeoutExpired
     )
+    crashhunt.suites._processes.subprocess = types.SimpleNamespace(Popen=Hunt, DEVNULL=subprocess.DEVNULL)
+    AT_FIRST, PATH = frozenset(sys.modules), sys.path[1:]
+    crashhunt.snapshots.environment()  # which looks through all that is installed
+    crashhunt.base.plugins.registered("agents")
     gc.collect()
     gc.freeze()
     _serve(socket.socket(fileno=int(sys.argv[1])))

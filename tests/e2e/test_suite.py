@@ -140,7 +140,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
 
 
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
-    written(toy, SLOW)
+    written(toy, SLOW.replace("80", "60"))
     process = toy.start("suite", "run", "suite.toml", "out", "2")
     wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
     os.kill(process.pid, signal.SIGKILL)
@@ -152,7 +152,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(80))
+        assert numbers(toy, f"out/{name}/0") == list(range(60))
     for name, rows in before.items():
         after = digests(toy, f"out/{name}/0")
         assert {number: after[number] for number in rows} == rows
@@ -172,7 +172,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
 
 
 def test_two_at_once_do_not_disturb_each_other(toy):
-    written(toy, SLOW)
+    written(toy, SLOW.replace("80", "24"))
     first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     second = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     for process in (first, second):
@@ -180,7 +180,7 @@ def test_two_at_once_do_not_disturb_each_other(toy):
         assert process.returncode == 0, err
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(80))
+        assert numbers(toy, f"out/{name}/0") == list(range(24))
         assert "error" not in toy.crashhunt("logs", "out", "--run", name, "--type", "state").out
 
 
@@ -203,7 +203,7 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
 
 
 def test_the_last_hunts_share_all_slots(toy):
-    written(toy, SLOW.replace('[[hunts]]\nid = "b"\n[[hunts]]\nid = "c"\n', ""))
+    written(toy, SLOW.replace('[[hunts]]\nid = "b"\n[[hunts]]\nid = "c"\n', "").replace("80", "20"))
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     workers = {row["worker"] for row in _results(toy, "out/a/0")}
     assert len(workers) == 2
