@@ -73,7 +73,7 @@ def _built(kind: Any, data: Any) -> Any:
     """Build what pydantic would build, for the types that our tables have; anything doubtful is left to it."""
     if is_dataclass(kind):
         return _dataclass_built(cast(type, kind), data)
-    if kind is Any or type(data) is kind:
+    if kind in (Any, object) or type(data) is kind:
         return data
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_json, say
@@ -12,12 +12,13 @@ from crashhunt.cli._common import add_json, say
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
     from crashhunt.hunts import Checked
 
 __all__ = ["add_check"]
 
 
-def add_check(commands: Any) -> None:
+def add_check(commands: Commands) -> None:
     """Add the command."""
     check = commands.add_parser(
         "check",

@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
@@ -17,12 +17,18 @@ from crashhunt.base.text import visible
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from _typeshed import SupportsWrite
+
     from crashhunt.crashes import Archive, Bundle
 
 __all__ = [
-    "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt", "pairs",
-    "say",
+    "Commands", "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt",
+    "pairs", "say",
 ]  # fmt: skip
+
+
+Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
+"""What a command is added to; argparse has no other name for it."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -44,14 +50,14 @@ class Parser(argparse.ArgumentParser):
                 raise UsageError(f"there is no option {name!r}", fix=fix)
         return super().parse_known_args(args, namespace)
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
+    def _check_value(self, action: argparse.Action, value: object) -> None:
         choices = [str(choice) for choice in action.choices or ()]
         if choices and value not in choices:
             name = "/".join(action.option_strings) or str(action.metavar or action.dest)
             what = f"there is no command {value!r}" if name == "COMMAND" else f"{name} {value!r} is none of its choices"
             raise UsageError(what, fix=one_of(str(value), choices))
 
-    def _print_message(self, message: str, file: Any = None) -> None:
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
         if message and file is not None:
             file.write(message)  # argparse would hide that the disk is full
 

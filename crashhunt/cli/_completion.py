@@ -6,12 +6,15 @@ import argparse
 import os
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
+    from crashhunt.base.plugins import Group
+    from crashhunt.cli._common import Commands
 
     Completer = Callable[..., Iterable[str]]
 
@@ -25,7 +28,7 @@ put one of these lines where your shell starts:
 """
 
 
-def add_completion(commands: Any) -> None:
+def add_completion(commands: Commands) -> None:
     """Add the command."""
     completion = commands.add_parser(
         "completion",
@@ -105,7 +108,7 @@ def _endings() -> tuple[str, ...]:
     return endings()
 
 
-def _registered(group: Any) -> list[str]:
+def _registered(group: Group) -> list[str]:
     from crashhunt.base.plugins import registered
 
     return list(registered(group))
@@ -117,14 +120,14 @@ def _outcomes(*, crashes: bool) -> list[str]:
     return [str(outcome) for outcome in ((*CRASHES, *EVENTS) if crashes else Outcome)]
 
 
-def _crashes(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+def _crashes(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
     return (
         sorted(path.parent.name for path in Path(folder).glob(f"{layout.CRASHES}/*/{layout.CRASH}")) if folder else []
     )
 
 
-def _runs(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+def _runs(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
     if not folder:
         return []
@@ -150,7 +153,7 @@ def _arguments(parsed_args: argparse.Namespace, *, of_agents: bool) -> list[str]
 def _several(one: Completer) -> Completer:
     """Complete the last of several that commas part."""
 
-    def last(prefix: str, **given: Any) -> list[str]:
+    def last(prefix: str, **given: object) -> list[str]:
         before = prefix.rpartition(",")[0]
         taken = before.split(",")
         return [f"{before},{name}" if before else name for name in one(prefix=prefix, **given) if name not in taken]
@@ -161,7 +164,7 @@ def _several(one: Completer) -> Completer:
 def _paths(*endings: str) -> Completer:
     """Complete folders, and files with one of some endings."""
 
-    def inside(prefix: str, **_: Any) -> list[str]:
+    def inside(prefix: str, **_: object) -> list[str]:
         folder, _slash, start = prefix.rpartition("/")
         place = Path(folder or ("/" if prefix.startswith("/") else ".")).expanduser()
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.cli._common import add_crash, add_json, say
 from crashhunt.cli._progress import shown_progress
@@ -12,10 +12,12 @@ from crashhunt.cli._progress import shown_progress
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_export"]
 
 
-def add_export(commands: Any) -> None:
+def add_export(commands: Commands) -> None:
     """Add the command."""
     export = commands.add_parser(
         "export",

@@ -6,7 +6,7 @@ import tempfile
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
@@ -16,7 +16,10 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
@@ -73,14 +76,14 @@ def film_options(options: argparse.Namespace) -> FilmOptions | None:
     )
 
 
-def look_at_all(bundle: Bundle, **options: Any) -> Look | None:
+def look_at_all(bundle: Bundle, *, to_stderr: bool = False) -> Look | None:
     """Return how to look at a whole crash; None where nothing of it can be looked at."""
     from crashhunt.replays import Look
 
     # The process that is looked at is not watched over: it stops before what ended the one of the hunt.
     fatal = bundle.result.outcome in {Outcome.PROCESS_DIED, Outcome.HANG}
     until = bundle.result.steps if fatal else bundle.result.spec.max_steps
-    return Look(until=until, **options) if until else None
+    return Look(until=until, to_stderr=to_stderr) if until else None
 
 
 @contextmanager
@@ -136,7 +139,7 @@ def _shot(
     bundle: Bundle,
     recording: Recording,
     result: TrialResult,
-    panels: Any,
+    panels: Mapping[int, Mapping[str, NDArray[np.uint8]]],
     *,
     crashed: bool,
     meanings: Sequence[str] = (),

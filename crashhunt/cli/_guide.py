@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import sys
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.cli._common import add_json
 
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
     from crashhunt.guide import Page
 
 __all__ = ["add_guide"]
 
 
-def add_guide(commands: Any) -> None:
+def add_guide(commands: Commands) -> None:
     """Add the command."""
     guide = commands.add_parser(
         "guide",

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line, visible
 from crashhunt.cli._common import add_json
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.report import ListingEntry
 
 __all__ = ["add_lists"]
 
 
-def add_lists(commands: Any) -> None:
+def add_lists(commands: Commands) -> None:
     """Add the commands."""
     for name, command, text in (
         ("agents", _agents, "list the agents that come with crashhunt or are installed, with their arguments"),
@@ -45,7 +49,7 @@ def _scenarios(options: argparse.Namespace, _words: list[str]) -> int:
     return _print_listing("scenarios", list_scenarios(), as_json=options.json)
 
 
-def _print_listing(name: str, entries: list[dict[str, Any]], *, as_json: bool) -> int:
+def _print_listing(name: str, entries: Sequence[ListingEntry], *, as_json: bool) -> int:
     from crashhunt.report import describe
 
     for entry in entries:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_line, visible
@@ -14,10 +14,12 @@ from crashhunt.cli._common import chosen_runs, integer
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_logs"]
 
 
-def add_logs(commands: Any) -> None:
+def add_logs(commands: Commands) -> None:
     """Add the command."""
     logs = commands.add_parser(
         "logs",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
-    from crashhunt.plans import HuntOption
+    from crashhunt.plans import Given, HuntOption
 
 __all__ = ["add_options", "add_options_of_machine", "chosen_of_machine", "chosen_options"]
 
@@ -24,7 +24,7 @@ def add_options(groups: Mapping[str, argparse._ArgumentGroup]) -> None:
             _add(groups[option.about.group], option)
 
 
-def chosen_options(given: argparse.Namespace) -> dict[str, Any]:
+def chosen_options(given: argparse.Namespace) -> Given:
     """Return the options that were given, as `crashhunt.prepare` takes them.
 
     Raises:
@@ -41,7 +41,7 @@ def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(**{option.name: None for option in hunt_options() if option.about.anywhere})
 
 
-def chosen_of_machine(given: argparse.Namespace) -> dict[str, Any]:
+def chosen_of_machine(given: argparse.Namespace) -> Given:
     """Return those of them that were given."""
     found = {option.name: getattr(given, option.name) for option in hunt_options() if option.about.anywhere}
     return {name: value for name, value in found.items() if value is not None}
@@ -61,7 +61,7 @@ def _add(group: argparse._ActionsContainer, option: HuntOption, help_text: str =
     group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=help_text or option.help, **words)
 
 
-def _value(option: HuntOption, given: Any) -> Any:
+def _value(option: HuntOption, given: Any) -> object:
     about = option.about
     if option.form == "table":
         return pairs(given, about.flag, named=about.named)

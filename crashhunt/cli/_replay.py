@@ -6,7 +6,7 @@ import json
 import math
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import argparse
     from pathlib import Path
 
+    from crashhunt.cli._common import Commands
     from crashhunt.crashes import Archive, Bundle
     from crashhunt.render import FilmOptions
     from crashhunt.replays import Look, ReplayOptions, ReplayReport
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["add_replay"]
 
 
-def add_replay(commands: Any) -> None:
+def add_replay(commands: Commands) -> None:
     """Add the command."""
     replay = commands.add_parser(
         "replay",
@@ -167,7 +168,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
 
 def _replay_one(
     options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
-) -> tuple[ReplayReport, dict[str, Any]]:
+) -> tuple[ReplayReport, dict[str, object]]:
     from crashhunt.crashes import partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
@@ -14,10 +14,12 @@ from crashhunt.cli._progress import shown_progress
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_report"]
 
 
-def add_report(commands: Any) -> None:
+def add_report(commands: Commands) -> None:
     """Add the command."""
     report = commands.add_parser(
         "report",

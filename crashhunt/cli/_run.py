@@ -6,7 +6,7 @@ import json
 import os
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.text import one_line
@@ -17,10 +17,12 @@ from crashhunt.cli._options import add_options, chosen_options
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_run"]
 
 
-def add_run(commands: Any) -> None:
+def add_run(commands: Commands) -> None:
     """Add the command."""
     run = commands.add_parser(
         "run",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import visible
@@ -12,10 +12,12 @@ from crashhunt.cli._common import add_crash, add_json, number, opened_crash
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_show"]
 
 
-def add_show(commands: Any) -> None:
+def add_show(commands: Commands) -> None:
     """Add the command."""
     show = commands.add_parser(
         "show",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from crashhunt.cli._common import Commands
     from crashhunt.hunts import HuntState
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
@@ -25,7 +26,7 @@ _WIDTH = 120
 _COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
 
-def add_status(commands: Any) -> None:
+def add_status(commands: Commands) -> None:
     """Add the command."""
     status = commands.add_parser(
         "status",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.cli._common import add_json, chosen_runs, integer, pairs, say
 from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
@@ -15,12 +15,13 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
+    from crashhunt.cli._common import Commands
     from crashhunt.hunts import HuntState
 
 __all__ = ["add_rerun", "add_suite"]
 
 
-def add_suite(commands: Any) -> None:
+def add_suite(commands: Commands) -> None:
     """Add the command."""
     suite = commands.add_parser(
         "suite",
@@ -49,7 +50,7 @@ def add_suite(commands: Any) -> None:
     defaults.set_defaults(command=_defaults)
 
 
-def add_rerun(commands: Any) -> None:
+def add_rerun(commands: Commands) -> None:
     """Add the command."""
     rerun = commands.add_parser(
         "rerun",

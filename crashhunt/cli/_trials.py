@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.names import one_of
@@ -14,10 +14,12 @@ from crashhunt.base.text import visible
 if TYPE_CHECKING:
     import argparse
 
+    from crashhunt.cli._common import Commands
+
 __all__ = ["add_trials"]
 
 
-def add_trials(commands: Any) -> None:
+def add_trials(commands: Commands) -> None:
     """Add the command."""
     from crashhunt.trial import Outcome
 

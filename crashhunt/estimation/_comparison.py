@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -133,7 +133,7 @@ class Comparison:
     hunts: tuple[HuntFigures, ...]
     pairs: tuple[Pair, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape that ``compare --json`` prints; what is no finite number is null."""
         return {
             "hunts": [finite_values(asdict(hunt)) for hunt in self.hunts],
@@ -177,7 +177,7 @@ def compare(*directories: Path | str) -> Comparison:
     return Comparison(figures, pairs)
 
 
-def _table(hunt: HuntResults) -> NDArray[Any]:
+def _table(hunt: HuntResults) -> NDArray[np.void]:
     """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers."""
     crash_on = hunt.settings.crash_on
     fields = [("number", "i8"), ("seed", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
@@ -190,7 +190,7 @@ def _table(hunt: HuntResults) -> NDArray[Any]:
     return np.sort(table, order="number")
 
 
-def _figures(hunt: HuntResults, table: NDArray[Any]) -> HuntFigures:
+def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
     valid = table[table["valid"]]
     crashes = int(valid["crash"].sum())
     crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
@@ -227,7 +227,7 @@ def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
     return ""
 
 
-def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: NDArray[Any]) -> Pair:
+def _pair(first: HuntResults, left: NDArray[np.void], second: HuntResults, right: NDArray[np.void]) -> Pair:
     (crashed, valid), (crashed_too, valid_too) = _counts(left), _counts(right)
     totals = (crashed, valid, crashed_too, valid_too)
     _, in_left, in_right = np.intersect1d(left["number"], right["number"], assume_unique=True, return_indices=True)
@@ -265,7 +265,7 @@ def _pair(first: HuntResults, left: NDArray[Any], second: HuntResults, right: ND
     )
 
 
-def _counts(table: NDArray[Any]) -> tuple[int, int]:
+def _counts(table: NDArray[np.void]) -> tuple[int, int]:
     """Crashes and valid trials."""
     return int((table["crash"] & table["valid"]).sum()), int(table["valid"].sum())
 
@@ -291,12 +291,9 @@ def _same_draws(first: HuntResults, second: HuntResults) -> bool:
     return first.settings.sampler == second.settings.sampler and first.independent and second.independent
 
 
-def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[Any]) -> NDArray[Any]:
+def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Of each trial, whether the scenario's arguments had the same values."""
-    found = [
-        {trial["spec"]["number"]: trial["spec"]["scenario_arguments"] for trial in hunt.plain_results()}
-        for hunt in (first, second)
-    ]
+    found = [{row.number: row.scenario_arguments for row in hunt.trial_rows()} for hunt in (first, second)]
     return np.array([found[0][number] == found[1][number] for number in numbers.tolist()], bool)
 
 

@@ -8,13 +8,13 @@ from ._preflight import Preflight as Preflight
 from ._progress import HuntStatus as HuntStatus
 from ._report import HuntReport as HuntReport
 from ._results import (
-    FACTS as FACTS,
     HuntResults as HuntResults,
     SuiteResults as SuiteResults,
     UnfinishedWarning as UnfinishedWarning,
     columns_of as columns_of,
     load as load,
 )
+from ._row import FACTS as FACTS, Cell as Cell, TrialRow as TrialRow
 from ._salvage import salvage as salvage
 from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
 from ._tables import write_parquet as write_parquet, write_text as write_text

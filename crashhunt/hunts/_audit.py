@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
@@ -39,8 +39,8 @@ class Difference:
     step: int
     agent: str
     field: str
-    recorded: Any
-    replayed: Any
+    recorded: object
+    replayed: object
 
     def __str__(self) -> str:
         whose = f" of {self.agent}" if self.agent else ""
@@ -49,7 +49,7 @@ class Difference:
             f"{self.recorded} and is {self.replayed}"
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain strings and numbers."""
         return {name: getattr(self, name) for name in self.__slots__}
 
@@ -66,7 +66,7 @@ class AuditReport:
     trials: int = 0
     differences: tuple[Difference, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape that ``run --json`` prints."""
         return {"trials": self.trials, "differences": [found.to_json() for found in self.differences]}
 

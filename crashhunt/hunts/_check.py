@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
@@ -75,7 +75,7 @@ class Checked:
         """Whether nothing is damaged."""
         return not any(finding.damaged for finding in self.findings)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape of one hunt in ``check --json``."""
         return {
             "dir": str(self.dir),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +47,7 @@ class HuntReport:
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
     audit: AuditReport | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape that ``run --json`` prints."""
         return {
             "dir": str(self.directory),

@@ -9,7 +9,7 @@ import time
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
@@ -83,7 +83,7 @@ class HuntState:
         """Whether it ended without having done what was asked."""
         return self.state in ("error", "interrupted", "killed")
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape of one hunt in ``status --json``."""
         return asdict(self)
 

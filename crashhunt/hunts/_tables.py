@@ -6,7 +6,7 @@ import csv
 import json
 from itertools import islice
 from tempfile import NamedTemporaryFile
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.hunts._results import HuntResults
+    from crashhunt.hunts._row import Cell
 
 __all__ = ["write_parquet", "write_text"]
 
@@ -73,7 +74,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
     return count
 
 
-def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
+def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
     """The type of each column, which a row group cannot find out by itself."""
     settings = hunt.settings
     specs = {f"scenario.{name}": spec for name, spec in settings.scenario_arguments.items()}
@@ -93,7 +94,7 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Any]]) -> dict[str, str]:
     return {name: kinds[name] for name in columns}
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: Cell) -> Cell:
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None else value

@@ -1,4 +1,4 @@
-from ._declaration import HuntOption as HuntOption
+from ._declaration import Given as Given, HuntOption as HuntOption
 from ._executor import SizesItself as SizesItself, executor_of as executor_of
 from ._options import (
     Driver as Driver,

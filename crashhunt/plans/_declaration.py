@@ -6,18 +6,23 @@ from dataclasses import MISSING, Field, dataclass, field, fields
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from crashhunt.base.errors import UsageError
 
 __all__ = [
-    "About", "Form", "HuntOption", "above_zero", "at_least", "declared", "declared_options", "option", "within",
+    "About", "Form", "Given", "HuntOption", "above_zero", "at_least", "declared", "declared_options", "option",
+    "within",
 ]  # fmt: skip
 
 T = TypeVar("T")
 
 Form = Literal["flag", "integer", "number", "text", "list", "table"]
 Check = Callable[[Any], str]  # what to give instead; empty where the value is fine
+
+Given: TypeAlias = Mapping[str, Any]
+"""Options by name, as somebody gives them. Of which types they are the list says, and `HuntOption.checked` sees to it;
+a type checker would need the list a second time."""
 
 _ABOUT = "crashhunt"  # the key of a field's metadata
 
@@ -89,7 +94,7 @@ class HuntOption:
 
     name: str
     form: Form
-    default: Any
+    default: object
     about: About
 
     @property
@@ -114,7 +119,7 @@ class HuntOption:
         """What the command line says of it, with another default."""
         return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
-    def checked(self, value: Any) -> Any:
+    def checked(self, value: object) -> Any:
         """Return a value of this option, plain where it was NumPy's.
 
         Raises:
@@ -153,12 +158,12 @@ _FORMS: Mapping[Form, tuple[tuple[type, ...], str]] = {
 }
 
 
-def declared(kind: Any) -> frozenset[str]:
+def declared(kind: type) -> frozenset[str]:
     """Return the names of the options that a dataclass declares, or has from one that does."""
     return frozenset(item.name for item in fields(kind) if _ABOUT in item.metadata)
 
 
-def declared_options(kind: Any) -> tuple[HuntOption, ...]:
+def declared_options(kind: type) -> tuple[HuntOption, ...]:
     """Return the options that a dataclass declares, in its order."""
     hints = get_type_hints(kind)
     return tuple(
@@ -168,16 +173,16 @@ def declared_options(kind: Any) -> tuple[HuntOption, ...]:
     )
 
 
-def _default(item: Field[Any]) -> Any:
+def _default(item: Field[object]) -> object:
     return {} if item.default is MISSING else item.default
 
 
-def _form(hint: Any) -> Form:
+def _form(hint: object) -> Form:
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     forms = {_FORM_OF.get(get_origin(kind) or kind, "text") for kind in kinds if kind is not NoneType}
     return forms.pop() if len(forms) == 1 else "text"
 
 
-_FORM_OF: Mapping[Any, Form] = {
+_FORM_OF: Mapping[object, Form] = {
     bool: "flag", int: "integer", float: "number", Sequence: "list", tuple: "list", Mapping: "table", dict: "table",
 }  # fmt: skip

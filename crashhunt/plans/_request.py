@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import UsageError
@@ -22,6 +22,8 @@ from crashhunt.plans._settings import RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from crashhunt.plans._declaration import Given
 
 __all__ = ["Request", "fields_of", "request_of", "sized", "spec_words"]
 
@@ -75,7 +77,7 @@ def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int
         UsageError: who drives is in no module that a worker could import.
     """
     drivers = {} if asked.agent in (None, "") else {"": asked.agent}
-    given: dict[str, Any] = {
+    given: Given = {
         **{name: getattr(asked, name) for name in (*fields_of(Subject), *fields_of(TrialOptions))},
         "agents": {name: _locator(who) for name, who in {**(asked.agents or {}), **drivers}.items() if who is not None},
         "arguments": spec_words(asked.arguments),

@@ -18,6 +18,7 @@ from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
+    from crashhunt.base.plain import Plain
     from crashhunt.samplers import Space
 
 __all__ = ["AgentSettings", "ArgumentSpec", "HuntSettings", "RunSettings", "read_settings", "write_settings"]
@@ -132,7 +133,7 @@ class HuntSettings(TrialOptions):
         ]
 
 
-def _flat(data: Any, prefix: str = "") -> dict[str, str]:
+def _flat(data: object, prefix: str = "") -> dict[str, str]:
     if isinstance(data, dict):
         found: dict[str, str] = {}
         for key, value in data.items():
@@ -166,14 +167,14 @@ def write_settings(path: Path, settings: HuntSettings, command: list[str], *, li
         temporary.write_text(text, encoding="utf-8")
 
 
-def _in_order(data: dict[str, Any], settings: HuntSettings | RunSettings, first: tuple[str, ...]) -> dict[str, Any]:
+def _in_order(data: Plain, settings: HuntSettings | RunSettings, first: tuple[str, ...]) -> dict[str, object]:
     """What every version knows, in its order; then what came later, where it is not as it was before it came."""
     later = (item for item in fields(settings) if item.name not in first)
     asked = [item.name for item in later if getattr(settings, item.name) not in (_default(item), None)]
     return {name: data[name] for name in (*first, *asked) if name in data}
 
 
-def _default(item: Field[Any]) -> Any:
+def _default(item: Field[object]) -> object:
     return item.default if item.default_factory is MISSING else item.default_factory()
 
 
@@ -205,16 +206,16 @@ def read_settings(path: Path) -> HuntSettings:
     return validate(HuntSettings, {**known, **wrong}, where=str(path), error=HuntDirectoryError)
 
 
-def _added_to(path: Path) -> dict[str, Any]:
+def _added_to(path: Path) -> Plain:
     """What a later version has added to a file, where one is there and can be read."""
     try:
-        later: dict[str, Any] = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
+        later: Plain = known_part(HuntSettings, tomllib.loads(path.read_text(encoding="utf-8")))[1]
     except (OSError, ValueError, RecursionError):
         return {}
     return later
 
 
-def _without_none(data: Any) -> Any:
+def _without_none(data: object) -> Any:
     if isinstance(data, dict):
         return {str(key): _without_none(value) for key, value in data.items() if value is not None}
     if isinstance(data, list | tuple):

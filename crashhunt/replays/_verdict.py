@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.snapshots import environment_changes
@@ -55,7 +55,7 @@ class ReplayReport:
         """How many steps it completed."""
         return self.recording.steps
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape that ``replay --json`` prints."""
         return {
             "crash": self.bundle.id,

@@ -1,5 +1,7 @@
 from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
 from ._listing import (
+    ArgumentEntry as ArgumentEntry,
+    ListingEntry as ListingEntry,
     describe as describe,
     list_agents as list_agents,
     list_oracles as list_oracles,

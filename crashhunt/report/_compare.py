@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.estimation import Comparison, HuntFigures
+    from crashhunt.hunts import Cell
 
 __all__ = ["comparison_page", "describe_comparison"]
 
@@ -132,7 +133,7 @@ def _outcomes(hunts: Sequence[HuntFigures]) -> str:
 
 
 def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> list[str]:
-    values: dict[str, dict[str, tuple[NDArray[Any], NDArray[Any]]]] = {}
+    values: dict[str, dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]] = {}
     units: dict[str, str] = {}
     for hunt in hunts:
         for name, pair in _arguments(HuntResults(hunt.dir)).items():
@@ -143,10 +144,10 @@ def _argument_plots(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> lis
     return [_argument_plot(name, labels[name], of, colors) for name, of in values.items()]
 
 
-def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
+def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]]:
     """Every argument that varies: its values, and whether the trial crashed."""
     names = [name for name in columns_of(hunt.settings) if name not in FACTS]
-    columns: dict[str, list[Any]] = {name: [] for name in names}
+    columns: dict[str, list[Cell]] = {name: [] for name in names}
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
     for row in islice(hunt.rows(), _MOST):
@@ -160,14 +161,14 @@ def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[Any], NDArray[Any]]
 
 
 def _argument_plot(
-    name: str, label: str, of: dict[str, tuple[NDArray[Any], NDArray[Any]]], colors: dict[str, str]
+    name: str, label: str, of: dict[str, tuple[NDArray[np.generic], NDArray[np.generic]]], colors: dict[str, str]
 ) -> str:
     numeric = all(np.issubdtype(values.dtype, np.number) for values, _ in of.values())
     lines: dict[str, list[tuple[float, float, int]]] = {}
     if numeric:
         low = min(float(values.min()) for values, _ in of.values())
         high = max(float(values.max()) for values, _ in of.values())
-        edges: NDArray[Any] = np.linspace(low, high, _BINS + 1)
+        edges: NDArray[np.float64] = np.linspace(low, high, _BINS + 1)
         labels = [f"{low:.4g}", f"{high:.4g}"]
     else:
         words = sorted({str(value) for values, _ in of.values() for value in values})

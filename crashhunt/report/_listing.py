@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import locate, registered
@@ -11,41 +11,64 @@ from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.trial import signature_of, without_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from crashhunt.base.plugins import Group
-    from crashhunt.trial import Argument
+    from crashhunt.trial import Argument, Kind, Value
 
-__all__ = ["describe", "list_agents", "list_oracles", "list_scenarios"]
+__all__ = ["ArgumentEntry", "ListingEntry", "describe", "list_agents", "list_oracles", "list_scenarios"]
 
 
-def list_agents() -> list[dict[str, Any]]:
+class ArgumentEntry(TypedDict):
+    """An argument; null for what nobody says."""
+
+    name: str
+    kind: Kind | None
+    default: Value | None
+    range: str | None
+    unit: str
+    help: str
+
+
+class ListingEntry(TypedDict):
+    """What ``agents``, ``oracles`` and ``scenarios`` print of one, under ``--json``; the last two are a scenario's."""
+
+    name: str
+    locator: str
+    title: str
+    arguments: list[ArgumentEntry]
+    warning: NotRequired[str]
+    simulator: NotRequired[str]
+    agents: NotRequired[dict[str, list[ArgumentEntry]]]
+
+
+def list_agents() -> list[ListingEntry]:
     """Return the registered agents. One that cannot be imported is listed with a warning: nobody asked for it."""
     return _list("agents")
 
 
-def list_oracles() -> list[dict[str, Any]]:
+def list_oracles() -> list[ListingEntry]:
     """Return the registered oracles, likewise."""
     return _list("oracles")
 
 
-def _list(group: Group) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
+def _list(group: Group) -> list[ListingEntry]:
+    found: list[ListingEntry] = []
     for name, point in registered(group).items():
-        entry: dict[str, Any] = {"name": name, "locator": point.value}
+        entry: ListingEntry = {"name": name, "locator": point.value, "title": "", "arguments": []}
         try:
             factory = locate(group, name)
             entry["title"] = (inspect.getdoc(factory) or "").partition("\n")[0]
             entry["arguments"] = _arguments(signature_of(factory).arguments.values())
         except CrashhuntError as error:
-            entry |= {"title": "", "arguments": [], "warning": str(error)}
+            entry["warning"] = str(error)
         found.append(entry)
     return found
 
 
-def list_scenarios() -> list[dict[str, Any]]:
+def list_scenarios() -> list[ListingEntry]:
     """Return the scenarios that come with crashhunt."""
-    found = []
+    found: list[ListingEntry] = []
     for name in shipped_scenarios():
         scenario = load_scenario(name)
         found.append(
@@ -61,7 +84,7 @@ def list_scenarios() -> list[dict[str, Any]]:
     return found
 
 
-def describe(entries: list[dict[str, Any]]) -> str:
+def describe(entries: Sequence[ListingEntry]) -> str:
     """Return a list for people."""
     blocks = []
     for entry in entries:
@@ -74,7 +97,7 @@ def describe(entries: list[dict[str, Any]]) -> str:
     return "\n\n".join(blocks)
 
 
-def _arguments(arguments: Iterable[Argument]) -> list[dict[str, Any]]:
+def _arguments(arguments: Iterable[Argument]) -> list[ArgumentEntry]:
     return [
         {
             "name": argument.name,
@@ -88,7 +111,7 @@ def _arguments(arguments: Iterable[Argument]) -> list[dict[str, Any]]:
     ]
 
 
-def _table(indent: str, arguments: list[dict[str, Any]]) -> list[str]:
+def _table(indent: str, arguments: Sequence[ArgumentEntry]) -> list[str]:
     rows = [
         (
             entry["name"],

@@ -7,7 +7,7 @@ import json
 import math
 import zlib
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from crashhunt.base import layout
 from crashhunt.base.files import whole_file
 from crashhunt.base.version import __version__
 from crashhunt.base.watching import watched
-from crashhunt.hunts import Ledger, has_begun
+from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
 from crashhunt.report._show import Story
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
+    from crashhunt.world import Actor
 
 __all__ = ["report_data", "write_report"]
 
@@ -68,7 +69,9 @@ def write_report(
     return target.stat().st_size
 
 
-def report_data(directory: Path, bundles: Sequence[Bundle], *, name: str, watch: Watch | None = None) -> dict[str, Any]:
+def report_data(
+    directory: Path, bundles: Sequence[Bundle], *, name: str, watch: Watch | None = None
+) -> dict[str, object]:
     """Return everything that the page shows."""
     settings = read_settings(directory / layout.HUNT)
     return {
@@ -94,7 +97,7 @@ def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
     return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
-def _trials(directory: Path) -> dict[str, Any]:
+def _trials(directory: Path) -> dict[str, object]:
     """Outcomes, and what was tried against how it went."""
     path = directory / layout.LEDGER
     if not has_begun(path):
@@ -105,21 +108,22 @@ def _trials(directory: Path) -> dict[str, Any]:
         total = sum(outcomes.values())
         every = max(1, math.ceil(total / _DOTS))
         trials = []
-        for number, result in enumerate(ledger.results()):
-            if number % every == 0 or result.outcome.category != "no crash":
+        for number, row in enumerate(map(TrialRow, ledger.plain_results())):
+            outcome = row.outcome
+            if number % every == 0 or outcome.category != "no crash":
                 values = {
-                    f"{agent}.{name}" if len(result.spec.arguments) > 1 else name: value
-                    for agent, given in result.spec.arguments.items()
+                    f"{agent}.{name}" if len(row.arguments) > 1 else name: value
+                    for agent, given in row.arguments.items()
                     for name, value in given.items()
                 }
-                time_s = result.closest.time_to_collision_s
+                time_s = row.time_to_collision_s
                 trials.append(
                     {
-                        "number": result.spec.number,
-                        "outcome": str(result.outcome),
-                        "category": result.outcome.category,
-                        "values": {**values, **result.spec.scenario_arguments},
-                        "ttc": round(time_s, 3) if math.isfinite(time_s) else None,
+                        "number": row.number,
+                        "outcome": str(outcome),
+                        "category": outcome.category,
+                        "values": {**values, **row.scenario_arguments},
+                        "ttc": round(time_s, 3) if time_s is not None else None,
                     }
                 )
         return {
@@ -133,7 +137,7 @@ def _trials(directory: Path) -> dict[str, Any]:
         ledger.close()
 
 
-def _crash(bundle: Bundle) -> dict[str, Any]:
+def _crash(bundle: Bundle) -> dict[str, object]:
     story = Story(bundle)
     recording, result = story.recording, bundle.result
     return {
@@ -163,10 +167,10 @@ def _crash(bundle: Bundle) -> dict[str, Any]:
     }
 
 
-def _scenes(recording: Recording, agent: str) -> dict[str, Any]:
+def _scenes(recording: Recording, agent: str) -> dict[str, object]:
     """All scenes as columns: float32, shape (steps, actors, 4), x and y from the first position of the agent."""
     scenes = recording.scenes()
-    names: dict[str, Any] = {}
+    names: dict[str, Actor] = {}
     highest: dict[str, float] = {}
     for scene in scenes:
         for row, actor in enumerate(scene.roster.actors):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
 from crashhunt.crashes import Encounter, last_escape
@@ -13,9 +13,11 @@ from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.crashes import Bundle, Moment, Position
+    from crashhunt.recording import StepRecord
+    from crashhunt.report._table import TableCell
 
 __all__ = ["Story"]
 
@@ -60,7 +62,7 @@ class Story:
             drove_into = hit is not None and hit.role == "collider"
             self.escape = last_escape(self.recording, self.agent, self.other, braking=braking) if drove_into else None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the shape that ``show --json`` prints."""
         nearest = steps_table(self.recording, NEAREST, self.agent) if self.encounter else []
         moments, tried = self.encounter.moments if self.encounter else [], self.bundle.result.escape
@@ -297,7 +299,7 @@ def _closing(speed: float) -> str:
     return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
 
 
-def _named(moment: Moment, nearest: dict[str, Any]) -> dict[str, Any]:
+def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object]:
     """A moment under names that mean the same everywhere: some are about the nearest one, some about the other one."""
     facts = asdict(moment)
     return {
@@ -314,7 +316,7 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, action, strict=False))
 
 
-def _thinned(steps: list[Any], rows: int, *, always: int | None) -> list[Any]:
+def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[StepRecord]:
     """About so many, evenly, the last ones all."""
     if len(steps) <= rows:
         return steps

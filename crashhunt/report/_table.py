@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.names import did_you_mean
@@ -14,10 +14,15 @@ from crashhunt.world import approaches
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
-__all__ = ["NEAREST", "aligned", "check_fields", "format_table", "steps_table"]
+__all__ = ["NEAREST", "TableCell", "TableRow", "aligned", "check_fields", "format_table", "steps_table"]
 
+TableCell: TypeAlias = "bool | int | float | str | None"
+TableRow: TypeAlias = dict[str, TableCell]
 _SCENE = ("x", "y", "heading", "speed")
 NEAREST = ("time_to_collision_s", "gap_m", "required_deceleration")
 """What is measured to whoever is the nearest, as of every trial."""
@@ -45,7 +50,7 @@ def check_fields(recording: Recording, fields: Sequence[str], agent: str) -> lis
     return names
 
 
-def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[dict[str, Any]]:
+def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: str = "") -> list[TableRow]:
     """Return one row a step: the step, the time and the fields; None where there is no value.
 
     Args:
@@ -63,14 +68,14 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
     channel = next(found for found in recording.prologue.agents if found.id == agent)
     actions, observed = _actions(channel), _observed(channel)
     names = check_fields(recording, fields, agent)
-    measured: dict[str, Any] = {}
+    measured: dict[str, NDArray[np.float64]] = {}
     if set(names) & set(NEAREST):
         frames = [step.scene.frame for step in recording.all_steps if step.scene is not None]
         measured = dict(zip(NEAREST, approaches(frames, agent), strict=True))
     moments = {moment.step: moment for moment in Encounter(recording, agent, other).moments} if other else {}
     rows = []
     for number, step in enumerate(recording.all_steps):
-        row: dict[str, Any] = {"step": step.step, "time_s": step.scene.time_s if step.scene is not None else None}
+        row: TableRow = {"step": step.step, "time_s": step.scene.time_s if step.scene is not None else None}
         for name in names:
             if name in _TO_OTHER:
                 row[name] = getattr(moments.get(step.step), _TO_OTHER[name], None)
@@ -88,7 +93,7 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
     return rows
 
 
-def format_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+def format_table(rows: Sequence[TableRow]) -> list[str]:
     """Return rows as aligned lines under a heading."""
     if not rows:
         return []
@@ -138,11 +143,11 @@ def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:
     return None if scene is None or row is None else float(scene.data[row, _SCENE.index(name)])
 
 
-def _is_nothing(value: Any) -> bool:
+def _is_nothing(value: TableCell) -> bool:
     return isinstance(value, float) and not math.isfinite(value)
 
 
-def _format(value: Any) -> str:
+def _format(value: TableCell) -> str:
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -14,7 +14,7 @@ from collections import deque
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
@@ -35,9 +35,9 @@ from crashhunt.scenario import load_scenario
 from crashhunt.snapshots import SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
-    from crashhunt.plans import HuntSettings
+    from crashhunt.plans import Given, HuntSettings
     from crashhunt.scenario import Scenario
 
 __all__ = ["REQUEST", "RunRequest", "check_machine", "run_all", "set_aside", "slots_of", "write_request"]
@@ -63,7 +63,7 @@ class RunRequest:
     folder: str
     snapshot: SnapshotChoices = field(default_factory=SnapshotChoices)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain data: what the snapshot takes in stands beside the request."""
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
 
@@ -101,7 +101,7 @@ def slots_of(parallel: int) -> int:
     return parallel or len(os.sched_getaffinity(0))
 
 
-def check_machine(parallel: int, machine: Mapping[str, Any] | None) -> None:
+def check_machine(parallel: int, machine: Given | None) -> None:
     """Refuse what no hunt could run with, before any of them starts.
 
     Raises:
@@ -117,7 +117,7 @@ def run_all(
     parallel: int = 0,
     *,
     watch: Callable[[], None] | None = None,
-    machine: Mapping[str, Any] | None = None,
+    machine: Given | None = None,
 ) -> None:
     """Run hunts, each in a process of its own, until the last has ended or somebody interrupts.
 
@@ -182,7 +182,7 @@ def set_aside(folder: Path) -> Path:
     return aside
 
 
-def _start(folder: Path, run: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+def _start(folder: Path, run: Given) -> subprocess.Popen[bytes]:
     request = RunRequest.read(folder / REQUEST)
     with (folder / layout.RUN_LOG).open("ab") as log:
         return subprocess.Popen(
@@ -203,7 +203,7 @@ def _start(folder: Path, run: Mapping[str, Any]) -> subprocess.Popen[bytes]:
         )
 
 
-def _main(folder: Path, run: Mapping[str, Any], parent: int) -> None:
+def _main(folder: Path, run: Given, parent: int) -> None:
     if sys.platform == "linux":  # a suite that is killed takes its hunts along, and they keep what has finished
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:
@@ -233,7 +233,7 @@ def _main(folder: Path, run: Mapping[str, Any], parent: int) -> None:
         _fail(folder, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _planned(folder: Path, request: Request, run: Mapping[str, Any]) -> tuple[Scenario, HuntSettings]:
+def _planned(folder: Path, request: Request, run: Given) -> tuple[Scenario, HuntSettings]:
     """What to run: what is there already, or what was asked for."""
     if not (folder / layout.HUNT).exists():
         return plan(replace(request, run=replace(request.run, **run)))

@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
@@ -19,6 +19,8 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
+    from crashhunt.plans import Given
 
 __all__ = ["rerun"]
 
@@ -33,7 +35,7 @@ def rerun(
     to: Path | None = None,
     parallel: int = 0,
     watch: Callable[[list[HuntState]], None] | None = None,
-    machine: Mapping[str, Any] | None = None,
+    machine: Given | None = None,
 ) -> tuple[list[HuntState], list[Path]]:
     """Run hunts again; return where they stand now, and where what they replace is kept.
 
@@ -132,14 +134,14 @@ def _moved(asked: RunRequest, hunt: Path, aside: Path) -> RunRequest:
 
 def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRequest:
     request = asked.request
-    numbers: dict[str, Any] = {}
     arguments, scenario_arguments = dict(request.arguments), dict(request.scenario_arguments)
     owners = _Names(asked, hunt) if changes else None
     for name, spec in changes.items():
         if name in _NUMBERS:
             if not spec.isdecimal():
                 raise UsageError(f"--set {name}={spec}", fix="give a whole number")
-            numbers[name] = int(spec)
+            number: Given = {name: int(spec)}
+            request = replace(request, **number)
         elif owners is not None:
             agent, argument = owners.owner(name)
             if not agent:
@@ -149,7 +151,7 @@ def _changed(asked: RunRequest, changes: Mapping[str, str], hunt: Path) -> RunRe
             for other in [other for other in arguments if owners.find(other) == (agent, argument)]:
                 del arguments[other]
             arguments[f"{agent}.{argument}"] = spec
-    request = replace(request, arguments=arguments, scenario_arguments=scenario_arguments, **numbers)
+    request = replace(request, arguments=arguments, scenario_arguments=scenario_arguments)
     return replace(asked, request=request)
 
 
@@ -195,7 +197,7 @@ def _elsewhere(
     changes: Mapping[str, str],
     parallel: int,
     watch: Callable[[list[HuntState]], None] | None,
-    machine: Mapping[str, Any] | None,
+    machine: Given | None,
 ) -> list[HuntState]:
     if len(hunts) != 1:
         raise UsageError(f"--to takes one hunt, and there are {len(hunts)}", fix="choose one with --run")

@@ -8,7 +8,7 @@ import secrets
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +22,9 @@ from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, write_request
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.plans import Given
 
 __all__ = ["Suite", "SuiteEntry", "default_suite"]
 
@@ -54,8 +56,8 @@ class SuiteEntry(HuntOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class _File:
-    hunts: tuple[dict[str, Any], ...]
-    defaults: dict[str, Any] = field(default_factory=dict)
+    hunts: tuple[dict[str, object], ...]
+    defaults: dict[str, object] = field(default_factory=dict)
     schema: int = 1
 
 
@@ -154,7 +156,7 @@ class Suite:
         parallel: int = 0,
         *,
         watch: Callable[[list[HuntState]], None] | None = None,
-        machine: Mapping[str, Any] | None = None,
+        machine: Given | None = None,
     ) -> list[HuntState]:
         """Run what has not ended, whatever becomes of the others; return where each run stands.
 
@@ -236,7 +238,7 @@ def default_suite() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(defaults: Given, given: Given) -> Given:
     """A hunt over the defaults; tables are merged, and its own agent is instead of all default ones."""
     found = dict(defaults)
     if "agent" in given or "agents" in given:

@@ -1,0 +1,98 @@
+"""What is told of a trial wherever trials are listed: the one projection of a result that tables and pages share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from crashhunt.trial import EVENTS, outcome_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.trial import Outcome, ResultData, Value
+
+__all__ = ["FACTS", "ORIGINS", "Cell", "TrialRow"]
+
+FACTS = (
+    "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
+    "wall_s", "digest", *map(str, EVENTS),
+)  # fmt: skip
+"""The columns that every table of trials begins with."""
+
+ORIGINS = ("parent", "origin")
+"""Further ones, of trials that a sampler made of others, or by one of several strategies."""
+
+Cell: TypeAlias = "Value | None"
+"""What a table has in one place; None where a trial has no such value."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRow:
+    """One trial of many.
+
+    It is made of plain data, as ledgers yield them: a table has a million trials, and a `TrialResult` takes three
+    times as long.
+
+    Args:
+        data: of the trial.
+    """
+
+    data: ResultData
+
+    @property
+    def number(self) -> int:
+        """Its place in the hunt."""
+        return self.data["spec"]["number"]
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return outcome_of(self.data)
+
+    @property
+    def time_to_collision_s(self) -> float | None:
+        """The least; None where no course ever crossed."""
+        return self.data["closest"]["time_to_collision_s"]
+
+    @property
+    def arguments(self) -> Mapping[str, Mapping[str, Value]]:
+        """What its agents were given, by agent and name."""
+        return self.data["spec"]["arguments"]
+
+    @property
+    def scenario_arguments(self) -> Mapping[str, Value]:
+        """What its scenario was given, by name."""
+        return self.data["spec"]["scenario_arguments"]
+
+    def cells(self, columns: Sequence[str]) -> dict[str, Cell]:
+        """Return it as a row of a table that has some columns.
+
+        Args:
+            columns: some of `FACTS` and `ORIGINS`, ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
+        """
+        data = self.data
+        spec, closest, events = data["spec"], data["closest"], data.get("events")
+        found: dict[str, Cell] = {
+            "number": spec["number"],
+            "seed": spec["seed"],
+            "outcome": data["outcome"],
+            "steps": data["steps"],
+            "sim_time_s": data["sim_time_s"],
+            "time_to_collision_s": closest["time_to_collision_s"],
+            "gap_m": closest["gap_m"],
+            "required_deceleration": closest["required_deceleration"],
+            "wall_s": data["wall_s"],
+            "digest": data["digest"],
+            "parent": spec.get("parent"),
+            "origin": spec.get("origin", ""),
+        }
+        if events is not None:  # somebody has looked for them
+            found |= dict.fromkeys(EVENTS, 0)
+            found |= events
+        for agent, given in spec["arguments"].items():
+            for name, value in given.items():
+                found[f"{agent}.{name}"] = value
+        for name, value in spec["scenario_arguments"].items():
+            found[f"scenario.{name}"] = value
+        return {name: found.get(name) for name in columns}
