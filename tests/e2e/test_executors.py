@@ -150,7 +150,7 @@ def test_suites_rerun_and_python_choose_it_too(mine, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nope", "'nope' is not a registered name of executors; give one of fresh, pool, or module:attribute"),
+        ("nope", "'nope' is not a registered name of executors; give one of fresh, pool, "),
         ("pol", "did you mean 'pool'?"),
         ("pool:3", "--executor pool:3: 'pool' takes no argument; write --executor pool"),
         ("mine:Nothing", "'mine:Nothing': mine has no attribute 'Nothing'"),

@@ -1,0 +1,1 @@
+from ._executor import RayExecutor as RayExecutor

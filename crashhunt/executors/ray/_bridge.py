@@ -1,0 +1,270 @@
+"""The process that speaks to Ray, between a hunt and the nodes.
+
+Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals;
+here none of that reaches the hunt. The hunt tells it by a socket what to run, and hears what came of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Unpack
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors._remains import died
+from crashhunt.executors.ray._cluster import Cluster, Lost, UnreachableError
+from crashhunt.executors.ray._parcel import Parcel
+from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
+from crashhunt.executors.ray._work import unpacked
+from crashhunt.trial import TrialSpec
+
+if TYPE_CHECKING:
+    from crashhunt.executors.ray._messages import BridgeJob, Ended, FromBridge, News, NodeJob, ToBridge
+
+__all__ = ["main"]
+
+_LOOK_EVERY_S = 1.0  # which nodes there are
+_WAIT_S = 0.2  # for a node to answer, before somebody else is looked at
+_TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
+_FREE_S = 3.0  # for CPUs to become free that somebody else has just left
+_CLOSE_S = 1.5  # for nodes to end everything; then they are killed
+_LOSSES = 3  # of a node without a trial between
+
+
+def main() -> None:
+    """Be the bridge; standard error is a log."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    control = socket.socket(fileno=int(sys.argv[1]))
+    job = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
+    code = 1
+    try:
+        Bridge(control, job).run()
+        code = 0
+    except CrashhuntError as error:
+        passing = isinstance(error, UnreachableError)
+        control.sendall(json.dumps({**error.to_json(), "passing": passing}).encode() + b"\n")
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)  # whoever is left is ended by the keeper, and by Ray
+
+
+class Bridge:
+    """Hands trials to nodes, and what comes of them back.
+
+    Args:
+        control: the socket to the hunt.
+        job: what is to be done: see `RayExecutor`.
+    """
+
+    def __init__(self, control: socket.socket, job: BridgeJob) -> None:
+        self._control = control
+        self._job = job
+        self._settings = WorkerSettings.from_json(job["settings"])
+        self._parcel = Parcel.of(self._settings)
+        self._digest = self._parcel.digest()
+        self._lock = threading.RLock()
+        self._roster = Roster()
+        self._refused: dict[str, str] = {}  # node to why
+        self._losses: dict[str, int] = {}
+        self._maps: dict[str, bytes] = {}
+        self._began = time.monotonic()
+        self._looked = self._told = 0.0
+        self._ever_ready = bool(job["resumed"])
+        self._alone = False  # no node is left, and people know
+        self._closing = False
+        self._cluster = Cluster(job["address"], cpus=job["cpus"], temporary=job["temporary"])
+
+    def run(self) -> None:
+        """Work until the hunt wants no more."""
+        threading.Thread(target=self._listen, daemon=True).start()
+        while not self._closing:
+            with self._lock:
+                self._look_for_nodes()
+                self._hand_out()
+                self._tell_figures()
+                asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
+            if not asked:
+                time.sleep(_WAIT_S / 2)
+                continue
+            for answer in self._cluster.answered(list(asked), _WAIT_S):
+                with self._lock:
+                    if asked[answer].answer is answer and not self._closing:
+                        self._hear(asked[answer])
+        with self._lock:
+            ready = [node for node in self._roster.nodes.values() if node.ready]
+            self._cluster.close([node.actor for node in self._roster.nodes.values()], ready, _CLOSE_S)
+
+    def _listen(self) -> None:
+        """Take what the hunt wants, also while nodes are waited for."""
+        with self._control.makefile("rb") as lines:
+            for line in lines:
+                message: ToBridge = json.loads(line)
+                with self._lock:
+                    if "submit" in message:
+                        self._roster.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
+                        self._hand_out()
+                    else:
+                        self._roster.cancel(message["cancel"])
+                        for node in self._roster.nodes.values():
+                            if node.ready:
+                                self._cluster.order(node.actor, "cancel", message["cancel"])
+        self._closing = True
+
+    def _say(self, **message: Unpack[FromBridge]) -> None:
+        self._control.sendall(json.dumps(message).encode() + b"\n")
+
+    def _hand_out(self) -> None:
+        for node, trials in self._roster.assign().items():
+            self._cluster.order(node.actor, "submit", [(trial.ticket, trial.spec) for trial in trials])
+
+    def _look_for_nodes(self) -> None:
+        """Find nodes that have come or gone, and have new ones get ready."""
+        if time.monotonic() - self._looked < _LOOK_EVERY_S:
+            return
+        self._looked = time.monotonic()
+        alive = self._cluster.nodes()
+        for node in list(self._roster.nodes.values()):
+            if node.id not in alive:
+                self._lose(node)
+        able = {found.id: found for found in alive.values() if found.cpus > 0}
+        taken = sum(node.slots for node in self._roster.nodes.values())
+        free = {
+            found.id: found.free
+            for found in able.values()
+            if found.id not in self._refused and found.id not in self._roster.nodes
+        }
+        wanted = self._job["parallel"] - taken if self._job["parallel"] else None
+        for name, slots in shares(free, wanted).items():
+            node = Node(name, able[name].name, slots, self._cluster.stand(name, slots))
+            self._roster.nodes[name] = node
+            self._ask(node, "differs", self._job["versions"], self._job["code"])
+        if self._roster.nodes:
+            return
+        if able and all(name in self._refused for name in able):
+            raise UsageError(
+                f"no node of the cluster can run the trials: {next(iter(self._refused.values()))}",
+                fix="install there what is here, and run the same command again",
+            )
+        if not self._ever_ready and time.monotonic() - self._began > _FREE_S:
+            cpus = sum(found.cpus for found in able.values())
+            why = f"none of its {cpus} CPUs is free" if cpus else "none of its nodes has a CPU for work"
+            raise UsageError(
+                f"the Ray cluster at {self._cluster.address} can run nothing: {why}",
+                fix="wait until others are done, or add a node with 'ray start --address=...'",
+            )
+        if self._ever_ready and not self._alone:
+            self._alone = True
+            self._say(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
+
+    def _ask(self, node: Node, what: str, *arguments: Any) -> None:
+        node.doing, node.answer = what, self._cluster.ask(node.actor, what, *arguments)
+
+    def _hear(self, node: Node) -> None:
+        """Take what a node answers, and ask it the next thing."""
+        try:
+            said = self._cluster.value(node.answer)
+        except Lost:
+            self._lose(node)
+            return
+        except Exception as error:  # of ours, over there
+            self._refuse(node, " ".join(f"{type(error).__name__}: {error}".split()))
+            return
+        if node.doing == "take":
+            self._take(node, said)
+        elif node.doing == "differs" and said:
+            self._refuse(node, said)
+        elif node.doing == "differs":
+            job: NodeJob = {
+                "settings": self._job["settings"],
+                "recycle_after": self._job["recycle_after"],
+                "digest": self._digest,
+                "folders": self._parcel.folders,
+                "slots": node.slots,
+            }
+            self._ask(node, "begin", job)
+        elif said == "ready":
+            node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
+            self._say(capacity=self._roster.capacity)
+            self._ask(node, "take", 0.0)
+        elif said == "lacks":
+            self._ask(node, "deliver", self._cluster.shared(self._parcel.packed))
+        else:
+            self._refuse(node, said)
+
+    def _take(self, node: Node, news: News) -> None:
+        """Pass on what has happened on a node."""
+        if news.map:
+            self._maps[node.id] = news.map
+        for ended in news.ended:
+            if self._roster.ended(node, ended.ticket):
+                self._losses.pop(node.id, None)
+                if ended.files:
+                    self._keep(node, ended)
+                self._control.sendall(ended.line)
+        self._hand_out()
+        for note in news.notes:
+            self._say(note=note)
+        if news.where is not None:
+            self._say(node=node.id, where=news.where)
+        if news.error is not None:
+            error = CrashhuntError.from_json(news.error)
+            self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
+        else:
+            self._ask(node, "take", _TAKE_S)
+
+    def _keep(self, node: Node, ended: Ended) -> None:
+        """Write what a trial that is kept has left behind to where the hunt looks for it."""
+        scratch = self._settings.scratch
+        folder = scratch_of(scratch, ended.number)
+        unpacked(ended.files, folder)
+        common = self._maps.get(node.id)
+        if common is not None and not (folder / layout.MAP).exists():
+            unpacked({layout.MAP: common}, folder if (scratch / layout.MAP).exists() else scratch)
+
+    def _lose(self, node: Node) -> None:
+        """Go on without a node; what ran there runs again elsewhere."""
+        count = len(node.running)
+        culprits = self._roster.lose(node)
+        self._cluster.kill(node.actor)
+        self._losses[node.id] = self._losses.get(node.id, 0) + 1
+        if self._losses[node.id] >= _LOSSES:
+            self._refused[node.id] = f"{node.name}: its process was ended {_LOSSES} times before a trial was done"
+            self._say(note=f"node {self._refused[node.id]}; it takes no part any more")
+        elif node.ready:
+            again = f", with {count} trials, which run again" if count else ""
+            self._say(note=f"node {node.name} was lost{again}")
+        self._say(capacity=self._roster.capacity, node=node.id, where={})
+        for trial in culprits:
+            result = died(TrialSpec.from_json(trial.spec), self._settings.scratch, -signal.SIGKILL)
+            assert result.failure is not None
+            why = f"the node on which it ran was lost {trial.losses} times, at last with this trial alone on it"
+            result = replace(result, failure=replace(result.failure, message=why))
+            self._say(ticket=trial.ticket, result=result.to_json())
+
+    def _refuse(self, node: Node, why: str) -> None:
+        """Go on without a node that cannot run trials."""
+        self._refused[node.id] = f"{node.name}: {why}"
+        for trial in node.running.values():
+            trial.losses -= 1  # it is not to blame
+        self._roster.lose(node)
+        self._cluster.order(node.actor, "close")
+        self._cluster.kill(node.actor, after_s=_CLOSE_S)
+        self._looked = 0.0
+        self._say(note=f"node {node.name} takes no part: {why}", capacity=self._roster.capacity, node=node.id, where={})
+
+    def _tell_figures(self) -> None:
+        if time.monotonic() - self._told > _LOOK_EVERY_S:
+            self._told = time.monotonic()
+            self._say(nodes=[node.figures() for node in self._roster.nodes.values() if node.ready])

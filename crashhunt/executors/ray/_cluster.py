@@ -1,0 +1,171 @@
+"""Ray itself, as far as a hunt needs it: which nodes there are, actors on them, calls and their answers."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.errors import UsageError
+from crashhunt.executors.ray import _site
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.executors.ray._roster import Node
+
+__all__ = ["Cluster", "Found", "Lost", "UnreachableError"]
+
+_STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
+_ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, beside those of the other
+
+
+class Lost(Exception):  # noqa: N818 - it is no fault
+    """The node, or the actor on it, is gone."""
+
+
+class UnreachableError(UsageError):
+    """The cluster cannot be reached, now or at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A node of a cluster.
+
+    Args:
+        id: Ray's.
+        name: for people.
+        cpus: for work.
+        free: those that nobody has taken.
+    """
+
+    id: str
+    name: str
+    cpus: int
+    free: int
+
+
+class Cluster:
+    """A connection to a cluster, of which a process has one.
+
+    Args:
+        address: of it; empty for one of our own, which ends with this process.
+        cpus: of one of our own.
+        temporary: the folder for files of one of our own.
+
+    Raises:
+        UnreachableError: it cannot be used.
+    """
+
+    def __init__(self, address: str, *, cpus: int, temporary: str | None) -> None:
+        import ray
+        from ray import cloudpickle
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        self._ray = ray
+        self._affinity = NodeAffinitySchedulingStrategy
+        self.address = address or "this machine"
+        os.environ.pop("RAY_ADDRESS", None)  # which was looked at before
+        options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "configure_logging": False}
+        if not address:
+            options |= {"num_cpus": cpus, "include_dashboard": False, "_temp_dir": temporary}
+            options |= {"object_store_memory": _STORE_BYTES}
+        try:
+            ray.init(address=address or "local", **options)
+        except Exception as error:
+            said = " ".join(str(error).split()) or type(error).__name__
+            raise UnreachableError(
+                f"the Ray cluster at {self.address} cannot be used: {said}",
+                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
+            ) from error
+        cloudpickle.register_pickle_by_value(_site)
+        kind = ray.remote(concurrency_groups={_ORDERS: 1, _ANSWERS: 1}, max_restarts=0, max_task_retries=0)
+        self._kind: Any = kind(_site.Site)
+        self._shared: Any = None
+
+    def nodes(self) -> dict[str, Found]:
+        """Return the nodes that are there now.
+
+        Raises:
+            UnreachableError: the cluster does not say.
+        """
+        from ray._private.state import available_resources_per_node  # of which there is no public form
+
+        try:
+            alive = [node for node in self._ray.nodes() if node["Alive"]]
+            free = available_resources_per_node()
+        except Exception as error:
+            raise UnreachableError(f"the Ray cluster at {self.address} does not answer: {error}") from error
+        hosts = Counter(node["NodeManagerHostname"] for node in alive)
+        found = {}
+        for node in alive:
+            name, host = node["NodeID"], node["NodeManagerHostname"]
+            shown = host if hosts[host] == 1 else f"{host}-{name[:6]}"
+            cpus = int(node["Resources"].get("CPU", 0))
+            found[name] = Found(name, shown, cpus, min(cpus, int(free.get(name, {}).get("CPU", 0))))
+        return found
+
+    def stand(self, node: str, slots: int) -> Any:
+        """Have an actor stand on a node, which takes so many of its CPUs."""
+        strategy = self._affinity(node_id=node, soft=False)
+        return self._kind.options(num_cpus=slots, scheduling_strategy=strategy).remote()
+
+    def ask(self, actor: Any, what: str, *arguments: Any) -> Any:
+        """Call a method of an actor; return where its answer will be."""
+        return getattr(actor, what).options(concurrency_group=_ANSWERS).remote(*arguments)
+
+    def order(self, actor: Any, what: str, *arguments: Any) -> Any:
+        """Call one whose answer says nothing; orders are carried out one after another."""
+        return getattr(actor, what).options(concurrency_group=_ORDERS).remote(*arguments)
+
+    def answered(self, answers: Sequence[Any], wait_s: float) -> list[Any]:
+        """Return the answers that are there, waiting so long for a first one."""
+        ready, rest = self._ray.wait(list(answers), num_returns=1, timeout=wait_s)
+        more, _ = self._ray.wait(rest, num_returns=len(rest), timeout=0) if ready and rest else ([], [])
+        return [*ready, *more]
+
+    def value(self, answer: Any) -> Any:
+        """Return an answer that is there.
+
+        Raises:
+            Lost: the one who was asked is gone.
+            Exception: what it raised.
+        """
+        from ray import exceptions
+
+        try:
+            return self._ray.get(answer)
+        except exceptions.RayTaskError as error:
+            raise error.cause if isinstance(error.cause, Exception) else error from None
+        except exceptions.RayError as error:
+            raise Lost(str(error)) from None
+
+    def shared(self, make: Callable[[], bytes]) -> Any:
+        """Return what all nodes can be sent, made when the first one needs it."""
+        if self._shared is None:
+            self._shared = self._ray.put(make())
+        return self._shared
+
+    def kill(self, actor: Any, *, after_s: float = 0.0) -> None:
+        """End an actor, where it is still there."""
+        if after_s:
+            timer = threading.Timer(after_s, self.kill, [actor])
+            timer.daemon = True
+            timer.start()
+            return
+        with suppress(Exception):
+            self._ray.kill(actor, no_restart=True)
+
+    def close(self, actors: Sequence[Any], ready: Sequence[Node], wait_s: float) -> None:
+        """Have nodes end what they do, and leave."""
+        with suppress(Exception):
+            closed = [self.order(node.actor, "close") for node in ready]
+            self._ray.wait(closed, num_returns=len(closed), timeout=wait_s)
+        for actor in actors:
+            self.kill(actor)
+        time.sleep(0.05)  # for the last of these to be on its way

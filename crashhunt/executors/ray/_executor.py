@@ -1,0 +1,280 @@
+"""Runs trials on all machines of a Ray cluster: the part of it that is in the hunt's process."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import platform
+import select
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.keeper import Kept
+from crashhunt.executors._notes import Notes
+from crashhunt.executors.ray._address import answers, cluster_of, require_ray
+from crashhunt.executors.ray._parcel import Parcel
+from crashhunt.executors.ray._site import code_digest
+from crashhunt.recording import BlackBoxHeader, Phase
+from crashhunt.snapshots import versions
+from crashhunt.trial import TrialResult
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.executors.ray._messages import BridgeJob, Figures, FromBridge, ToBridge
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["RayExecutor"]
+
+_RECEIVED = 1 << 18  # bytes at a time
+_CLOSE_S = 3.0  # for the bridge to end what runs on the nodes
+_RETRY_S = 3.0  # between looks whether a cluster that was lost is back
+_LOSSES = 3  # of a cluster of the hunt's own, without a trial between
+_LONGEST = 40  # characters of a folder in which Ray can make its sockets
+_numbers = itertools.count()
+
+
+class RayExecutor:
+    """Runs trials on all machines of a Ray cluster, on each in a pool of its own.
+
+    Ray is used by a process beside this one, the bridge (see ``_bridge.py``), and may be lost with it: every trial that
+    was submitted and has not come back is submitted again to the next one.
+
+    Args:
+        settings: of the hunt.
+        parallel: how many trials at a time over the whole cluster; 0 for all of its CPUs, now and later.
+        recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
+        argument: of ``--executor ray:ADDRESS``: see `cluster_of`.
+
+    Raises:
+        PluginError: Ray is not installed.
+        UsageError: nobody answers there, or there is more to send than travels well.
+    """
+
+    sizes_itself: ClassVar[bool] = True
+
+    def __init__(
+        self, settings: WorkerSettings, *, parallel: int = 0, recycle_after: int = 1000, argument: str = ""
+    ) -> None:
+        require_ray()
+        self._address = cluster_of(argument)
+        Parcel.of(settings)
+        self._settings = settings
+        self._parallel = parallel
+        self._recycle_after = recycle_after
+        self._slots: int | None = None
+        self._tickets = itertools.count()
+        self._open: dict[int, TrialSpec] = {}  # ticket to trial
+        self._where: dict[str, dict[int, BlackBoxHeader]] = {}
+        self._nodes: list[Figures] = []
+        self._notes = Notes(settings.scratch)
+        self._found: list[TrialResult] = []
+        self._losses = 0
+        self._lost_at = 0.0
+        self._ever_up = False
+        self._closed = False
+        self._temporary: str | None = None
+        self._kept: Kept | None = None
+        self._control: socket.socket | None = None
+        self._log = Path()
+        self._received = bytearray()
+        self._start()
+
+    @property
+    def capacity(self) -> int:
+        """How many trials run at a time, at least 1: where nobody runs any, they are waited for."""
+        return max(1, self._parallel if self._slots is None else self._slots)
+
+    def submit(self, spec: TrialSpec) -> None:
+        """Queue a trial."""
+        ticket = next(self._tickets)
+        self._open[ticket] = spec
+        self._send({"submit": [(ticket, spec.to_json())]})
+
+    def completed(self, timeout_s: float) -> Iterator[TrialResult]:
+        """Yield the trials that have ended, waiting so long for a first one.
+
+        Raises:
+            CrashhuntError: no node can run any.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._receive(max(0.0, deadline - time.monotonic()))
+            found, self._found = self._found, []
+            yield from found
+            if found or time.monotonic() >= deadline:
+                return
+
+    def cancel(self, *, above: int = -1) -> None:
+        """Give up all trials whose number is greater than ``above``, at once."""
+        self._open = {ticket: spec for ticket, spec in self._open.items() if spec.number <= above}
+        self._found = [result for result in self._found if result.spec.number <= above]
+        self._send({"cancel": above})
+
+    def where(self) -> dict[int, BlackBoxHeader]:
+        """Return where running trials were half a second ago, for people who watch."""
+        running = {spec.number for spec in self._open.values()}
+        found = [pair for headers in self._where.values() for pair in headers.items()]
+        return {number: header for number, header in found if number in running}
+
+    def notes(self) -> list[str]:
+        """Return what people should be told that has not been returned before."""
+        return self._notes.fresh()
+
+    def close(self) -> None:
+        """End everything on every node, and a cluster of our own."""
+        if self._closed:
+            return
+        self._closed = True
+        self._open.clear()
+        if self._control is not None and self._kept is not None:
+            with suppress(OSError):
+                self._control.shutdown(socket.SHUT_RDWR)
+            with suppress(subprocess.TimeoutExpired):
+                self._kept.process.wait(_CLOSE_S)
+        self._end()
+
+    def _start(self) -> None:
+        """Start a bridge, and submit everything to it that has not come back."""
+        number = next(_numbers)
+        scratch = self._settings.scratch
+        job, self._log = scratch / f"ray-{number}.json", scratch / f"ray-{number}.log"
+        self._temporary = None if self._address else _short_folder()
+        content: BridgeJob = {
+            "settings": self._settings.to_json(),
+            "parallel": self._parallel,
+            "recycle_after": self._recycle_after,
+            "address": self._address,
+            "cpus": self._parallel or len(os.sched_getaffinity(0)),
+            "temporary": self._temporary,
+            "versions": {"machine": platform.machine(), **versions()},
+            "code": code_digest(),
+            "resumed": self._ever_up,
+        }
+        job.write_text(json.dumps(content), encoding="utf-8")
+        self._control, theirs = socket.socketpair()
+        with theirs, self._log.open("wb") as log:
+            self._kept = Kept(
+                "crashhunt.executors.ray._bridge",
+                [str(theirs.fileno()), str(job)],
+                environment={**os.environ, **_QUIET},
+                inherited=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        self._received.clear()
+        self._send({"submit": [(ticket, spec.to_json()) for ticket, spec in self._open.items()]})
+
+    def _send(self, message: ToBridge) -> None:
+        if self._control is not None:
+            with suppress(OSError):  # it is gone, which shows when it is listened to
+                self._control.sendall(json.dumps(message).encode() + b"\n")
+
+    def _receive(self, wait_s: float) -> None:
+        """Take what the bridge says, waiting so long for something."""
+        if self._control is None:
+            if self._closed or not self._is_back():
+                time.sleep(wait_s)
+            return
+        if not select.select([self._control], [], [], wait_s)[0]:
+            return
+        try:
+            data = self._control.recv(_RECEIVED)
+        except OSError:
+            data = b""
+        self._received += data
+        *lines, rest = bytes(self._received).split(b"\n")
+        self._received = bytearray(rest)
+        for line in lines:
+            self._hear(json.loads(line))
+        if not data and self._control is not None:
+            self._lose()
+
+    def _hear(self, message: FromBridge) -> None:
+        if "result" in message:
+            if self._open.pop(message["ticket"], None) is not None:
+                self._found.append(TrialResult.from_json(message["result"]))
+                self._losses = 0
+            return
+        if "error" in message:
+            error = CrashhuntError.from_json({"error": message["error"]})
+            if not message["passing"] or not self._ever_up or not self._address:
+                raise error
+            self._lose(error.message)
+            return
+        if "capacity" in message:
+            self._slots = message["capacity"]
+            self._ever_up = self._ever_up or bool(self._slots)
+        if "note" in message:
+            self._notes.add(message["note"])
+        if "nodes" in message:
+            self._nodes = message["nodes"]
+        if "where" in message:
+            self._where[message["node"]] = {
+                int(number): BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent)
+                for number, (pid, trial, started, committed, step, phase, agent) in message["where"].items()
+            }
+
+    def _lose(self, why: str = "") -> None:
+        """Take note that the bridge is gone, and with it the cluster, or the connection to it.
+
+        Raises:
+            CrashhuntError: it has never come up, or a cluster of our own has ended too often.
+        """
+        self._end()
+        self._slots, self._lost_at = 0, time.monotonic()
+        self._where.clear()
+        self._losses += 1
+        if not self._ever_up or (not self._address and self._losses >= _LOSSES):
+            lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise CrashhuntError(
+                f"Ray has ended on its own{f': {lines[-1]}' if lines else ''}",
+                fix="see that the limits on memory and processes leave it room, and run the same command again",
+            )
+        self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")
+
+    def _is_back(self) -> bool:
+        """Whether a cluster that was lost answers again; then the hunt goes on there."""
+        if time.monotonic() - self._lost_at < (_RETRY_S if self._address else 0.0):
+            return False
+        self._lost_at = time.monotonic()
+        if self._address and answers(self._address):
+            return False
+        self._start()
+        return True
+
+    def _end(self) -> None:
+        if self._kept is not None:
+            self._kept.end()
+            self._kept = None
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        if self._temporary is not None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+            self._temporary = None
+
+
+# Nothing goes to the makers of Ray, and it gives a lost head up soon: the hunt looks for it again.
+_QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+def _short_folder() -> str:
+    """A folder in which Ray can make its sockets, whose names must not be long."""
+    folder = tempfile.gettempdir()
+    return tempfile.mkdtemp(prefix="chr-", dir=folder if len(folder) <= _LONGEST else "/tmp")
