@@ -31,7 +31,7 @@ __all__ = [
     "registered",
 ]
 
-Group = Literal["agents", "backends", "executors", "oracles", "samplers", "simulators"]
+Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "samplers", "simulators"]
 
 
 def registered(group: Group) -> dict[str, EntryPoint]:

@@ -95,7 +95,7 @@ def states_table(states: list[HuntState]) -> Table:
             f"{state.trials_run}/{state.trials_planned}",
             f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
-            str(state.crashes),
+            str(state.crashes) + (f" ({state.disturbed} disturbed)" if state.disturbed is not None else ""),
             str(state.errors),
             Text(said),
         )

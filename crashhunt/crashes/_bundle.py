@@ -17,7 +17,17 @@ from crashhunt.base.tolerance import known_part, merged, typed_where_there
 from crashhunt.crashes._data import CrashData, Protected
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
-from crashhunt.trial import Collision, Escape, Failure, TrialResult, TrialSpec, check_parts, outcome_of
+from crashhunt.trial import (
+    Collision,
+    Disturbance,
+    Escape,
+    Failure,
+    TrialResult,
+    TrialSpec,
+    check_disturbances,
+    check_parts,
+    outcome_of,
+)
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
@@ -39,7 +49,8 @@ __all__ = [
     "write_trial",
 ]
 
-SCHEMA = 2
+SCHEMA = 3
+_UNDISTURBED = 2  # what is written where there are no disturbances: without them, it would be another trial
 _PROTECTED = 2  # the first version with a digest of itself and of the files beside it
 _KNOWN = bool | float | str | None
 _NEEDED: Plain = {
@@ -53,6 +64,8 @@ _TYPES: Plain = {
     "sim_time_s": float,
     "confirmed": bool | None,
     "divergence": dict | None,
+    "disturbed": bool,
+    "log_likelihood": float | None,
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
@@ -154,7 +167,7 @@ class Bundle:
         plain = result.to_json()
         spec = plain["spec"]
         data: CrashData = {
-            "schema": SCHEMA,
+            "schema": SCHEMA if result.spec.disturbances else _UNDISTURBED,
             "id": self.id,
             "hunt_seed": self.hunt_seed,
             "trial": spec["number"],
@@ -180,6 +193,11 @@ class Bundle:
             "divergence": self.divergence,
             "files": dict(self.files) or _files_beside(folder),
         }
+        if result.log_likelihood is not None or result.spec.disturbances:
+            data["disturbed"] = result.disturbed
+            data["log_likelihood"] = plain.get("log_likelihood")
+            data["disturbances"] = plain.get("disturbances", [])
+            data["planned_disturbances"] = spec.get("disturbances", [])
         whole = merged(data, self.added)
         whole["integrity"] = digest_of_data(whole)
         with whole_file(folder / layout.CRASH) as temporary:
@@ -232,6 +250,8 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
     closest = data.get("closest_approach", {})
     check_parts(closest, hit, failure, escape, event)
+    for disturbances in (data.get("planned_disturbances"), data.get("disturbances")):
+        check_disturbances(disturbances)
     typed({"events": data.get("events")}, {"events": dict[str, int] | None})
     if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
         raise ValueError("trial, seed, step or max_steps is out of its range")
@@ -243,6 +263,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         data.get("arguments", {}),
         data.get("scenario_arguments", {}),
         max_steps=data["max_steps"],
+        disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
     )
     result = TrialResult(
         spec,
@@ -256,6 +277,8 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         escape=Escape.from_json(escape) if escape else None,
         event=Event.from_json(event) if event else None,
         events=data.get("events"),
+        disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
+        log_likelihood=data.get("log_likelihood"),
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(
@@ -320,7 +343,7 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
     _collect_output(result, scratch, target)
-    data = {**result.to_json(), "schema": SCHEMA, "files": _files_beside(target)}
+    data = {**result.to_json(), "schema": _UNDISTURBED, "files": _files_beside(target)}
     data["integrity"] = digest_of_data(data)
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.integrity import FileEntry
     from crashhunt.recording import DivergenceData
-    from crashhunt.trial import CollisionData, EscapeData, FailureData, Value
+    from crashhunt.trial import CollisionData, DisturbanceData, EscapeData, FailureData, Value
     from crashhunt.world import ClosestData, EventData
 
 __all__ = ["ArchiveIndex", "CrashData", "CrashSummary", "Protected"]
@@ -52,6 +52,10 @@ class CrashData(Protected):
     versions: dict[str, str]
     confirmed: bool | None
     divergence: DivergenceData | None
+    disturbed: NotRequired[bool]
+    log_likelihood: NotRequired[float | None]
+    disturbances: NotRequired[list[DisturbanceData]]
+    planned_disturbances: NotRequired[list[DisturbanceData]]
 
 
 class CrashSummary(TypedDict):

@@ -17,6 +17,7 @@ import numpy as np
 from crashhunt.agents import Closes
 from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
+from crashhunt.episode._disturbed import Disturbed
 from crashhunt.episode._failures import failure_of, is_emptied
 from crashhunt.episode._nearness import Nearness
 from crashhunt.episode._observer import Observer
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.recording import BlackBox
-    from crashhunt.simulators import Observations, Simulator
+    from crashhunt.simulators import Observations, Simulator, StepResult
+    from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
 __all__ = ["Episode", "MakeAgent", "run_episode", "seed_everything"]
@@ -104,6 +106,7 @@ class Episode:
             self._oracles += (TrafficEvents(),)
         self._checks: list[Callable[[Scene, Sequence[str]], Sequence[Finding]]] = []
         self._max_steps = spec.max_steps
+        self._advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] = simulator.step
         self._nothing: tuple[float, ...] = ()
         self._encoders: list[Callable[[Any], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[Any], Any]] = {}
@@ -114,6 +117,9 @@ class Episode:
         ]
         self._on_action = [one.action for one in observers if type(one).action is not Observer.action]
         self._on_scene = [one.scene for one in observers if type(one).scene is not Observer.scene]
+        self._on_disturbance: list[Callable[[Disturbance], None]] = [
+            one.disturbance for one in observers if type(one).disturbance is not Observer.disturbance
+        ]
         self._on_end = [one.end for one in reversed(observers) if type(one).end is not Observer.end]
 
     def start(self) -> TrialResult | None:
@@ -173,7 +179,7 @@ class Episode:
                 actions[name] = action
             simulator = self.simulator
             try:
-                self.observations, rewards, self.terminations, truncations, _ = simulator.step(actions)
+                self.observations, rewards, self.terminations, truncations, _ = self._advance(actions)
                 scene = simulator.scene()
                 scene.follow(self.scene)
                 self.scene = scene
@@ -208,7 +214,8 @@ class Episode:
         agents, self.agents = self.agents, {}
         for agent in agents.values():
             _quietly(agent)
-        for told in (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_end):
+        tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
+        for told in (*tells, self._on_end):
             told.clear()  # observers may hold the episode
 
     def __enter__(self) -> Self:
@@ -229,6 +236,10 @@ class Episode:
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:
                 tell(self)
+            if spec.disturbances:
+                disturbed = Disturbed(spec, simulator, self._on_disturbance)
+                self._advance, self.observations = disturbed.step, disturbed.first(self.observations)
+                self._on_end.insert(0, disturbed.end)
             for number, agent in enumerate(self.names):
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
                 self.agents[agent].reset(_agent_seed(spec.seed, number))

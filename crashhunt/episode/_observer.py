@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import Disturbance, TrialResult
     from crashhunt.world import Scene
 
 __all__ = ["Observer"]
@@ -39,6 +39,13 @@ class Observer:
         Args:
             number: of the agent, in `Episode.names`.
             action: encoded.
+        """
+
+    def disturbance(self, disturbance: Disturbance) -> None:
+        """A disturbance takes place; told before the step in which it begins, or that follows.
+
+        Args:
+            disturbance: as it takes place, with who is meant; a vehicle that is not there is empty.
         """
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:

@@ -19,6 +19,7 @@ from crashhunt.recording import (
     Tag,
     digest_of,
     encode_actors,
+    encode_disturbance,
     encode_events,
     encode_heights,
     encode_notes,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
     from crashhunt.episode._episode import Episode
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import Disturbance, TrialResult
     from crashhunt.world import Actor, Roster, Scene
 
 __all__ = ["Recorder"]
@@ -77,6 +78,10 @@ class Recorder(Observer):
     def action(self, number: int, action: NDArray[np.generic]) -> None:
         """Record what an agent answered."""
         self._box.action(number, action)
+
+    def disturbance(self, disturbance: Disturbance) -> None:
+        """Record what takes place, and who is meant."""
+        self._box.append(Tag.DISTURBANCE, 0, encode_disturbance(disturbance))
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a scene, and before it whatever is new about it."""

@@ -278,9 +278,15 @@ def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
         for name in sorted(one.scenario_arguments.keys() | other.scenario_arguments.keys())
         if one.scenario_arguments.get(name) != other.scenario_arguments.get(name)
     ]
+    if one.disturb != other.disturb:
+        return f"they have {_disturbances(one)} and {_disturbances(other)}, so that the same seed is another traffic"
     if differing:
         return f"they do not try the same values of {', '.join(differing)}, so that the same seed is another traffic"
     return ""
+
+
+def _disturbances(settings: HuntSettings) -> str:
+    return f"the disturbances {', '.join(settings.disturb)}" if settings.disturb else "no disturbances"
 
 
 def _same_draws(first: HuntResults, second: HuntResults) -> bool:
@@ -312,6 +318,8 @@ def _caution(first: HuntResults, second: HuntResults) -> str:
         return f"trials of the one have {one.max_steps} steps to crash in, those of the other {other.max_steps}"
     if one.crash_on != other.crash_on:
         return "they do not count the same outcomes as crashes"
+    if one.disturb != other.disturb:
+        return f"the one has {_disturbances(one)}, the other {_disturbances(other)}"
     if not (one.run.keep_going and other.run.keep_going):
         return "one that stops at its first crash runs fewer trials; use --keep-going"
     return ""

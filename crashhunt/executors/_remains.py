@@ -12,7 +12,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.episode import scratch_of
 from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
-from crashhunt.trial import Failure, Outcome, TrialResult
+from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
 from crashhunt.world import ClosestApproach, closest_approach
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _result(
             message = f"{message} in the simulator at step {steps + 1}"
     failure = Failure(kind, message, stack, agent, exit_code, output)
     wall_s = time.monotonic() - header.started if header is not None else 0.0
-    return TrialResult(
+    result = TrialResult(
         spec,
         outcome,
         steps=steps,
@@ -140,6 +140,7 @@ def _result(
         worker=header.pid if header is not None else 0,
         kept=folder.is_dir(),
     )
+    return in_effect(result, recording.disturbances if recording is not None else ())
 
 
 def signal_name(exit_code: int) -> str:

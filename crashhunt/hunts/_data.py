@@ -34,6 +34,7 @@ class Noted(TypedDict, total=False):
         independent: whether they were drawn independently of each other.
         lag: by how many trials a sampler that learns is told late.
         origins: whether its sampler says where trials come from.
+        disturb: how often what disturbs its trials; None where nothing does.
     """
 
     owner: Owner | None
@@ -45,6 +46,7 @@ class Noted(TypedDict, total=False):
     independent: bool
     lag: int | None
     origins: bool
+    disturb: list[str] | None
 
 
 class Facts(Noted, total=False):

@@ -25,7 +25,7 @@ from crashhunt.hunts._preflight import Preflight
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
-from crashhunt.plans import with_settings
+from crashhunt.plans import disturber, with_settings
 from crashhunt.replays import confirm
 from crashhunt.samplers import NamedSampler
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
@@ -129,6 +129,7 @@ class Hunt:
         settings = self.settings
         snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
         sampler = NamedSampler(settings.sampler, settings.space, points=settings.points)
+        self._disturber = disturber(self.scenario, settings)
         progress = Progress()
         finished = ledger.finished()
         # It was killed between saving the one and the other. Where the trial is from, only its proposal says.
@@ -143,7 +144,7 @@ class Hunt:
         progress.crashes = list_bundles(self.directory)
         before = ledger.facts()
         lag = self._lag(before)
-        trials = Trials(settings, sampler, ledger, finished, lag=lag)
+        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber)
         ledger.enter(
             "running",
             owner=this_process(),
@@ -153,6 +154,7 @@ class Hunt:
             planned=settings.trials,
             hunt_seed=settings.seed,
             independent=sampler.independent and (not finished or draws_independently(before, settings)),
+            disturb=list(settings.disturb) or None,
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         stopped: StoppedBecause | None = None
@@ -302,6 +304,8 @@ class Hunt:
     ) -> None:
         """Account for a trial that has ended."""
         settings = self.settings
+        if self._disturber is not None:
+            result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
         progress.ended_here += 1
         progress.outcomes[str(result.outcome)] += 1

@@ -11,6 +11,7 @@ from crashhunt.hunts._ledger_reader import Turn
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
+    from crashhunt.disturbances import Disturber
     from crashhunt.hunts._ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
@@ -35,18 +36,27 @@ class Trials:
         ledger: of the hunt.
         finished: the numbers of the trials that have ended.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
+        disturber: what draws their disturbances; None where they have none.
 
     Raises:
         CrashhuntError: the sampler fails, or the ledger is damaged.
     """
 
     def __init__(
-        self, settings: HuntSettings, sampler: NamedSampler, ledger: Ledger, finished: set[int], *, lag: int
+        self,
+        settings: HuntSettings,
+        sampler: NamedSampler,
+        ledger: Ledger,
+        finished: set[int],
+        *,
+        lag: int,
+        disturber: Disturber | None = None,
     ) -> None:
         self._settings = settings
         self._sampler = sampler
         self._ledger = ledger
         self._lag = lag
+        self._disturber = disturber
         self._waiting = iter(number for number in range(settings.trials) if number not in finished)
         self._next = next(self._waiting, None)
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
@@ -71,10 +81,10 @@ class Trials:
                 if self._must_wait(self._next):
                     break
                 told = self._tell(self._next - self._lag)
-                spec = spec_of(self._next, self._settings, self._sampler)
+                spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
                 turns.append(Turn(told, spec))
             elif spec is None:
-                spec = spec_of(self._next, self._settings, self._sampler)
+                spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
             found.append(spec)
             self._open.add(self._next)
             self._next = next(self._waiting, None)
@@ -122,8 +132,10 @@ class Trials:
         self._untold = sorted(finished - told)
 
 
-def spec_of(number: int, settings: HuntSettings, sampler: NamedSampler) -> TrialSpec:
-    """Return a trial as a sampler proposes it.
+def spec_of(
+    number: int, settings: HuntSettings, sampler: NamedSampler, disturber: Disturber | None = None
+) -> TrialSpec:
+    """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
 
     Raises:
         CrashhuntError: the sampler fails.
@@ -135,12 +147,15 @@ def spec_of(number: int, settings: HuntSettings, sampler: NamedSampler) -> Trial
     scenario_arguments: dict[str, Any] = {}
     for (agent, name), value in sorted(proposal.arguments.items()):
         (arguments[agent] if agent else scenario_arguments)[name] = value
+    if proposal.seed is not None:
+        seed = proposal.seed
     return TrialSpec(
         number,
-        seed if proposal.seed is None else proposal.seed,
+        seed,
         arguments,
         scenario_arguments,
         max_steps=settings.max_steps,
         parent=proposal.parent,
         origin=proposal.origin,
+        disturbances=disturber.draw(seed, settings.max_steps) if disturber is not None else (),
     )

@@ -17,7 +17,7 @@ from crashhunt.base.names import one_of
 from crashhunt.crashes import Bundle, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._ledger import Ledger, has_begun
-from crashhunt.hunts._row import FACTS, ORIGINS, TrialRow
+from crashhunt.hunts._row import DISTURBANCES, FACTS, ORIGINS, TrialRow
 from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
 from crashhunt.plans import HuntSettings, read_settings, with_settings
 from crashhunt.snapshots import Snapshot, latest_snapshot
@@ -89,9 +89,13 @@ class HuntResults:
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing."""
+        """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing.
+
+        Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances.
+        """
         with closing(self._ledger()) as ledger:
-            return (*columns_of(self.settings), *(ORIGINS if ledger.facts().get("origins") else ()))
+            origins = ORIGINS if ledger.facts().get("origins") else ()
+        return (*columns_of(self.settings), *(DISTURBANCES if self.settings.disturb else ()), *origins)
 
     @property
     def crashes(self) -> list[Bundle]:

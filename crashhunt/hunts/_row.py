@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import Outcome, ResultData, Value
 
-__all__ = ["FACTS", "ORIGINS", "Cell", "TrialRow"]
+__all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "Cell", "TrialRow"]
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
@@ -22,6 +22,9 @@ FACTS = (
 
 ORIGINS = ("parent", "origin")
 """Further ones, of trials that a sampler made of others, or by one of several strategies."""
+
+DISTURBANCES = ("disturbances", "log_likelihood")
+"""Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
 
 Cell: TypeAlias = "Value | None"
 """What a table has in one place; None where a trial has no such value."""
@@ -69,7 +72,7 @@ class TrialRow:
         """Return it as a row of a table that has some columns.
 
         Args:
-            columns: some of `FACTS` and `ORIGINS`, ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
+            columns: some of `FACTS`, `DISTURBANCES` and `ORIGINS`, ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
         """
         data = self.data
         spec, closest, events = data["spec"], data["closest"], data.get("events")
@@ -86,6 +89,8 @@ class TrialRow:
             "digest": data["digest"],
             "parent": spec.get("parent"),
             "origin": spec.get("origin", ""),
+            "disturbances": len(data.get("disturbances", ())),
+            "log_likelihood": data.get("log_likelihood"),
         }
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)

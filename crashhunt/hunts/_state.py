@@ -6,13 +6,14 @@ import json
 import os
 import socket
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.integrity import read_object
 from crashhunt.base.names import near_path
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._ledger_file import damaged
@@ -63,6 +64,7 @@ class HuntState:
         seconds_left: to the last trial, at that rate; None where it does not run.
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
+        disturbed: how many of the crashes had disturbances; None where the hunt has none.
     """
 
     dir: str
@@ -77,6 +79,7 @@ class HuntState:
     seconds_left: float | None = None
     owner_alive: bool = False
     damaged: bool = False
+    disturbed: int | None = None
 
     @property
     def failed(self) -> bool:
@@ -85,7 +88,10 @@ class HuntState:
 
     def to_json(self) -> dict[str, object]:
         """Return the shape of one hunt in ``status --json``."""
-        return asdict(self)
+        data = asdict(self)
+        if self.disturbed is None:
+            del data["disturbed"]
+        return data
 
 
 def is_hunt(directory: Path) -> bool:
@@ -171,7 +177,17 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         rate,
         (planned - run) / rate if state == "running" and rate > 0 else None,
         alive,
+        disturbed=_disturbed(directory) if facts.get("disturb") else None,
     )
+
+
+def _disturbed(directory: Path) -> int:
+    """How many crashes had disturbances; one that cannot be read is left to whoever reads it."""
+    count = 0
+    for path in (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}"):
+        with suppress(OSError, ValueError):
+            count += read_object(path, dict[str, object]).get("disturbed") is True
+    return count
 
 
 def draws_independently(facts: Facts, settings: HuntSettings) -> bool:

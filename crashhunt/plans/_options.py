@@ -113,6 +113,14 @@ class TrialOptions(_Options):
         "not_moving:S), others_collided, hard_braking (or hard_braking:M/S²), teleport",
         flag="--crash-on", metavar="KIND,…", separator=",",
     )  # fmt: skip
+    disturb: Sequence[str] = option(
+        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second",
+        help="have others around the agent err, or the agent see or act late, so often a second, as in "
+        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, ignore_priority, unseen, "
+        "late_observation, noisy_observation, late_action or module:attribute; none for nothing at all",
+        unset="as the scenario says, and nothing where it is silent",
+        flag="--disturb", metavar="NAME=RATE,…", separator=",",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

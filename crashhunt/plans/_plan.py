@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
+from crashhunt.disturbances import disturber_of, parse_rates
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
@@ -23,10 +24,11 @@ from crashhunt.world import LIMITS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from crashhunt.disturbances import Disturber
     from crashhunt.plans._request import Request
     from crashhunt.trial import Signature
 
-__all__ = ["parse_crash_on", "plan", "with_settings"]
+__all__ = ["disturber", "parse_crash_on", "plan", "with_settings"]
 
 
 def plan(request: Request) -> tuple[Scenario, HuntSettings]:
@@ -51,6 +53,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
         "crash_on": crash_on,
+        "disturb": _disturb(request, scenario),
     }
     settings = HuntSettings(
         **options,
@@ -68,6 +71,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
+    disturber(scenario, settings)  # it refuses what cannot be meant
     NamedSampler(settings.sampler, settings.space, points=settings.points)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
     return scenario, replace(settings, run=sized(settings.run))
@@ -106,6 +110,31 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
         if action:
             scenario = with_action(scenario, agent, action)
     return scenario
+
+
+def disturber(scenario: Scenario, settings: HuntSettings) -> Disturber | None:
+    """Return what draws the disturbances of a hunt's trials; None where there are none.
+
+    Raises:
+        CrashhuntError: there is no such disturbance, or the simulator cannot do it.
+    """
+    rates = parse_rates(settings.disturb)
+    if not rates:
+        return None
+    backend = scenario.backend
+    return disturber_of(
+        rates,
+        agents=tuple(settings.agents),
+        step_length_s=backend.step_length_s(scenario),
+        known=backend.disturbances,
+        simulator=backend.title or "the simulator",
+    )
+
+
+def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
+    """What is asked for, or else what the scenario says."""
+    words = request.disturb or tuple(f"{name}={rate!r}" for name, rate in scenario.disturbances.items())
+    return tuple(f"{name}={rate!r}" for name, rate in parse_rates(words).items())
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:

@@ -15,6 +15,7 @@ from ._reading import StepRecord as StepRecord
 from ._recording import Recording as Recording
 from .records import RECORD_TYPES as RECORD_TYPES, Tag as Tag
 from .records.actors import encode_actors as encode_actors
+from .records.disturbances import encode_disturbance as encode_disturbance
 from .records.events import encode_events as encode_events
 from .records.heights import encode_heights as encode_heights
 from .records.lanes import encode_lanes as encode_lanes

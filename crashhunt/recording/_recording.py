@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.recording._blackbox import Record
     from crashhunt.recording._reading import StepRecord
     from crashhunt.recording.records.prologue import AgentChannel, Prologue
+    from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 
 __all__ = ["Recording"]
@@ -90,6 +91,11 @@ class Recording:
     def scenes(self) -> list[Scene]:
         """All scenes, in order."""
         return [step.scene for step in self.all_steps if step.scene is not None]
+
+    @property
+    def disturbances(self) -> tuple[Disturbance, ...]:
+        """Those that began, as they took place; of one for which nobody was there, the vehicle is empty."""
+        return tuple(one for step in self.all_steps for one in step.more.get("disturbance", ()))
 
     def _channel(self, agent: str) -> AgentChannel:
         for channel in self.prologue.agents:

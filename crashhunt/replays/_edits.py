@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.plans import Owners, Takes, takes_of
+from crashhunt.replays._disturbances import edited_disturbances, is_about_disturbances
 from crashhunt.trial import Constant, parse_spec
 
 if TYPE_CHECKING:
@@ -77,7 +78,12 @@ def edited_spec(
         if before_it != now:
             longer = name == "max_steps" and now > before_it  # which leaves nothing out
             (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
+    disturbances = recorded.disturbances
     for name, text in changes.items():
+        if is_about_disturbances(name) and recorded.disturbances:
+            disturbances, said = edited_disturbances(disturbances, name, text)
+            others += said
+            continue
         key = _find(name, recorded, settings, code)
         values[key] = _constant(text, after.get(key), f"--set {name}")
     arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
@@ -90,10 +96,16 @@ def edited_spec(
             )
             target[name] = value
     max_steps = settings.max_steps if settings.max_steps != original.max_steps else recorded.max_steps
-    trial = replace(recorded, arguments=arguments, scenario_arguments=scenario_arguments, max_steps=max_steps)
+    trial = replace(
+        recorded,
+        arguments=arguments,
+        scenario_arguments=scenario_arguments,
+        max_steps=max_steps,
+        disturbances=disturbances,
+    )
     kept = [
-        f"{name} was {was} and is {now} in hunt.toml; a replay keeps that of the recorded trial"
-        for name in ("seed", "scenario")
+        f"{name} was {_plain(was)} and is {_plain(now)} in hunt.toml; a replay keeps that of the recorded trial"
+        for name in ("seed", "scenario", "disturb")
         if (was := getattr(original, name)) != (now := getattr(settings, name))
     ]
     return trial, Edits(tuple(agents), tuple(others), tuple(kept))

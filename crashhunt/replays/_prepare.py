@@ -16,6 +16,7 @@ from crashhunt.plans import read_settings, with_settings
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.snapshots import Snapshot, environment_changes, processor
+from crashhunt.trial import OF_AGENT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -176,9 +177,18 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.backend.step_length_s(other)
+    able = other.backend.disturbances
+    odd = next((one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT)), "")
+    if odd:
+        message = f"--scenario {name!r}: {other.backend.title} cannot do the disturbance {odd!r}"
+        raise UsageError(message, fix="replay with --set disturbances=none as well")
     return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
         scenario_arguments=argument_values(other) | shared,
         max_steps=max(1, round(spec.max_steps * step_length_s / there)),
+        disturbances=tuple(
+            replace(one, step=max(1, round(one.step * step_length_s / there)), agent=ids.get(one.agent, one.agent))
+            for one in spec.disturbances
+        ),
     )

@@ -18,6 +18,7 @@ from crashhunt.base.watching import watched
 from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
+from crashhunt.report._disturbances import by_likelihood
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
+    from crashhunt.trial import TrialResult
     from crashhunt.world import Actor
 
 __all__ = ["report_data", "write_report"]
@@ -88,7 +90,7 @@ def report_data(
             for (agent, name), unit in argument_units(directory, settings).items()
         },
         **_trials(directory),
-        "crashes": [_crash(bundle) for bundle in watched(bundles, len(bundles), watch)],
+        "crashes": [_crash(bundle) for bundle in watched(by_likelihood(bundles), len(bundles), watch)],
     }
 
 
@@ -154,6 +156,7 @@ def _crash(bundle: Bundle) -> dict[str, object]:
             "simulation time": f"{result.sim_time_s:.1f} s",
             "digest": result.digest,
             "snapshot": bundle.snapshot,
+            **_disturbances(result),
             "confirmed": {True: "yes, to the bit", False: "no: flaky", None: "not tried"}[bundle.confirmed],
         },
         "escape": story.escape,
@@ -165,6 +168,14 @@ def _crash(bundle: Bundle) -> dict[str, object]:
         **({} if story.encounter is None else {"gap": _gap_to_other(story.encounter, recording)}),
         "lanes": _lanes(bundle, recording),
     }
+
+
+def _disturbances(result: TrialResult) -> dict[str, str]:
+    """What the page says of disturbances, which the words tell one by one."""
+    if result.log_likelihood is None:
+        return {}
+    said = f"{len(result.disturbances)} took place" if result.disturbed else "none: in undisturbed traffic"
+    return {"disturbances": said, "log-likelihood": f"{result.log_likelihood:.2f}"}
 
 
 def _scenes(recording: Recording, agent: str) -> dict[str, object]:

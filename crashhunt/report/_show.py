@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
 from crashhunt.crashes import Encounter, last_escape
+from crashhunt.report._disturbances import about_disturbances
 from crashhunt.report._events import about_events
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
@@ -97,6 +98,7 @@ class Story:
         scenes = recording.scenes()
         lasted = self._end_s - scenes[0].time_s if scenes else 0.0
         sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
+        sentences += about_disturbances(recording, result, self._first_step())
         if self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
         sentences += about_events(recording, self._first_step(), besides=result.event)

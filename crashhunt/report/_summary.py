@@ -7,6 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
+from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
@@ -42,12 +43,14 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if not report.crashes and report.stopped_because == "all_trials":
         lines.append("No crash was found.")
     lines += _describe_events(report)
-    for bundle in report.crashes[:_SHOWN]:
+    lines += describe_disturbances(report.crashes)
+    crashes = by_likelihood(report.crashes)
+    for bundle in crashes[:_SHOWN]:
         lines += ["", *_describe_crash(bundle)]
     if len(report.crashes) > _SHOWN:
         lines += ["", f"… and {len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"]
     if report.crashes:
-        first = report.crashes[0]
+        first = crashes[0]
         command = [program, "replay", str(report.directory)]
         if len(report.crashes) > 1:
             command += ["--crash", first.id]
@@ -153,7 +156,7 @@ def _describe_crash(bundle: Bundle) -> list[str]:
         f"  after {result.steps} steps, simulation time {result.sim_time_s:.1f} s",
         f"  seed {result.spec.seed}, {format_arguments(result)}",
     ]
-    lines += [f"  {line}" for line in _evidence(result)]
+    lines += [f"  {line}" for line in (*_evidence(result), *told_disturbances(result))]
     lines.append(f"  saved in {bundle.path}")
     if bundle.confirmed is not None:
         first: Plain = bundle.divergence or {}

@@ -100,6 +100,7 @@ class Backend:
         per_processor: whether it may round otherwise on another processor.
         step_length_s: the control step, in s, where it is not the scenario's own.
         told_events: the kinds of traffic events that it tells; None where nobody knows.
+        disturbances: the kinds of disturbances of the traffic that it can do; None where nobody knows.
         actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
         accelerator: where it has one.
         configurations: files of its own that are run as they are.
@@ -129,6 +130,7 @@ class Backend:
     per_processor: bool = False
     step_length_s: Callable[[Scenario], float] = _its_own
     told_events: tuple[str, ...] | None = None
+    disturbances: tuple[str, ...] | None = None
     actions: tuple[str, ...] = ()
     accelerator: Accelerator | None = None
     configurations: tuple[Configuration, ...] = ()

@@ -61,6 +61,7 @@ def as_plain_data(scenario: Scenario) -> dict[str, object]:
 
     said = asdict(replace(scenario, folder=Path()))
     data = as_in_file({key: plain(value) for key, value in said.items() if value is not None})
-    if not data["events"]:
-        del data["events"]  # which an earlier crashhunt does not know
+    for later in ("events", "disturbances"):  # which an earlier crashhunt does not know
+        if not data[later]:
+            del data[later]
     return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}

@@ -40,6 +40,8 @@ class Scenario:
         tables: what simulators of their own want to know, by the name of the table; in the file, they stand beside
             these keys. Each is of the dataclass that the simulator's `Backend` says.
         events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
+        disturbances: how often others err, or an agent sees or acts late: name to a rate per second. Hunts heed it, and
+            nothing else.
         schema: of the file format.
         name: what people call it; the folder's name by default.
         folder: where its files are; not part of the file.
@@ -57,6 +59,7 @@ class Scenario:
     agents: dict[str, AgentSetup] = field(default_factory=lambda: {"ego": AgentSetup()})
     tables: dict[str, Any] = field(default_factory=dict)
     events: dict[str, float] = field(default_factory=dict)
+    disturbances: dict[str, float] = field(default_factory=dict)
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()

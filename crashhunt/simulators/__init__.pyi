@@ -10,6 +10,8 @@ from ._protocol import (
     FACULTIES as FACULTIES,
     ActionForm as ActionForm,
     BrakesFully as BrakesFully,
+    Disturbing as Disturbing,
+    Disturbs as Disturbs,
     FlattensObservations as FlattensObservations,
     FullBraking as FullBraking,
     HasMap as HasMap,

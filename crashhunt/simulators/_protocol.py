@@ -13,12 +13,15 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
+    from crashhunt.trial import Disturbance
     from crashhunt.world import Lane, Scene
 
 __all__ = [
     "FACULTIES",
     "ActionForm",
     "BrakesFully",
+    "Disturbing",
+    "Disturbs",
     "FlattensObservations",
     "FullBraking",
     "HasMap",
@@ -77,8 +80,8 @@ class Simulator(Protocol):
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
-    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully` and `Tidies`.
-    Nothing is registered: whoever has the methods and attributes of one offers it.
+    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs` and
+    `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers it.
     """
 
     @property
@@ -203,6 +206,47 @@ class BrakesFully(Protocol):
         """Return how; None where this vehicle's actions do not keep it in its lane. Called after `Simulator.reset`."""
 
 
+class Disturbing(Protocol):
+    """A vehicle that errs; it has begun to with the next step."""
+
+    @property
+    def how_strong(self) -> float:
+        """What the vehicle can do of what was asked for, in the unit of the kind."""
+
+    def keep(self) -> None:
+        """Go on; called before every further step. The vehicle may be gone."""
+
+    def end(self) -> None:
+        """Let the vehicle drive by itself again from the next step on. It may be gone."""
+
+
+class Disturbs(Protocol):
+    """A simulator that can have others than the agents err.
+
+    Contract: an erring vehicle does what vehicles of its type can do, and is never one of the agents'. Only one
+    disturbance at a time has the same vehicle. Whatever still goes on at the end is forgotten by `Simulator.reset`.
+    """
+
+    @property
+    def disturbing_kinds(self) -> Sequence[str]:
+        """What it can do, such as ``brake``."""
+
+    def whom(self, disturbance: Disturbance) -> str:
+        """Return which vehicle is meant, as it is now; empty where there is none.
+
+        Args:
+            disturbance: says the agent, and the place around it.
+        """
+
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+        """Have a vehicle err from the next step on; None where it cannot, as where there is no lane to change to.
+
+        Args:
+            vehicle: as `whom` has just said.
+            disturbance: what it is to do.
+        """
+
+
 class Tidies(Protocol):
     """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
 
@@ -226,6 +270,7 @@ FACULTIES: tuple[type, ...] = (
     HasMap,
     HasWindow,
     BrakesFully,
+    Disturbs,
     Tidies,
 )
 """Everything that a simulator may offer."""

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Disturbing, Observations, StepResult
+    from crashhunt.trial import Disturbance
 
 __all__ = ["ToySimulator"]
 
@@ -74,6 +75,7 @@ class ToySimulator:
         self._v = dict.fromkeys(names, float(self._argument("leader_speed", 10.0)))
         self._start = dict(self._x)
         self._touched: set[str] = set()
+        self._disturbed: dict[str, float] = {}  # who errs, and the speed that it brakes to in the next step, in m/s
         self._enlist()
         self._look(())
         return {agent: self._observe(agent) for agent in self.agents}, {}
@@ -85,6 +87,7 @@ class ToySimulator:
         wanted = {agent: self._target(agent, action) for agent, action in actions.items()}
         cruising = float(self._argument("leader_speed", 10.0))
         wanted[_LEADER] = 0.0 if self._rng.random() < 0.05 else cruising
+        wanted |= self._disturbed
         for name, target in wanted.items():
             change = min(
                 max(target - self._v[name], -_BRAKING * self.step_length_s), _ACCELERATION * self.step_length_s
@@ -121,6 +124,25 @@ class ToySimulator:
         if self._setups[agent].action == "meta":
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         return FullBraking((0.0, 0), "all that it can do", _BRAKING)
+
+    disturbing_kinds = ("brake", "stop")
+
+    def whom(self, disturbance: Disturbance) -> str:
+        """Return the leader where it is next ahead; everybody else is an agent."""
+        ahead = [name for name, x in self._x.items() if x > self._x.get(disturbance.agent, np.inf)]
+        return _LEADER if disturbance.who == "ahead" and ahead == [_LEADER] else ""
+
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing:
+        """Brake, as hard as vehicles can at most."""
+        return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
+
+    def brake(self, vehicle: str, deceleration: float) -> None:
+        """Have a vehicle brake in the next step, in m/s²."""
+        self._disturbed[vehicle] = max(0.0, self._v[vehicle] - deceleration * self.step_length_s)
+
+    def let_go(self, vehicle: str) -> None:
+        """Let a vehicle drive by itself again."""
+        self._disturbed.pop(vehicle, None)
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -182,3 +204,21 @@ class ToySimulator:
             lateral_speed=0.0,
             lanes=1,
         )
+
+
+class _Braking:
+    """A vehicle that brakes, whatever it would do otherwise."""
+
+    def __init__(self, toy: ToySimulator, vehicle: str, how_strong: float) -> None:
+        self.how_strong = how_strong
+        self._toy = toy
+        self._vehicle = vehicle
+        self.keep()
+
+    def keep(self) -> None:
+        """Brake in the next step as well."""
+        self._toy.brake(self._vehicle, self.how_strong)
+
+    def end(self) -> None:
+        """Drive by itself again."""
+        self._toy.let_go(self._vehicle)

@@ -1,5 +1,6 @@
 from ._agents import AgentContract as AgentContract
 from ._backends import BackendContract as BackendContract
+from ._disturbances import DisturbanceContract as DisturbanceContract
 from ._escapes import EscapeCheck as EscapeCheck, check_escape as check_escape
 from ._executors import ExecutorContract as ExecutorContract
 from ._oracles import OracleContract as OracleContract, drive as drive

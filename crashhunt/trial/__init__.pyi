@@ -1,9 +1,16 @@
 from ._data import (
     CollisionData as CollisionData,
+    DisturbanceData as DisturbanceData,
     EscapeData as EscapeData,
     FailureData as FailureData,
     ResultData as ResultData,
     SpecData as SpecData,
+)
+from ._disturbance import (
+    CELLS as CELLS,
+    KINDS as KINDS,
+    OF_AGENT as OF_AGENT,
+    Disturbance as Disturbance,
 )
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (
@@ -14,8 +21,12 @@ from ._outcome import (
     in_order as in_order,
     outcome_of as outcome_of,
 )
-from ._plain import check_parts as check_parts, check_plain as check_plain
-from ._result import TrialResult as TrialResult
+from ._plain import (
+    check_disturbances as check_disturbances,
+    check_parts as check_parts,
+    check_plain as check_plain,
+)
+from ._result import TrialResult as TrialResult, in_effect as in_effect
 from ._signature import Signature as Signature, signature_of as signature_of
 from ._space import (
     Argument as Argument,

@@ -13,7 +13,16 @@ if TYPE_CHECKING:
     from crashhunt.trial._space import Value
     from crashhunt.world import ClosestData, EventData
 
-__all__ = ["CollisionData", "EscapeData", "FailureData", "OverruledData", "ResultData", "SpecData", "SpecExtras"]
+__all__ = [
+    "CollisionData",
+    "DisturbanceData",
+    "EscapeData",
+    "FailureData",
+    "OverruledData",
+    "ResultData",
+    "SpecData",
+    "SpecExtras",
+]
 
 
 class OverruledData(TypedDict):
@@ -23,12 +32,25 @@ class OverruledData(TypedDict):
     after: int
 
 
+class DisturbanceData(TypedDict):
+    """Of a `Disturbance`."""
+
+    step: int
+    who: str
+    what: str
+    how_strong: float
+    how_long: float
+    agent: str
+    vehicle: NotRequired[str]
+
+
 class SpecExtras(TypedDict, total=False):
     """What of a `TrialSpec` is left out where there is none; ``requires`` names what another version must know."""
 
     overruled: OverruledData
     parent: int
     origin: str
+    disturbances: list[DisturbanceData]
     requires: list[str]
 
 
@@ -98,3 +120,5 @@ class ResultData(TypedDict):
     escape: NotRequired[EscapeData | None]
     event: NotRequired[EventData | None]
     events: NotRequired[dict[str, int] | None]
+    disturbances: NotRequired[list[DisturbanceData]]
+    log_likelihood: NotRequired[float | None]

@@ -8,10 +8,12 @@ from crashhunt.base.integrity import typed
 from crashhunt.base.tolerance import typed_where_there
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import Plain
-    from crashhunt.trial._data import ResultData
+    from collections.abc import Sequence
 
-__all__ = ["check_parts", "check_plain"]
+    from crashhunt.base.plain import Plain
+    from crashhunt.trial._data import DisturbanceData, ResultData
+
+__all__ = ["check_disturbances", "check_parts", "check_plain"]
 
 
 _TEXT_OR_NUMBER = bool | float | str | None
@@ -39,6 +41,13 @@ _FAILURE = {**dict.fromkeys(("kind", "message", "traceback", "agent", "last_outp
 _ESCAPE = {"step": int | None, "too_late": int | None, "braking": float | None, "how": str}
 
 
+_DISTURBANCE: Plain = {
+    "step": int,
+    **dict.fromkeys(("who", "what"), str),
+    **dict.fromkeys(("how_strong", "how_long"), float),
+}
+
+
 _EVENT: Plain = {
     **dict.fromkeys(("kind", "agent", "what", "lane"), str),
     **dict.fromkeys(("x", "y", "speed"), float | None),
@@ -62,10 +71,26 @@ def check_plain(data: ResultData) -> None:
     typed_where_there(spec, _SPEC)
     typed({"events": data.get("events")}, {"events": dict | None})
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
+    for planned in (data.get("disturbances"), spec.get("disturbances")):
+        check_disturbances(planned)
+    typed_where_there(data, {"log_likelihood": float | None})
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
     if min(data["steps"], spec["number"], spec["seed"], spec["max_steps"]) < 0:
         raise ValueError("a number is below 0")
+
+
+def check_disturbances(disturbances: Sequence[DisturbanceData] | None) -> None:
+    """See the same of a list of disturbances, where there is one.
+
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    typed({"disturbances": disturbances}, {"disturbances": list | None})
+    for one in disturbances or ():
+        typed({"disturbance": one}, {"disturbance": dict})
+        typed(one, _DISTURBANCE)
+        typed_where_there(one, dict.fromkeys(("agent", "vehicle"), str))
 
 
 def check_parts(

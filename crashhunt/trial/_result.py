@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from crashhunt.base.plain import finite
+from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from crashhunt.trial._data import ResultData
 
-__all__ = ["TrialResult"]
+__all__ = ["TrialResult", "in_effect"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,9 @@ class TrialResult:
         kept: whether the worker left its scratch folder for the hunt to collect.
         escape: until when braking would have avoided it; None where nobody tried, or where it cannot be told.
         events: how many traffic events of which kind there were; None where nobody looked.
+        disturbances: those that took place, with who turned out to be meant.
+        log_likelihood: that just these disturbances begin in these steps, and no others: the natural logarithm of the
+            probability, as the hunt's models have it; None where the hunt has none.
     """
 
     spec: TrialSpec
@@ -55,6 +60,8 @@ class TrialResult:
     escape: Escape | None = None
     event: Event | None = None
     events: Mapping[str, int] | None = None
+    disturbances: tuple[Disturbance, ...] = ()
+    log_likelihood: float | None = None
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -78,6 +85,10 @@ class TrialResult:
         }
         if not self.outcome.is_own:
             del data["category"]
+        if self.disturbances:
+            data["disturbances"] = [one.to_json() for one in self.disturbances]
+        if self.log_likelihood is not None:
+            data["log_likelihood"] = finite(self.log_likelihood)
         return data
 
     @classmethod
@@ -101,7 +112,19 @@ class TrialResult:
             setup_s=data.get("setup_s", 0.0),
             worker=data.get("worker", 0),
             kept=data.get("kept", False),
+            disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
+            log_likelihood=data.get("log_likelihood"),
         )
+
+    @property
+    def steps_begun(self) -> int:
+        """How many steps were begun: one more than were completed, where something failed in the next."""
+        return self.steps + (self.failure is not None)
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether anything disturbed it: if not, it took place in the traffic as it is."""
+        return bool(self.disturbances)
 
     @property
     def summary(self) -> str:
@@ -122,3 +145,9 @@ class TrialResult:
                 return f"{whose}{failure.kind}: {failure.message}"
             return failure.message
         return f"{self.outcome} after {self.steps} steps"
+
+
+def in_effect(result: TrialResult, told: Iterable[Disturbance]) -> TrialResult:
+    """Return a result with those disturbances that had an effect by the end, of all that were told."""
+    found = tuple(one for one in told if one.vehicle and one.step <= result.steps_begun)
+    return replace(result, disturbances=found) if found else result

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.tolerance import ESSENTIAL, known_values, not_understood, required_of
 from crashhunt.base.version import __version__
+from crashhunt.trial._disturbance import Disturbance
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,6 +45,7 @@ class TrialSpec:
         overruled: which agent is not asked any more, and from when on; None where all drive to the end.
         parent: the trial that the sampler made it from; None where there is none. It determines nothing.
         origin: the sampler's word on where it came from, such as the name of a strategy. It determines nothing.
+        disturbances: who around the agents errs, and when; in the order of their steps.
     """
 
     number: int
@@ -54,6 +56,7 @@ class TrialSpec:
     overruled: Overruled | None = field(default=None, metadata=ESSENTIAL)
     parent: int | None = None
     origin: str = ""
+    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=ESSENTIAL)
 
     def to_json(self) -> SpecData:
         """Return plain dicts and numbers."""
@@ -64,6 +67,8 @@ class TrialSpec:
             more["parent"] = self.parent
         if self.origin:
             more["origin"] = self.origin
+        if self.disturbances:
+            more["disturbances"] = [one.to_json() for one in self.disturbances]
         if requires := required_of(self):
             more["requires"] = requires
         return {
@@ -98,4 +103,5 @@ class TrialSpec:
             overruled=Overruled(**known_values(Overruled, overruled)) if overruled else None,
             parent=data.get("parent"),
             origin=data.get("origin", ""),
+            disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
         )

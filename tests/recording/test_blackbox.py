@@ -103,7 +103,7 @@ def test_the_numbers_on_disk_stay_what_they_are():
     """Digests run over them, and logs that were written before have them."""
     assert [(tag.name, tag.value) for tag in Tag] == [
         ("PROLOGUE", 1), ("ACTORS", 2), ("ROSTER", 3), ("OBSERVATION", 4), ("ACTION", 5), ("STEP", 6), ("LANES", 7),
-        ("EVENTS", 8), ("HEIGHTS", 9), ("SPINES", 10), ("NOTES", 11),
+        ("EVENTS", 8), ("HEIGHTS", 9), ("SPINES", 10), ("NOTES", 11), ("DISTURBANCE", 12),
     ]  # fmt: skip
     assert [(phase.name, phase.value) for phase in Phase] == [("SETUP", 0), ("ACT", 1), ("SIMULATE", 2), ("DONE", 3)]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from crashhunt.recording.records import (
     action,
     actors,
+    disturbances,
     events,
     heights,
     lanes,
@@ -30,7 +31,20 @@ __all__ = ["RECORD_TYPES", "Tag"]
 # In the order in which those of one step are compared: what an agent saw and did, what came of it.
 RECORD_TYPES: dict[int, RecordType] = {
     module.TYPE.tag: module.TYPE
-    for module in (prologue, actors, roster, observation, action, step, events, lanes, heights, spines, notes)
+    for module in (
+        prologue,
+        actors,
+        roster,
+        disturbances,
+        observation,
+        action,
+        step,
+        events,
+        lanes,
+        heights,
+        spines,
+        notes,
+    )
 }
 """Every type by its tag."""
 
@@ -49,3 +63,4 @@ class Tag(IntEnum):
     HEIGHTS = heights.TYPE.tag
     SPINES = spines.TYPE.tag
     NOTES = notes.TYPE.tag
+    DISTURBANCE = disturbances.TYPE.tag

@@ -80,5 +80,6 @@ BACKEND = Backend(
     modules=_modules,
     versions=("gymnasium",),
     told_events=(),
+    disturbances=(),
     side_effect=_side_effect,
 )

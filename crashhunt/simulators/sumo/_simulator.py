@@ -17,6 +17,7 @@ from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup, Scenario
-    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Disturbing, Observations, StepResult
+    from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
 __all__ = ["SumoSimulator"]
@@ -70,8 +72,10 @@ class SumoSimulator:
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
+        self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
 
     told_events = BACKEND.told_events
+    disturbing_kinds = BACKEND.disturbances or ()
 
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo brings along."""
@@ -175,6 +179,14 @@ class SumoSimulator:
         if setup.speed_mode & _KEEPS_DECELERATION:
             return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
+
+    def whom(self, disturbance: Disturbance) -> str:
+        """Return who is at a place around an agent, along the lanes."""
+        return self._disturbances.whom(disturbance, self._scene)
+
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+        """Command a vehicle until its disturbance ends."""
+        return self._disturbances.disturb(vehicle, disturbance)
 
     def close(self) -> None:
         """End the simulation, unless another simulator of this process has begun one since."""

@@ -1,0 +1,15 @@
+from ._models import (
+    Choices as Choices,
+    brake as brake,
+    cut_in as cut_in,
+    dawdle as dawdle,
+    ignore_priority as ignore_priority,
+    late_action as late_action,
+    late_observation as late_observation,
+    noisy_observation as noisy_observation,
+    speed as speed,
+    stop as stop,
+    unseen as unseen,
+)
+from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn
+from ._rates import NONE as NONE, Disturber as Disturber, disturber_of as disturber_of, parse_rates as parse_rates

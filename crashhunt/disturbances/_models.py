@@ -1,0 +1,127 @@
+"""The models that come with crashhunt: a few places, strengths and lengths each, drawn independently."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+from crashhunt.disturbances._protocol import Drawn
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+
+__all__ = [
+    "Choices",
+    "brake",
+    "cut_in",
+    "dawdle",
+    "ignore_priority",
+    "late_action",
+    "late_observation",
+    "noisy_observation",
+    "speed",
+    "stop",
+    "unseen",
+]
+
+T = TypeVar("T")
+
+_AROUND = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead": 2.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """A model that chooses place, strength and length independently of each other.
+
+    Args:
+        what: the kind.
+        who: places in the grid around the agent, each with its weight.
+        how_strong: likewise, in the unit of the kind.
+        how_long: likewise, in s.
+    """
+
+    what: str
+    who: Mapping[str, float]
+    how_strong: Mapping[float, float]
+    how_long: Mapping[float, float]
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """Draw the three, in this order."""
+        return Drawn(_one_of(self.who, rng), _one_of(self.how_strong, rng), _one_of(self.how_long, rng))
+
+    def log_likelihood(self, drawn: Drawn) -> float:
+        """Return the sum of the three logarithms."""
+        return (
+            _log_share(self.who, drawn.who)
+            + _log_share(self.how_strong, drawn.how_strong)
+            + _log_share(self.how_long, drawn.how_long)
+        )
+
+
+def brake() -> Choices:
+    """Whoever is ahead brakes hard, and lets go again."""
+    return Choices("brake", {"ahead": 1.0}, {2.0: 3.0, 4.0: 2.0, 6.0: 1.0}, {1.0: 1.0, 2.0: 2.0, 3.0: 1.0})
+
+
+def stop() -> Choices:
+    """Whoever is ahead comes to a stop in the middle of the road, and goes on later."""
+    return Choices("stop", {"ahead": 1.0}, {3.0: 1.0, 6.0: 1.0}, {8.0: 1.0, 15.0: 1.0})
+
+
+def dawdle() -> Choices:
+    """Whoever is ahead drives much slower for a while."""
+    return Choices("dawdle", {"ahead": 1.0}, {0.3: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
+
+
+def speed() -> Choices:
+    """Whoever is behind wants to drive faster than allowed."""
+    places = {"behind": 2.0, "left behind": 1.0, "right behind": 1.0}
+    return Choices("speed", places, {0.2: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
+
+
+def cut_in() -> Choices:
+    """Somebody from a neighbouring lane changes into the agent's, however small the gap, and may brake there."""
+    return Choices("cut_in", _AROUND, {0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, {2.0: 1.0, 4.0: 1.0})
+
+
+def ignore_priority() -> Choices:
+    """Somebody on another way into the junction heeds neither its lights nor who has priority."""
+    places = {"left ahead": 2.0, "right ahead": 2.0, "left": 1.0, "right": 1.0}
+    return Choices("ignore_priority", places, {1.0: 1.0}, {5.0: 1.0, 10.0: 1.0})
+
+
+def late_observation() -> Choices:
+    """The agent sees everything late."""
+    return Choices("late_observation", {"itself": 1.0}, {0.2: 2.0, 0.5: 1.0, 1.0: 1.0}, {1.0: 1.0, 3.0: 1.0})
+
+
+def noisy_observation() -> Choices:
+    """Every number that the agent sees is off by some share of itself."""
+    return Choices("noisy_observation", {"itself": 1.0}, {0.05: 2.0, 0.1: 1.0, 0.2: 1.0}, {1.0: 1.0, 3.0: 1.0})
+
+
+def unseen() -> Choices:
+    """The agent does not see somebody."""
+    return Choices("unseen", {"ahead": 2.0, **_AROUND}, {1.0: 1.0}, {1.0: 2.0, 2.0: 1.0, 4.0: 1.0})
+
+
+def late_action() -> Choices:
+    """What the agent decides takes effect late."""
+    return Choices("late_action", {"itself": 1.0}, {0.2: 2.0, 0.5: 1.0, 1.0: 1.0}, {1.0: 1.0, 3.0: 1.0})
+
+
+def _one_of(weights: Mapping[T, float], rng: np.random.Generator) -> T:
+    place = rng.random() * sum(weights.values())
+    for value, weight in weights.items():
+        place -= weight
+        if place < 0:
+            return value
+    return list(weights)[-1]  # where rounding has left nothing over
+
+
+def _log_share(weights: Mapping[T, float], value: T) -> float:
+    weight = weights.get(value, 0.0)
+    return math.log(weight / sum(weights.values())) if weight > 0 else -math.inf

@@ -1,0 +1,49 @@
+"""The protocol of models: which disturbances of a kind there are, and how likely each is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = ["DisturbanceModel", "Drawn"]
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What a model has drawn.
+
+    Args:
+        who: the place in the grid around the agent, one of `crashhunt.trial.CELLS`.
+        how_strong: in the unit of the kind.
+        how_long: in s.
+    """
+
+    who: str
+    how_strong: float
+    how_long: float
+
+
+class DisturbanceModel(Protocol):
+    """Says what disturbances of one kind are like, once one happens; how often that is, whoever hunts says.
+
+    To give one a name, register what makes it, called without arguments::
+
+        [project.entry-points."crashhunt.disturbances"]
+        truck_cut_in = "mypackage.disturbances:TruckCutIn"
+
+    Contract: `draw` draws from its argument alone, and two models that were made alike draw alike. What is drawn is one
+    of countably many possibilities, of which `log_likelihood` knows the probability. A model keeps no state.
+    """
+
+    @property
+    def what(self) -> str:
+        """The kind: what the simulator is asked to do, such as ``brake``."""
+
+    def draw(self, rng: np.random.Generator) -> Drawn:
+        """Return one, drawn by a generator of its own."""
+
+    def log_likelihood(self, drawn: Drawn) -> float:
+        """Return the natural logarithm of the probability that one that happens is this; -inf where it never is."""

@@ -1,0 +1,216 @@
+"""``brake=0.02,cut_in=0.01``: how often what happens; and from that, which disturbances a trial has.
+
+Every model has a generator of its own around every agent, made of the trial's seed and its name: whatever else is drawn
+of the seed stays as it is, and so do the draws of a model where another one is added.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.base.blame import place_of
+from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
+from crashhunt.base.names import one_of
+from crashhunt.base.plugins import locate, registered
+from crashhunt.disturbances._protocol import Drawn
+from crashhunt.trial import CELLS, OF_AGENT, Disturbance
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from crashhunt.disturbances._protocol import DisturbanceModel
+    from crashhunt.trial import TrialResult
+
+__all__ = ["NONE", "Disturber", "disturber_of", "parse_rates"]
+
+NONE = "none"
+"""The word for no disturbances, whatever the scenario says."""
+_STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
+_SHOWN = "--disturb"
+
+
+def parse_rates(words: Iterable[str]) -> dict[str, float]:
+    """Return how often what happens, from ``NAME=RATE``; what has the rate 0 is left out.
+
+    Args:
+        words: as they are given; ``none`` alone for nothing.
+
+    Raises:
+        UsageError: a word says no rate, or a name comes twice.
+    """
+    given = tuple(words)
+    rates: dict[str, float] = {}
+    for word in given:
+        if word == NONE:
+            if len(given) > 1:
+                raise UsageError(f"{_SHOWN} {','.join(given)}: none stands alone", fix="leave it or the others out")
+            continue
+        name, equals, text = word.rpartition("=")
+        if not equals or not name:
+            fix = "write NAME=RATE with a rate per second, such as brake=0.02"
+            raise UsageError(f"{_SHOWN} {word!r} says no rate", fix=fix)
+        if name in rates:
+            raise UsageError(f"{_SHOWN} gives {name!r} twice", fix="give it once")
+        rates[name] = _rate(name, text)
+    return {name: rate for name, rate in sorted(rates.items()) if rate > 0}
+
+
+def _rate(name: str, text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not 0 <= rate < math.inf:
+        fix = "give how often it happens a second, from 0 on, such as 0.02"
+        raise UsageError(f"{_SHOWN} {name}={text}: {text!r} is no rate", fix=fix)
+    return rate
+
+
+def disturber_of(
+    rates: Mapping[str, float], *, agents: Sequence[str], step_length_s: float, known: Sequence[str] | None = None,
+    simulator: str = "the simulator",
+) -> Disturber:  # fmt: skip
+    """Return what draws the disturbances of trials.
+
+    Args:
+        rates: name of a model to how often it happens a second, around each agent.
+        agents: the controlled vehicles.
+        step_length_s: in s.
+        known: the kinds that the simulator can do; None where nobody knows.
+        simulator: how people call it.
+
+    Raises:
+        PluginError: there is no such model.
+        UsageError: it happens more than once a step, or the simulator cannot do it.
+    """
+    models: dict[str, DisturbanceModel] = {}
+    for name, rate in rates.items():
+        model: DisturbanceModel = locate_model(name)
+        if rate * step_length_s > 1:
+            fix = f"give at most {1 / step_length_s:g} a second"
+            raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one a step of {step_length_s:g} s", fix=fix)
+        if known is not None and model.what not in known and model.what not in OF_AGENT:
+            able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
+            message = f"{_SHOWN} {name}: {simulator} cannot do {model.what!r}"
+            raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
+        twin = next((other for other, made in models.items() if made.what == model.what), None)
+        if twin is not None:
+            message = f"{_SHOWN}: {twin} and {name} are both about {model.what!r}"
+            raise UsageError(message, fix="choose one of the two")
+        models[name] = model
+    return Disturber(models, dict(rates), tuple(agents), step_length_s)
+
+
+def locate_model(name: str) -> DisturbanceModel:
+    """Return the model of a name, or of a ``module:attribute``.
+
+    Raises:
+        PluginError: there is none.
+    """
+    if ":" not in name and name not in registered("disturbances"):
+        fix = f"{one_of(name, registered('disturbances'), none='(none)')}, or module:attribute"
+        raise UsageError(f"{_SHOWN}: there is no disturbance {name!r}", fix=fix)
+    try:
+        made: DisturbanceModel = locate("disturbances", name)()
+    except CrashhuntError:
+        raise
+    except Exception as error:  # somebody's own
+        message = f"the disturbance {name!r} cannot be made: {_said(error)}"
+        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+    for part in ("what", "draw", "log_likelihood"):
+        if not hasattr(made, part):
+            raise PluginError(f"{name!r} is no model of disturbances: it has no {part}", fix="see crashhunt.testing")
+    return made
+
+
+def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Drawn:
+    try:
+        drawn = model.draw(rng)
+        fine = drawn.who in CELLS and math.isfinite(drawn.how_strong) and 0 < drawn.how_long < math.inf
+    except Exception as error:  # somebody's own
+        message = f"the disturbance {name!r} cannot be drawn: {_said(error)}"
+        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+    if not fine:
+        fix = f"draw one of {', '.join(CELLS)}, a finite strength, and a length above 0 s"
+        raise PluginError(f"the disturbance {name!r} has drawn {drawn}, which is none", fix=fix)
+    return drawn
+
+
+def _said(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+@dataclass(frozen=True, slots=True)
+class Disturber:
+    """Draws the disturbances of trials, and knows how likely they are.
+
+    In every step, each model begins one around each agent with a probability of rate times step length, whatever else
+    is going on.
+
+    Args:
+        models: by name.
+        rates: of each, in 1/s.
+        agents: around whom.
+        step_length_s: in s.
+    """
+
+    models: Mapping[str, DisturbanceModel]
+    rates: Mapping[str, float]
+    agents: tuple[str, ...]
+    step_length_s: float
+
+    def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
+        """Return the disturbances of a trial, in order; those of a longer one begin with these.
+
+        Args:
+            seed: of the trial.
+            max_steps: the bound on its length, in steps.
+        """
+        found: list[Disturbance] = []
+        for number, agent in enumerate(self.agents):
+            for name, model in self.models.items():
+                key = (_STREAM, number, *name.encode())
+                rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+                chance, step = self._chance(name), 0
+                # A waiting time can be longer than any number of steps: that of a rate near 0.
+                while (step := step + int(min(rng.geometric(chance), max_steps + 1))) <= max_steps:
+                    drawn = _drawn(name, model, rng)
+                    strong, long = float(drawn.how_strong), float(drawn.how_long)
+                    found.append(Disturbance(step, drawn.who, model.what, strong, long, agent))
+        return tuple(sorted(found, key=lambda one: (one.step, one.agent, one.what)))
+
+    def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
+        """Return the natural logarithm of the probability that just these begin in so many steps.
+
+        Args:
+            disturbances: as they were drawn; what begins later is left out.
+            steps: how many there were.
+        """
+        begun = [one for one in disturbances if one.step <= steps]
+        total = 0.0
+        for agent in self.agents:
+            for name, model in self.models.items():
+                chance = self._chance(name)
+                mine = [one for one in begun if one.agent == agent and one.what == model.what]
+                for one in mine:
+                    total += math.log(chance) + model.log_likelihood(Drawn(one.who, one.how_strong, one.how_long))
+                if len(mine) < steps:
+                    total += (steps - len(mine)) * (math.log1p(-chance) if chance < 1 else -math.inf)
+        known = {model.what for model in self.models.values()}
+        return total if all(one.what in known and one.agent in self.agents for one in begun) else -math.inf
+
+    def log_likelihood_of(self, result: TrialResult) -> float:
+        """Return the logarithm of the probability that just what took place in a trial begins in its steps.
+
+        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier.
+        """
+        there = {(one.step, one.agent, one.what) for one in result.disturbances}
+        drawn = [one for one in result.spec.disturbances if (one.step, one.agent, one.what) in there]
+        return self.log_likelihood(drawn, result.steps_begun)
+
+    def _chance(self, name: str) -> float:
+        return min(1.0, self.rates[name] * self.step_length_s)

@@ -1,0 +1,73 @@
+"""Disturbances in words: what happened before a crash, and which crash would be the likeliest."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.trial import Disturbance, TrialResult
+
+__all__ = ["about_disturbances", "by_likelihood", "describe_disturbances", "told_disturbances"]
+
+
+def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
+    """Return what disturbed a trial in its last steps, a sentence each, and how often anything did before.
+
+    Args:
+        recording: of the episode.
+        result: of it.
+        first_step: from which on.
+    """
+    step_length_s = recording.prologue.step_length_s
+    recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
+    earlier = len(result.disturbances) - len(recent)
+    told = [
+        f"{max(0, recording.steps - one.step + 1) * step_length_s:.1f} s before, from step {one.step} on: {one.words}"
+        f"{_where(one)}."
+        for one in recent
+    ]
+    if earlier:
+        told.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over before that.")
+    return told
+
+
+def told_disturbances(result: TrialResult) -> list[str]:
+    """Return a line for each disturbance of a trial, and one for how likely all of it was."""
+    if result.log_likelihood is None and not result.disturbances:
+        return []
+    lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
+    lines = lines or ["in undisturbed traffic: nothing that was drawn had begun"]
+    if result.log_likelihood is not None:
+        lines.append(f"log-likelihood of these disturbances and no others: {result.log_likelihood:.2f}")
+    return lines
+
+
+def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
+    """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
+    if not any(bundle.result.log_likelihood is not None for bundle in crashes):
+        return []
+    disturbed = [bundle for bundle in crashes if bundle.result.disturbed]
+    lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
+    if disturbed:
+        first = by_likelihood(disturbed)[0]
+        lines.append(f"The likeliest of those with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
+    return lines
+
+
+def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
+    """Return crashes in order: those in undisturbed traffic as they are, then the others, the likeliest first."""
+    return sorted(crashes, key=lambda bundle: (1, -_likely(bundle)) if bundle.result.disturbed else (0, 0.0))
+
+
+def _likely(bundle: Bundle) -> float:
+    found = bundle.result.log_likelihood
+    return -math.inf if found is None else found
+
+
+def _where(one: Disturbance) -> str:
+    return f" ({one.place})" if one.vehicle != one.agent else ""

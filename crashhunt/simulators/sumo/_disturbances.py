@@ -1,0 +1,250 @@
+"""Vehicles of SUMO's that err: each is commanded as long as its disturbance lasts, and then drives by itself again.
+
+SUMO's own checks stay on wherever they can: a vehicle that brakes hard still heeds whoever is ahead of it, and never
+brakes harder than the ``decel`` of its type. A cut-in is made however small the gap, but not into the side of somebody.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.world import is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from crashhunt.simulators._protocol import Disturbing
+    from crashhunt.trial import Disturbance
+    from crashhunt.world import Scene
+
+__all__ = ["SumoDisturbances"]
+
+_IN_LANE_M, _BESIDE_M, _CROSSING_M = 100.0, 50.0, 80.0  # who is further away than that is not meant
+_LEFT, _RIGHT, _AHEAD = 0, 1, 2  # bits of SUMO's vehicle.getNeighbors
+_GENTLY = 1.5  # m/s²; how a dawdler slows down
+_NEITHER_RED_NOR_PRIORITY = 7  # speed mode: safe speed and physical limits, and nothing at junctions
+_NOT_INTO_OTHERS = 256  # lane change mode: none of its own accord, and a commanded one unless somebody is there
+_LATERAL_M = 1.6  # half a lane: who is less to the side is ahead
+
+
+class SumoDisturbances:
+    """Finds who is meant, and commands them.
+
+    Args:
+        controlled: the vehicles that are driven from outside, which are never meant.
+        step_length_s: of the simulation.
+    """
+
+    def __init__(self, controlled: Collection[str], step_length_s: float) -> None:
+        self._controlled = controlled
+        self._dt = step_length_s
+
+    def whom(self, disturbance: Disturbance, scene: Scene) -> str:
+        """Return who is at a place around an agent; empty where nobody is who is not controlled."""
+        try:
+            if disturbance.what == "ignore_priority":
+                found = self._crossing(disturbance.agent, disturbance.who, scene)
+            else:
+                found = _at(disturbance.agent, disturbance.who)
+        except libsumo.TraCIException:  # the agent has just arrived
+            return ""
+        return "" if found in self._controlled else found
+
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+        """Command a vehicle; None where it cannot do that."""
+        strong, decel = disturbance.how_strong, float(sumo.vehicle_getDecel(vehicle))
+        try:
+            if disturbance.what in ("brake", "stop"):
+                return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
+            if disturbance.what == "dawdle":
+                target = (1.0 - strong) * sumo.vehicle_getSpeed(vehicle)
+                return _Slows(vehicle, min(_GENTLY, decel), self._dt, how_strong=strong, target=target)
+            if disturbance.what == "speed":
+                return _Speeds(vehicle, strong)
+            if disturbance.what == "cut_in":
+                side = -1 if disturbance.who.startswith("left") else 1  # lanes are counted from the right
+                return _cut_in(vehicle, side, disturbance.how_long, min(strong, decel), self._dt)
+            return _Ignores(vehicle, self._dt)
+        except libsumo.TraCIException:
+            return None
+
+    def _crossing(self, agent: str, who: str, scene: Scene) -> str:
+        """The nearest one on a way that crosses the agent's at the junction that both come to."""
+        here = scene.roster.index.get(agent)
+        way = _way(agent)
+        if here is None or not way:
+            return ""
+        foes = set(sumo.lane_getInternalFoes(way))
+        (x, y), present = scene.points[here], sumo.vehicle_getIDList()
+        found = []
+        for row, actor in enumerate(scene.roster.actors):
+            if actor.id == agent or is_person(actor.id) or actor.id in self._controlled or actor.id not in present:
+                continue
+            dx, dy = scene.points[row][0] - x, scene.points[row][1] - y
+            if dx * dx + dy * dy > _CROSSING_M**2 or _place(scene, here, row) != who or _way(actor.id) not in foes:
+                continue
+            found.append((dx * dx + dy * dy, actor.id))
+        return min(found)[1] if found else ""
+
+
+class _Slows:
+    """Brakes down to a speed, and keeps to it."""
+
+    def __init__(self, vehicle: str, deceleration: float, dt: float, *, how_strong: float, target: float = 0.0) -> None:
+        self.how_strong = how_strong
+        self._vehicle = vehicle
+        self._change = deceleration * dt
+        self._target = target
+        self._command()
+
+    def keep(self) -> None:
+        with _gone():
+            self._command()
+
+    def end(self) -> None:
+        with _gone():
+            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+    def _command(self) -> None:
+        speed = sumo.vehicle_getSpeed(self._vehicle)
+        sumo.vehicle_setSpeed(self._vehicle, max(min(self._target, speed), speed - self._change))
+
+
+class _Speeds:
+    """Wants to drive faster than before, and keeps its distance as before."""
+
+    def __init__(self, vehicle: str, share: float) -> None:
+        self.how_strong = share
+        self._vehicle = vehicle
+        self._before = sumo.vehicle_getSpeedFactor(vehicle)
+        sumo.vehicle_setSpeedFactor(vehicle, (1.0 + share) * self._before)
+
+    def keep(self) -> None:
+        pass
+
+    def end(self) -> None:
+        with _gone():
+            sumo.vehicle_setSpeedFactor(self._vehicle, self._before)
+
+
+class _CutsIn:
+    """Changes lanes as soon as nobody is in the very place, and may brake there."""
+
+    def __init__(self, vehicle: str, lane: str, deceleration: float, dt: float, how_long: float) -> None:
+        self.how_strong = deceleration
+        self._vehicle = vehicle
+        self._lane = lane
+        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
+        self._change = deceleration * dt
+        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_INTO_OTHERS)
+        sumo.vehicle_changeLane(vehicle, int(lane.rpartition("_")[2]), how_long)
+
+    def keep(self) -> None:
+        with _gone():
+            if self._change and sumo.vehicle_getLaneID(self._vehicle) == self._lane:
+                speed = sumo.vehicle_getSpeed(self._vehicle)
+                sumo.vehicle_setSpeed(self._vehicle, max(0.0, speed - self._change))
+
+    def end(self) -> None:
+        with _gone():
+            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+            if self._change:
+                sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+
+class _Ignores:
+    """Drives on at a junction as if it were not there; SUMO wants the speed commanded for that."""
+
+    how_strong = 1.0
+
+    def __init__(self, vehicle: str, dt: float) -> None:
+        self._vehicle = vehicle
+        self._dt = dt
+        self._before = sumo.vehicle_getSpeedMode(vehicle)
+        sumo.vehicle_setSpeedMode(vehicle, _NEITHER_RED_NOR_PRIORITY)
+        self._command()
+
+    def keep(self) -> None:
+        with _gone():
+            self._command()
+
+    def end(self) -> None:
+        with _gone():
+            sumo.vehicle_setSpeedMode(self._vehicle, self._before)
+            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+    def _command(self) -> None:
+        allowed, speed = sumo.vehicle_getAllowedSpeed(self._vehicle), sumo.vehicle_getSpeed(self._vehicle)
+        faster = speed + sumo.vehicle_getAccel(self._vehicle) * self._dt
+        slower = speed - sumo.vehicle_getDecel(self._vehicle) * self._dt
+        sumo.vehicle_setSpeed(self._vehicle, max(0.0, slower, min(allowed, faster)))
+
+
+class _gone:  # noqa: N801 - it is used as a statement
+    """Passes over that a vehicle has left."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, error: object, _trace: object) -> bool:
+        return isinstance(error, libsumo.TraCIException)
+
+
+def _at(agent: str, who: str) -> str:
+    """Who is at a place around an agent, along the lanes; empty where nobody is."""
+    if who in ("ahead", "behind"):
+        ask = sumo.vehicle_getLeader if who == "ahead" else sumo.vehicle_getFollower
+        found = ask(agent, _IN_LANE_M)
+        return str(found[0]) if found is not None and found[0] and found[1] <= _IN_LANE_M else ""
+    side, _, along = who.partition(" ")
+    bit = _LEFT if side == "left" else _RIGHT
+    near = []
+    for ahead in (0, _AHEAD):
+        for vehicle, gap in sumo.vehicle_getNeighbors(agent, bit | ahead):
+            gap += _min_gap(vehicle, agent, leads=bool(ahead))
+            place = "" if gap < 0 else "ahead" if ahead else "behind"
+            if place == along and gap <= _BESIDE_M:
+                near.append((gap, vehicle))
+    return min(near)[1] if near else ""
+
+
+def _min_gap(vehicle: str, agent: str, *, leads: bool) -> float:
+    """What SUMO has taken from the distance of bumpers: the gap that the one behind likes to keep, in m."""
+    return float(sumo.vehicle_getMinGap(agent if leads else vehicle))
+
+
+def _way(vehicle: str) -> str:
+    """The lane inside the next junction that a vehicle comes to; that on which it is, where it is inside one."""
+    lane = str(sumo.vehicle_getLaneID(vehicle))
+    if lane.startswith(":"):
+        return lane
+    links = sumo.vehicle_getNextLinks(vehicle)
+    return str(links[0][4]) if links else ""
+
+
+def _place(scene: Scene, here: int, row: int) -> str:
+    """The place of one actor around another, as the crow flies."""
+    from math import cos, sin
+
+    (x, y), (own_x, own_y), heading = scene.points[row], scene.points[here], scene.headings[here]
+    dx, dy = x - own_x, y - own_y
+    ahead, left = dx * cos(heading) + dy * sin(heading), dy * cos(heading) - dx * sin(heading)
+    half = scene.roster.actors[here].length / 2
+    side = "" if abs(left) <= _LATERAL_M else "left" if left > 0 else "right"
+    along = "ahead" if ahead > half else "behind" if ahead < -half else ""
+    return f"{side} {along}".strip()
+
+
+def _cut_in(vehicle: str, side: int, how_long: float, deceleration: float, dt: float) -> _CutsIn | None:
+    """Have a vehicle change lanes, where there is a lane that it may use."""
+    edge, lane = sumo.vehicle_getRoadID(vehicle), sumo.vehicle_getLaneIndex(vehicle) + side
+    if edge.startswith(":") or not 0 <= lane < sumo.edge_getLaneNumber(edge):
+        return None
+    target = f"{edge}_{lane}"
+    allowed = sumo.lane_getAllowed(target)
+    if allowed and sumo.vehicle_getVehicleClass(vehicle) not in allowed:
+        return None
+    return _CutsIn(vehicle, target, deceleration, dt, how_long)

@@ -1,0 +1,71 @@
+"""What every model of disturbances must do."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from crashhunt.disturbances import DisturbanceModel, Drawn
+from crashhunt.trial import CELLS
+
+__all__ = ["DisturbanceContract"]
+
+Make = Callable[[], DisturbanceModel]
+
+_DRAWS = 2000
+_DEVIATIONS = 6.0  # of a share that is drawn from its probability: once in a billion by chance
+
+
+class DisturbanceContract:
+    """Checks `crashhunt.disturbances.DisturbanceModel`.
+
+    The fixture ``make`` returns a function that makes a model.
+    """
+
+    @pytest.fixture
+    def make(self) -> Make:
+        """Return what makes a model."""
+        raise NotImplementedError("give the suite a fixture named make")
+
+    def test_what_is_drawn_is_a_disturbance(self, make: Make) -> None:
+        """A place in the grid around the agent, a finite strength, and a length above 0 s."""
+        model = make()
+        assert isinstance(model.what, str)
+        assert model.what
+        for drawn in _draws(model, seed=1):
+            assert drawn.who in CELLS
+            assert math.isfinite(drawn.how_strong)
+            assert 0 < drawn.how_long < math.inf
+
+    def test_the_generator_alone_decides(self, make: Make) -> None:
+        """It draws from no other one, and keeps nothing."""
+        model = make()
+        found = []
+        for seed in (1, 2):
+            random.seed(seed)
+            np.random.seed(seed)  # noqa: NPY002 - whoever draws from a global generator is found out
+            found.append(_draws(model, seed=3))
+        assert found[0] == found[1] == _draws(make(), seed=3)
+
+    def test_the_likelihood_is_that_of_the_draws(self, make: Make) -> None:
+        """A probability for everything that is drawn, as often as it says, and no more than 1 in all."""
+        model = make()
+        counts = Counter(_draws(model, seed=5))
+        total = 0.0
+        for drawn, count in counts.items():
+            chance = math.exp(model.log_likelihood(drawn))
+            assert 0 < chance <= 1 + 1e-9
+            total += chance
+            deviation = math.sqrt(chance * (1 - min(chance, 1.0)) / _DRAWS)
+            assert abs(count / _DRAWS - chance) <= _DEVIATIONS * deviation + 1e-9, drawn
+        assert total <= 1 + 1e-9
+
+
+def _draws(model: DisturbanceModel, *, seed: int) -> list[Drawn]:
+    rng = np.random.default_rng(seed)
+    return [model.draw(rng) for _ in range(_DRAWS)]

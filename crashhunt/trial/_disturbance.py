@@ -1,0 +1,133 @@
+"""A disturbance: somebody around the agent errs, or what the agent sees or does comes late."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.tolerance import known_values
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.trial._data import DisturbanceData
+
+__all__ = ["CELLS", "KINDS", "OF_AGENT", "Disturbance", "Kind"]
+
+
+_PLACES = {
+    "left ahead": "ahead of {} to the left",
+    "ahead": "ahead of {}",
+    "right ahead": "ahead of {} to the right",
+    "left": "to the left of {}",
+    "itself": "{}",
+    "right": "to the right of {}",
+    "left behind": "behind {} to the left",
+    "behind": "behind {}",
+    "right behind": "behind {} to the right",
+}
+CELLS = tuple(_PLACES)
+"""The grid around an agent, as it drives: three lanes, and itself in the middle."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What crashhunt knows of a kind of disturbance.
+
+    Args:
+        unit: of `Disturbance.how_strong`; empty for a share.
+        words: what happens, a sentence; ``share`` stands for the strength in per cent. What is behind a ``|`` is only
+            said where there is any strength.
+        of_agent: whether it is the agent's own eyes or hands that err: then every simulator can do it.
+    """
+
+    unit: str
+    words: str
+    of_agent: bool = False
+
+
+KINDS: Mapping[str, Kind] = {
+    "brake": Kind("m/s²", "{vehicle} brakes with {strong:.3g} m/s² for {long:g} s"),
+    "stop": Kind("m/s²", "{vehicle} stops with {strong:.3g} m/s² and stands, for {long:g} s in all"),
+    "dawdle": Kind("", "{vehicle} drives {share:.0f} % slower than it did for {long:g} s"),
+    "speed": Kind("", "{vehicle} wants to drive {share:.0f} % faster for {long:g} s"),
+    "cut_in": Kind("m/s²", "{vehicle} cuts in on {agent} within {long:g} s| and brakes with {strong:.3g} m/s²"),
+    "ignore_priority": Kind("", "{vehicle} heeds neither red lights nor priority for {long:g} s"),
+    "late_observation": Kind("s", "{agent} sees everything {strong:g} s late for {long:g} s", of_agent=True),
+    "noisy_observation": Kind("", "what {agent} sees is up to {share:.0f} % off for {long:g} s", of_agent=True),
+    "unseen": Kind("", "{agent} does not see {vehicle} for {long:g} s"),
+    "late_action": Kind("s", "what {agent} does takes effect {strong:g} s late for {long:g} s", of_agent=True),
+}  # fmt: skip
+"""The kinds that come with crashhunt, by name; a simulator of somebody's own may know more."""
+
+OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
+"""Those of them that need nothing of the simulator."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """One disturbance: planned, as part of a trial's specification, or as it took place.
+
+    Args:
+        step: in which it begins, from 1.
+        who: the place in the grid around the agent, one of `CELLS`, in which the vehicle is when it begins.
+        what: the kind; of those that come with crashhunt, one of `KINDS`.
+        how_strong: in the unit of its kind: m/s² of a braking, s of a delay, a share of a speed or of what is seen.
+        how_long: in s of simulation time.
+        agent: around which of the controlled vehicles.
+        vehicle: who turned out to be meant; empty of what is planned, and where nobody was there.
+    """
+
+    step: int
+    who: str
+    what: str
+    how_strong: float
+    how_long: float
+    agent: str = ""
+    vehicle: str = field(default="")
+
+    def took_place(self, vehicle: str, how_strong: float) -> Disturbance:
+        """Return it as it took place.
+
+        Args:
+            vehicle: who was there.
+            how_strong: what that vehicle can do of it.
+        """
+        return replace(self, vehicle=vehicle, how_strong=how_strong)
+
+    @property
+    def words(self) -> str:
+        """What happens, for people; such as ``main.35 brakes with 4 m/s² for 2 s``."""
+        agent = self.agent or "the agent"
+        vehicle = self.vehicle or (agent if self.who == "itself" else f"whoever is {_PLACES[self.who].format(agent)}")
+        kind = KINDS.get(self.what)
+        if kind is None:
+            return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
+        always, _, where_strong = kind.words.partition("|")
+        return (always + where_strong * (self.how_strong > 0)).format(
+            vehicle=vehicle, agent=agent, strong=self.how_strong, share=100 * self.how_strong, long=self.how_long
+        )
+
+    @property
+    def place(self) -> str:
+        """Where it is, for people; such as ``ahead of ego to the left``."""
+        return _PLACES[self.who].format(self.agent or "the agent")
+
+    def to_json(self) -> DisturbanceData:
+        """Return plain text and numbers; who was meant only where that is known."""
+        data: DisturbanceData = {
+            "step": self.step,
+            "who": self.who,
+            "what": self.what,
+            "how_strong": self.how_strong,
+            "how_long": self.how_long,
+            "agent": self.agent,
+        }
+        if self.vehicle:
+            data["vehicle"] = self.vehicle
+        return data
+
+    @classmethod
+    def from_json(cls, data: DisturbanceData) -> Disturbance:
+        """Rebuild it from plain data."""
+        return cls(**known_values(cls, data))

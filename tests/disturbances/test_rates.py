@@ -1,0 +1,207 @@
+"""How often what happens: the words, the draws, and how likely they are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.base.plugins import locate, registered
+from crashhunt.disturbances import Choices, Disturber, Drawn, brake, cut_in, disturber_of, parse_rates
+from crashhunt.errors import PluginError, UsageError
+from crashhunt.testing import DisturbanceContract
+from crashhunt.trial import KINDS, Disturbance, TrialResult
+
+DT = 0.1
+names = st.sampled_from(["brake", "cut_in", "a.b:C", "module:Class.part"])
+rates = st.dictionaries(names, st.floats(0, 1e3), max_size=4)
+
+
+class TestBuiltIn(DisturbanceContract):
+    @pytest.fixture(params=sorted(registered("disturbances")))
+    def make(self, request):
+        return locate("disturbances", request.param)
+
+
+def test_every_kind_has_a_model_of_its_name():
+    assert {name: locate("disturbances", name)().what for name in registered("disturbances")} == {k: k for k in KINDS}
+
+
+@given(rates)
+def test_words_and_rates_say_the_same(given_rates):
+    words = [f"{name}={rate!r}" for name, rate in given_rates.items()]
+    found = parse_rates(words)
+    assert found == {name: rate for name, rate in given_rates.items() if rate > 0}
+    assert list(found) == sorted(found)
+    assert parse_rates([f"{name}={rate!r}" for name, rate in found.items()]) == found
+
+
+@given(st.text(max_size=20))
+def test_any_word_is_a_rate_or_refused(word):
+    try:
+        found = parse_rates([word])
+    except UsageError as error:
+        assert error.fix
+    else:
+        assert all(0 < rate < math.inf for rate in found.values())
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["brake"], "'brake' says no rate"),
+        (["=1"], "'=1' says no rate"),
+        (["brake=much"], "'much' is no rate"),
+        (["brake=-0.1"], "'-0.1' is no rate"),
+        (["brake=nan"], "'nan' is no rate"),
+        (["brake=inf"], "'inf' is no rate"),
+        (["brake=1", "brake=1"], "gives 'brake' twice"),
+        (["none", "brake=1"], "none stands alone"),
+    ],
+)
+def test_what_is_no_rate_is_refused(words, says):
+    with pytest.raises(UsageError, match=says):
+        parse_rates(words)
+
+
+def test_none_is_nothing():
+    assert parse_rates(["none"]) == parse_rates([]) == parse_rates(["brake=0"]) == {}
+
+
+def make(known=("brake", "stop"), **found):
+    return disturber_of(found, agents=("ego",), step_length_s=DT, known=known, simulator="the toy")
+
+
+def other_brake():
+    return brake()
+
+
+def fails():
+    raise OSError("no such table")
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        ({"brake": 10.1}, "brake=10.1: more than one a step of 0.1 s"),
+        ({"braek": 1}, "no disturbance 'braek'"),
+        ({"cut_in": 1}, "the toy cannot do 'cut_in'"),
+        ({"brake": 1, "test_rates:other_brake": 1}, "both about 'brake'"),
+        ({"test_rates:DT": 1}, "cannot be called"),
+        ({"test_rates:fails": 1}, "cannot be made: OSError: no such table"),
+        ({"os:getcwd": 1}, "no model of disturbances"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(found, says):
+    with pytest.raises((UsageError, PluginError), match=says) as caught:
+        make(**found)
+    assert caught.value.fix
+
+
+def test_the_agents_own_eyes_can_err_on_every_simulator():
+    assert make(known=(), late_observation=1, late_action=1, noisy_observation=1).models.keys() == {
+        "late_observation", "late_action", "noisy_observation",
+    }  # fmt: skip
+
+
+@given(st.integers(0, 2**31 - 1), st.integers(1, 400), st.integers(0, 400))
+def test_a_longer_trial_begins_with_the_same_disturbances(seed, steps, more):
+    disturber = make(brake=0.5, stop=0.3)
+    short, long = disturber.draw(seed, steps), disturber.draw(seed, steps + more)
+    assert short == tuple(one for one in long if one.step <= steps)
+    assert list(long) == sorted(long, key=lambda one: one.step)
+    assert all(one.step >= 1 and one.agent == "ego" and not one.vehicle for one in long)
+
+
+def test_another_model_or_agent_shifts_no_draw():
+    alone = make(brake=0.5).draw(7, 500)
+    assert alone
+    both = make(brake=0.5, stop=0.5).draw(7, 500)
+    assert tuple(one for one in both if one.what == "brake") == alone
+    two = disturber_of({"brake": 0.5}, agents=("ego", "second"), step_length_s=DT).draw(7, 500)
+    assert tuple(one for one in two if one.agent == "ego") == alone
+    assert len(two) > len(alone)
+
+
+def test_they_begin_as_often_as_the_rate_says():
+    disturber = make(brake=0.4)
+    count = sum(len(disturber.draw(seed, 1000)) for seed in range(100))  # 4000 expected of 100,000 steps
+    assert abs(count - 4000) < 6 * math.sqrt(100_000 * 0.04 * 0.96)
+
+
+@given(st.integers(0, 1000), st.integers(0, 60))
+def test_the_likelihood_is_the_product_of_what_was_drawn(seed, steps):
+    disturber = make(brake=1.0, stop=0.5)
+    drawn = disturber.draw(seed, 60)
+    expected = 0.0
+    for model, rate in ((disturber.models["brake"], 1.0), (disturber.models["stop"], 0.5)):
+        at = {one.step: one for one in drawn if one.what == model.what}
+        for step in range(1, steps + 1):
+            if step in at:
+                one = at[step]
+                likely = model.log_likelihood(Drawn(one.who, one.how_strong, one.how_long))
+                expected += math.log(rate * DT) + likely
+            else:
+                expected += math.log(1 - rate * DT)
+    assert math.isclose(disturber.log_likelihood(drawn, steps), expected, abs_tol=1e-9)
+
+
+def test_the_probabilities_of_all_that_can_happen_add_up():
+    """Of two steps and a model with two possibilities: nothing, or one of two, in each."""
+    model = Choices("brake", {"ahead": 1.0}, {2.0: 3.0, 4.0: 1.0}, {1.0: 1.0})
+    disturber = Disturber({"brake": model}, {"brake": 3.0}, ("ego",), DT)
+    possible = [None, 2.0, 4.0]
+    total = 0.0
+    for first in possible:
+        for second in possible:
+            begun = [(1, first), (2, second)]
+            given_them = [Disturbance(at, "ahead", "brake", how, 1.0, "ego") for at, how in begun if how is not None]
+            total += math.exp(disturber.log_likelihood(given_them, 2))
+    assert math.isclose(total, 1.0)
+
+
+def test_what_the_models_never_draw_is_impossible():
+    disturber = make(brake=1.0)
+    odd = Disturbance(1, "ahead", "brake", 3.5, 1.0, "ego")
+    assert disturber.log_likelihood([odd], 5) == -math.inf
+    assert disturber.log_likelihood([Disturbance(1, "ahead", "stop", 3.0, 8.0, "ego")], 5) == -math.inf
+    always = Disturber({"brake": brake()}, {"brake": 10.0}, ("ego",), DT)
+    assert always.log_likelihood([], 1) == -math.inf
+    assert math.isfinite(always.log_likelihood(always.draw(1, 5), 5))
+
+
+def test_what_was_drawn_while_nobody_was_there_makes_a_trial_no_less_likely():
+    disturber = make(brake=1.0)
+    drawn = Disturbance(3, "ahead", "brake", 4.0, 2.0, "ego")
+    spec = _spec(disturbances=(Disturbance(2, "ahead", "brake", 6.0, 1.0, "ego"), drawn))
+    result = TrialResult(spec, "survived", steps=10, disturbances=(drawn.took_place("leader", 3.5),))
+    assert disturber.log_likelihood_of(result) == disturber.log_likelihood([drawn], 10)
+
+
+def _spec(**more):
+    from crashhunt.trial import TrialSpec
+
+    return TrialSpec(0, 1, {}, {}, 20, **more)
+
+
+def test_a_model_that_draws_nonsense_is_named():
+    class Odd:
+        what = "brake"
+
+        def draw(self, rng):
+            return Drawn("above", float(rng.random()), 1.0)
+
+        def log_likelihood(self, drawn):
+            return 0.0
+
+    with pytest.raises(PluginError, match="'odd' has drawn"):
+        Disturber({"odd": Odd()}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
+
+
+def test_weights_are_shares():
+    model = cut_in()
+    rng = np.random.default_rng(1)
+    assert {model.draw(rng).who for _ in range(200)} == set(model.who)
+    assert math.isclose(sum(math.exp(model.log_likelihood(Drawn(who, 0.0, 2.0))) for who in model.who), 0.5 * 0.5)

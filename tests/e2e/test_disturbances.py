@@ -1,0 +1,130 @@
+"""A hunt with disturbances, from the command line to the report."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import crashhunt
+
+WORDS = ("--scenario", "toy", "--seed", "4", "--arg", "speed=10", "--no-snapshot", "--keep-going")
+
+
+def hunt(shell, *more, trials="6"):
+    return shell.crashhunt("run", "h", "1", trials, "100", *WORDS, *more, "--json")
+
+
+def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
+    """The leader of the toy brakes now and then by itself; who drives as fast as it does crashes when it stops."""
+    done = hunt(toy, "--disturb", "stop=0.05,brake=0.02", "--set", "gap_m=5")
+    crashes = done.json["crashes"]
+    assert crashes
+    assert all(crash["confirmed"] for crash in crashes)
+    saved = [json.loads((toy.folder / crash["path"] / "crash.json").read_text()) for crash in crashes]
+    disturbed = [data for data in saved if data["disturbed"]]
+    assert disturbed
+    assert all(bool(data["disturbances"]) == data["disturbed"] for data in saved)
+    assert all(one["vehicle"] == "leader" for data in saved for one in data["disturbances"])
+    assert f"{len(disturbed)} with disturbances." in done.err
+    likeliest = max(disturbed, key=lambda data: data["log_likelihood"])
+    assert f"The likeliest of those with disturbances: {likeliest['id']} (log-likelihood " in done.err
+    state = toy.crashhunt("status", "h", "--json").json["hunts"][0]
+    assert (state["crashes"], state["disturbed"]) == (len(crashes), len(disturbed))
+    assert f"{len(crashes)} ({len(disturbed)} disturbed)" in toy.crashhunt("status", "h").out
+    assert toy.crashhunt("check", "h").code == 0
+
+    crash = likeliest["id"]
+    first = likeliest["disturbances"][0]
+    assert "leader" in toy.crashhunt("show", "h", "--crash", crash).out
+    assert f"from step {first['step']} on: leader" in toy.crashhunt("show", "h", "--crash", crash).out
+    assert toy.crashhunt("replay", "h", "--crash", crash, "--json").json["verdict"] == "reproduced"
+    toy.crashhunt("export", "h", "crash.zip", "--crash", crash)
+    assert toy.crashhunt("replay", "crash.zip", "--json").json["verdict"] == "reproduced"
+    without = toy.crashhunt("replay", "h", "--crash", crash, "--set", "disturbances=none", expect=None)
+    assert "disturbances were" in without.out
+
+    table = crashhunt.load(toy.folder / "h").trials()
+    assert set(table["log_likelihood"] < 0) == {True}
+    assert (table["disturbances"] > 0).sum() >= len(disturbed)
+
+
+def test_what_is_not_asked_for_is_nowhere(toy):
+    done = hunt(toy, trials="2")
+    assert "isturb" not in done.err
+    assert "disturb" not in (toy.folder / "h" / "hunt.toml").read_text()
+    assert "log_likelihood" not in toy.crashhunt("trials", "h").out
+    assert "disturbed" not in toy.crashhunt("status", "h", "--json").json["hunts"][0]
+
+
+def test_trials_in_which_nothing_is_drawn_are_those_of_an_undisturbed_hunt(toy):
+    plain = hunt(toy, trials="4")
+    digests = [trial.digest for trial in crashhunt.load(toy.folder / "h").results()]
+    assert plain.json["trials_run"] == 4
+    hunt(toy, "--disturb", "stop=0.000001", "--overwrite", trials="4")
+    assert [trial.digest for trial in crashhunt.load(toy.folder / "h").results()] == digests
+    assert 'disturb = [\n    "stop=1e-06",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
+
+
+def test_a_scenario_says_it_and_none_takes_it_back(toy):
+    file = toy.folder / "toy" / "scenario.toml"
+    before = file.read_text()
+    file.write_text(f"{before}\n[disturbances]\nbrake = 0.5\n")
+    hunt(toy, trials="2")
+    assert 'disturb = [\n    "brake=0.5",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
+    hunt(toy, "--disturb", "none", "--overwrite", trials="2")
+    assert "\ndisturb" not in (toy.folder / "h" / "hunt.toml").read_text()
+    file.write_text(f"{before}\n[disturbances]\nbraek = 0.5\n")
+    assert "did you mean 'brake'" in hunt_refused(toy)
+
+
+def hunt_refused(shell, *more):
+    done = shell.crashhunt("run", "h2", "1", "1", "9", *WORDS, *more, expect=2)
+    assert not (shell.folder / "h2").exists()
+    assert len(done.err.strip().splitlines()) == 1
+    return done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("brake", "'brake' says no rate; write NAME=RATE"),
+        ("brake=-1", "'-1' is no rate"),
+        ("brake=11", "more than one a step of 0.1 s"),
+        ("cut_in=0.1", "cannot do 'cut_in'; it can do brake, late_action"),
+        ("none,brake=1", "none stands alone"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
+    assert says in hunt_refused(toy, "--disturb", words)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("disturbances=some", "'some' is not none"),
+        ("disturbances.0.how_strong=2", "none begins at step '0'"),
+        ("disturbances.{step}.how=2", "'how' is nothing to change"),
+        ("disturbances.{step}.how_long=0", "give a number above 0"),
+        ("disturbances.{step}.who=above", "'above' is no place"),
+    ],
+)
+def test_edits_that_cannot_be_meant(toy, change, says):
+    from crashhunt.errors import ArgumentError
+    from crashhunt.replays import edited_disturbances
+    from crashhunt.trial import Disturbance
+
+    name, _, text = change.format(step=7).partition("=")
+    with pytest.raises(ArgumentError, match=says):
+        edited_disturbances([Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego")], name, text)
+
+
+def test_a_stronger_one_and_none(toy):
+    from crashhunt.replays import edited_disturbances
+    from crashhunt.trial import Disturbance
+
+    planned = [Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego"), Disturbance(9, "ahead", "stop", 2.0, 8.0, "ego")]
+    found, words = edited_disturbances(planned, "disturbances.9.how_strong", "6")
+    assert [one.how_strong for one in found] == [2.0, 6.0]
+    assert words == ["disturbances.9.how_strong was 2.0 and is 6.0"]
+    assert edited_disturbances(planned, "disturbances", "none") == ((), ["disturbances were 2 and are none"])
