@@ -42,6 +42,7 @@ class Reader:
             return f"{done.err}\n{done.out}"
         program = sys.executable if program in ("python", ".venv/bin/python") else program
         environment = {**self.shell.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+        environment |= {"PYTEST_DEBUG_TEMPROOT": str(self.shell.folder)}  # and not where it would clear up after others
         environment |= {"PATH": f"{os.path.dirname(sys.executable)}:{environment['PATH']}"}  # noqa: PTH120
         done = subprocess.run(
             [program, *words], cwd=self.shell.folder, env=environment, capture_output=True, text=True, check=False
