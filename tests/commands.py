@@ -40,13 +40,18 @@ class Commands:
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         self._at_start = at_start(environment)
+        from crashhunt.executors import worker_environment
+
+        started = {**environment, **worker_environment()}
+        self.warm, self._kept = Warm.start(started)
         self._lock = threading.Lock()
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+        descriptors = [theirs.fileno(), self.warm.control.fileno()]
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, __file__, str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, __file__, *map(str, descriptors), json.dumps(at_start(started))],
+                pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=environment,
             )
@@ -88,6 +93,8 @@ class Commands:
         """End it."""
         self._control.close()
         self._process.wait(10)
+        self.warm.control.close()
+        self._kept.wait(10)
 
 
 def _text(data: bytes) -> str:
@@ -185,10 +192,7 @@ if __name__ == "__main__":
         for name in module.__all__:
             getattr(module, name)  # which imports what it lies in
     del sys.modules["warm"]  # else a snapshot would have it, as whatever has been imported and is not installed
-    started = Warm(os.environ)
-    crashhunt.base.keeper.subprocess = types.SimpleNamespace(
-        Popen=started.popen, TimeoutExpired=subprocess.TimeoutExpired
-    )
+    crashhunt.base.keeper.subprocess = Warm(socket.socket(fileno=int(sys.argv[2])), json.loads(sys.argv[3])).subprocess
     crashhunt.suites._processes.subprocess = types.SimpleNamespace(Popen=Hunt, DEVNULL=subprocess.DEVNULL)
     AT_FIRST, PATH = frozenset(sys.modules), sys.path[1:]
     crashhunt.snapshots.environment()  # which looks through all that is installed
@@ -196,4 +200,3 @@ if __name__ == "__main__":
     gc.collect()
     gc.freeze()
     _serve(socket.socket(fileno=int(sys.argv[1])))
-    started.close()

@@ -118,6 +118,13 @@ def _commands_end() -> Iterator[None]:
         _commands.cache_clear()
 
 
+@pytest.fixture(autouse=True)
+def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test itself replays, end to end, starts as little as what its commands do."""
+    if request.path.parent.name == "e2e":
+        monkeypatch.setattr("crashhunt.base.keeper.subprocess", _commands().warm.subprocess)
+
+
 def needed(*names: str) -> str:
     """Where a program that is no Python package is; without it, the test cannot run, and in CI fails."""
     found = next(filter(None, map(shutil.which, names)), None)

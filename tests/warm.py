@@ -75,29 +75,33 @@ def leave_after(call: Callable[[], object]) -> NoReturn:
 
 
 class Warm:
-    """The process of which keepers are forks.
+    """The process of which keepers are forks, and whoever asks for one.
 
     Args:
-        environment: of whatever a command starts.
+        control: a socket to it.
+        environment: in which it was started.
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
-        from crashhunt.executors._worker import worker_environment
-
-        environment = {**environment, **worker_environment()}
+    def __init__(self, control: socket.socket, environment: Mapping[str, str]) -> None:
+        self.control = control
         self._at_start = at_start(environment)
-        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
+
+    @classmethod
+    def start(cls, environment: Mapping[str, str]) -> tuple[Warm, subprocess.Popen[bytes]]:
+        """Start it; it ends when nobody has a socket to it any more."""
+        control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
         with theirs:
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-P", __file__, str(theirs.fileno())], pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment,
             )  # fmt: skip
+        return cls(control, environment), process
 
-    def close(self) -> None:
-        """End it."""
-        self._control.close()
-        self._process.wait(10)
+    @property
+    def subprocess(self) -> types.SimpleNamespace:
+        """What `crashhunt.base.keeper` uses of the module."""
+        return types.SimpleNamespace(Popen=self.popen, TimeoutExpired=subprocess.TimeoutExpired)
 
     def popen(self, words: Sequence[str], **options: Any) -> Forked | subprocess.Popen[bytes]:
         """Start a keeper as `subprocess.Popen` does, in a fork where that comes to the same."""
@@ -106,7 +110,7 @@ class Warm:
         fits = at_start(environment) == self._at_start and options["start_new_session"]
         if not fits or not there.isdisjoint({"sitecustomize", "usercustomize", "numpy", *sys.stdlib_module_names}):
             return subprocess.Popen(words, **options)
-        return Forked(self._control, words, **options)
+        return Forked(self.control, words, **options)
 
 
 class Forked:
