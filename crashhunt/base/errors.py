@@ -22,7 +22,10 @@
 from __future__ import annotations
 
 import errno
-from typing import TypedDict, final
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from crashhunt.base.plain import ErrorData
 
 __all__ = [
     "DISK",
@@ -34,8 +37,6 @@ __all__ = [
     "CallError",
     "CrashhuntError",
     "EpisodeError",
-    "ErrorData",
-    "ErrorWords",
     "HuntDirectoryError",
     "InvalidEpisodeError",
     "PluginError",
@@ -52,21 +53,6 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 DISK = FULL | {errno.EIO, errno.EROFS}
 """What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
-
-
-class ErrorWords(TypedDict):
-    """What an error says."""
-
-    message: str
-    fix: str
-    where: str
-
-
-@final
-class ErrorData(TypedDict):
-    """The shape that every command prints under ``--json``."""
-
-    error: ErrorWords
 
 
 class CrashhuntError(Exception):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TypeAlias
+from typing import TypeAlias, TypedDict, final
 
-__all__ = ["Json", "JsonObject", "Plain", "finite", "finite_values"]
+__all__ = ["ErrorData", "ErrorWords", "Json", "JsonObject", "Plain", "finite", "finite_values"]
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 """What `json.loads` returns."""
@@ -20,6 +20,21 @@ JsonObject: TypeAlias = "dict[str, Json]"
 
 Plain: TypeAlias = Mapping[str, object]
 """An object that is only looked through or written: any `TypedDict` is one."""
+
+
+class ErrorWords(TypedDict):
+    """What an error says."""
+
+    message: str
+    fix: str
+    where: str
+
+
+@final
+class ErrorData(TypedDict):
+    """The shape that every command prints under ``--json``."""
+
+    error: ErrorWords
 
 
 def finite(value: float) -> float | None:

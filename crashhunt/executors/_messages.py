@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NotRequired, TypeAlias, TypedDict, final
 
-from crashhunt.base.errors import ErrorData, ErrorWords
+from crashhunt.base.plain import ErrorData, ErrorWords
 
 if TYPE_CHECKING:
     from crashhunt.episode import SettingsData

@@ -26,7 +26,7 @@ from crashhunt.executors._worker import Worker, loaded
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from crashhunt.base.errors import ErrorData
+    from crashhunt.base.plain import ErrorData
     from crashhunt.episode import Parts
     from crashhunt.executors._messages import Answer, FromTemplate, TemplateJob, ToTemplate
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.base.errors import ErrorData
+    from crashhunt.base.plain import ErrorData
     from crashhunt.episode import Episode, SettingsData
     from crashhunt.replays._prepare import Rerun
     from crashhunt.simulators import Simulator
