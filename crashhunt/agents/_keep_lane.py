@@ -37,7 +37,7 @@ class KeepLaneWithSpeed:
     def reset(self, seed: int) -> None:
         """Nothing to forget."""
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: Any) -> object:
         """Return (speed, 0), or the meta-action that brings the speed nearer."""
         if self._meta is None:
             return self.speed, 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from zipfile import BadZipFile
 
 import numpy as np
@@ -72,7 +72,7 @@ class NumpyPolicy:
         self._target = -1.0
         self.values = np.zeros(len(_MEANINGS), np.float32)
 
-    def act(self, observation: NDArray[np.float32]) -> Any:
+    def act(self, observation: NDArray[np.float32]) -> object:
         """Return the meta-action of the greatest value, or (target speed, lane change)."""
         decision = "IDLE"
         if self._left == 0:
@@ -104,7 +104,7 @@ class NumpyPolicy:
                 found = np.maximum(found, 0.0)
         return found
 
-    def panels(self) -> Any:
+    def panels(self) -> object:
         """Show the values."""
         from crashhunt import panels
 

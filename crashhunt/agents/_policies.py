@@ -6,13 +6,15 @@ import importlib
 import math
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from crashhunt.trial import Argument
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from gymnasium import Space
     from numpy.typing import NDArray
 
@@ -73,10 +75,10 @@ class StableBaselines3:
     def reset(self, seed: int) -> None:
         """Forget the hidden state, and seed the model."""
         self._model.set_random_seed(seed)
-        self._state: Any = None
+        self._state: object = None
         self._first = True
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return what the model predicts."""
         action, self._state = self._model.predict(
             observation, state=self._state, episode_start=np.array([self._first]), deterministic=self._deterministic
@@ -134,7 +136,7 @@ class _Network(ABC):
     def _answer(self, batch: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return a value for each discrete action, or the continuous action, of each observation of a batch."""
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return the action of the network's answer."""
         seen = np.array(observation, np.float32)
         values = self._answer(seen.reshape(1, -1) if self._flatten else seen[None])[0]
@@ -216,7 +218,7 @@ class OnnxPolicy(_Network):
         return answer
 
 
-def _library(name: str, extra: str) -> Any:
+def _library(name: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -235,7 +237,7 @@ def _line(error: BaseException) -> str:
     return text if len(text) <= 200 else f"{text[:199]}…"
 
 
-def _choices(space: Any) -> Any:
+def _choices(space: Space[object]) -> object:
     """What tells spaces of actions apart as far as a policy's answers go: kind, shape and number."""
     from gymnasium.spaces import Discrete, MultiDiscrete
 
@@ -252,7 +254,7 @@ def _count(space: Space[object] | None) -> int:
     return int(space.n) if isinstance(space, Discrete) else math.prod(space.shape or () if space is not None else ())
 
 
-def _shape(space: Any) -> Any:
+def _shape(space: Space[object]) -> object:
     from gymnasium.spaces import Dict, Tuple
 
     if isinstance(space, Dict):

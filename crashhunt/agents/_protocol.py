@@ -34,7 +34,7 @@ class Agent(Protocol):
 class DrawsPanels(Protocol):
     """An agent that shows what it thinks."""
 
-    def panels(self) -> Any:
+    def panels(self) -> object:
         """Return panels in a nest of mappings and sequences, whose keys are their labels.
 
         Called after `Agent.act`, and only when somebody renders: it must not change what the agent does next.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from crashhunt.trial import Argument
 
@@ -30,14 +30,14 @@ class RandomAgent:
         self._space = action_space
         self._hold = hold_steps
         self._left = 0
-        self._action: Any = None
+        self._action: object = None
 
     def reset(self, seed: int) -> None:
         """Seed the space."""
         self._space.seed(seed)
         self._left = 0
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return the action that is held."""
         if self._left == 0:
             self._left = self._hold

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from crashhunt.trial import Argument
 
@@ -32,7 +32,7 @@ class Recorded:
         """Begin at the first action."""
         self._next = 0
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return the next action.
 
         Raises:

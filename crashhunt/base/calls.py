@@ -43,7 +43,7 @@ def clear_constructor(kind: type[T]) -> type[T]:
     known = inspect.signature(kind)
 
     @functools.wraps(constructor)
-    def construct(self: T, *args: Any, **kwargs: Any) -> None:
+    def construct(self: T, *args: object, **kwargs: object) -> None:
         _refuse(kind.__name__, known, args, kwargs)
         constructor(self, *args, **kwargs)
 
@@ -108,7 +108,7 @@ def _with_arguments(doc: str, of_shape: str, documents: Iterable[Documented]) ->
     return "\n".join([purpose, "", "Args:", *lines]) + parts + rest
 
 
-def _refuse(name: str, signature: inspect.Signature, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+def _refuse(name: str, signature: inspect.Signature, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
     known = _keywords(signature)
     for keyword in kwargs:
         if keyword not in known:

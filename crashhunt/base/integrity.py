@@ -120,7 +120,7 @@ def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the ty
         raise ValueError("it is nested too deeply") from None
     if not isinstance(found, dict):
         raise ValueError(f"it holds {type(found).__name__}, not an object")
-    return cast("T", found)
+    return cast(T, found)
 
 
 FILES = dict[str, dict[str, int | str]]

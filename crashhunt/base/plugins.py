@@ -125,7 +125,7 @@ def load_attribute(target: str, *, shown: str = "") -> Any:
     name = shown or target
     module_name, _, attribute = target.partition(":")
     module = import_module(module_name, shown=name)
-    found: Any = module
+    found: object = module
     for part in attribute.split("."):
         if not hasattr(found, part):
             public = [name for name in vars(found) if not name.startswith("_")] if hasattr(found, "__dict__") else []

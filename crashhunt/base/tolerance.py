@@ -52,7 +52,7 @@ def known_part(kind: Any, data: object) -> tuple[Any, Any]:
     altogether is an empty dict.
     """
     if is_dataclass(kind) and isinstance(data, dict):
-        hints = _hints_of(cast("Any", kind))
+        hints = _hints_of(cast(Any, kind))
         return _split({name: hints[name] for name in data if name in hints}, data)
     origin, inner = get_origin(kind), get_args(kind)
     if origin is dict and isinstance(data, dict):
@@ -83,7 +83,7 @@ def _split(kinds: Plain, data: Plain) -> tuple[dict[str, object], dict[str, obje
     return known, rest
 
 
-def merged(data: Plain, rest: Plain) -> dict[str, Any]:
+def merged(data: Plain, rest: Plain) -> dict[str, object]:
     """Return plain data with what was left aside of it, where nothing else has taken its place."""
     found = dict(data)
     for name, value in rest.items():
@@ -121,7 +121,7 @@ def essentials(*kinds: Any) -> frozenset[str]:
     for kind in kinds:
         if is_dataclass(kind):
             found |= {item.name for item in fields(kind) if "essential" in item.metadata}
-            found |= essentials(*_hints_of(cast("Any", kind)).values())
+            found |= essentials(*_hints_of(cast(Any, kind)).values())
         found |= essentials(*get_args(kind))
     return frozenset(found)
 
@@ -133,7 +133,7 @@ def not_understood(needed: Iterable[str], *kinds: object) -> list[str]:
 
 def required_of(value: object) -> list[str]:
     """Return the names of the essential fields of an object that are not at their default; not of those inside it."""
-    return [name for name, default in _essential(cast("Any", type(value))) if getattr(value, name) != default]
+    return [name for name, default in _essential(cast(Any, type(value))) if getattr(value, name) != default]
 
 
 def required_in(value: object) -> list[str]:

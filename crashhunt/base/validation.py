@@ -18,7 +18,8 @@ from crashhunt.base.names import did_you_mean
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from pydantic import TypeAdapter
+    from pydantic import ConfigDict, TypeAdapter
+    from pydantic_core import ErrorDetails
 
     from crashhunt.base.errors import CrashhuntError
 
@@ -93,14 +94,14 @@ def _built(kind: Any, data: Any) -> Any:
     raise _NotToTheLetterError
 
 
-def _dataclass_built(kind: type, data: Any) -> Any:
+def _dataclass_built(kind: type, data: object) -> Any:
     hints, needed = _hints_of(kind)
     if type(data) is not dict or not needed <= data.keys() <= hints.keys():
         raise _NotToTheLetterError
     return kind(**{name: _built(hints[name], value) for name, value in data.items()})
 
 
-def _member_built(kinds: tuple[Any, ...], data: Any) -> Any:
+def _member_built(kinds: tuple[object, ...], data: object) -> Any:
     """Of a union, the member whose type it is; of an optional type, that type."""
     if type(data) in kinds:
         return _built(type(data), data)
@@ -111,7 +112,7 @@ def _member_built(kinds: tuple[Any, ...], data: Any) -> Any:
 
 
 @cache
-def _hints_of(kind: type) -> tuple[dict[str, Any], frozenset[str]]:
+def _hints_of(kind: type) -> tuple[dict[str, object], frozenset[str]]:
     """The types of a dataclass's fields, and which of them have no default."""
     items = fields(kind)
     hints = get_type_hints(kind)
@@ -139,7 +140,7 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
         raise error(f"{key} = {first['input']!r}: {message}", fix="change the value", where=where) from None
 
 
-def _telling(errors: Sequence[Any]) -> Any:
+def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:
     """Of several mistakes the first one; where a key is missing because it is misspelt, that it is."""
     first = errors[0]
     if first["type"] in _MISSING:
@@ -151,14 +152,14 @@ def _telling(errors: Sequence[Any]) -> Any:
 
 
 @cache
-def _adapter(kind: type) -> TypeAdapter[Any]:
+def _adapter(kind: type) -> TypeAdapter[object]:
     from pydantic import ConfigDict, TypeAdapter
 
     _forbid_unknown(kind, ConfigDict(extra="forbid"), set())
     return TypeAdapter(kind)
 
 
-def _forbid_unknown(kind: Any, config: Any, seen: set[Any]) -> None:
+def _forbid_unknown(kind: Any, config: ConfigDict, seen: set[object]) -> None:
     if kind in seen:
         return
     seen.add(kind)
@@ -182,5 +183,5 @@ def _known_keys(kind: Any, path: tuple[str, ...]) -> list[str]:
     return [item.name for item in fields(kind)] if is_dataclass(kind) else []
 
 
-def _is_table(kind: Any) -> bool:
+def _is_table(kind: object) -> bool:
     return is_dataclass(kind) or getattr(kind, "__origin__", None) is dict

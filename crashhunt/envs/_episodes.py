@@ -19,13 +19,14 @@ from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
     from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.simulators import Simulator
+    from crashhunt.trial import Value
     from crashhunt.world import Scene
 
 __all__ = ["Episodes"]
@@ -71,9 +72,9 @@ class Episodes:
         self.step_length_s = self._simulator.step_length_s
         self._trail = _Trail(round(_TRAIL_S / self.step_length_s) + 1)
         self._crash_step = -1
-        self._borders: Any = None
+        self._borders: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] | None = None
 
-    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[np.generic], dict[str, Any]]:
+    def reset(self, seed: int, arguments: Mapping[str, Value]) -> tuple[NDArray[np.generic], dict[str, object]]:
         """Begin an episode; return the observation and the info."""
         if self._episode is not None:
             self._episode.close()
@@ -86,7 +87,7 @@ class Episodes:
         self._crash_step, self._borders = -1, None
         return self._episode.observations[self.agent], {"sim_time_s": self._trail.scenes[-1].time_s}
 
-    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""
         encoded = self._form.encode(action)  # here, where it is an error of the caller's, and the episode goes on
         episode = self._episode
@@ -102,7 +103,7 @@ class Episodes:
         if finding is not None:
             self._crash_step = episode.steps
         terminated = episode.terminations[self.agent] or finding is not None
-        info: dict[str, Any] = {"sim_time_s": scene.time_s}
+        info: dict[str, object] = {"sim_time_s": scene.time_s}
         if scene.events:
             info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
         if terminated:
@@ -156,7 +157,7 @@ class _Trail(Observer):
         self.scenes.append(scene)
 
 
-def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Any]) -> KeepLaneWithSpeed:
+def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
     """Who drives where nobody else does; that of the environment's own vehicle is never asked."""
     return KeepLaneWithSpeed(_OTHERS_SPEED, simulator.actions[agent].space)
 

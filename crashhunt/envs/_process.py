@@ -8,7 +8,7 @@ import sys
 import weakref
 from contextlib import suppress
 from multiprocessing.connection import Connection, Pipe
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import SimulatorError
 
@@ -20,7 +20,12 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
+    from crashhunt.trial import Value
+
 __all__ = ["RemoteEpisodes"]
+
+Ours: TypeAlias = "Connection[Any, Any]"
+"""A pipe between the two processes, which send each other what the methods of `Episodes` take and return."""
 
 _LOOK_EVERY_S = 1.0  # whether whoever asks is still there
 _GOOD_BYE_S = 5.0  # for SUMO to close; then it is killed
@@ -51,14 +56,14 @@ class RemoteEpisodes:
         self.step_length_s: float = found["step_length_s"]
         self.agent: str = found["agent"]
 
-    def reset(self, seed: int, arguments: Mapping[str, Any]) -> tuple[NDArray[np.generic], dict[str, Any]]:
+    def reset(self, seed: int, arguments: Mapping[str, Value]) -> tuple[NDArray[np.generic], dict[str, object]]:
         """Begin an episode."""
-        found: tuple[NDArray[np.generic], dict[str, Any]] = self._ask("reset", seed, dict(arguments))
+        found: tuple[NDArray[np.generic], dict[str, object]] = self._ask("reset", seed, dict(arguments))
         return found
 
-    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step."""
-        found: tuple[NDArray[np.generic], float, bool, dict[str, Any]] = self._ask("step", action)
+        found: tuple[NDArray[np.generic], float, bool, dict[str, object]] = self._ask("step", action)
         return found
 
     def picture(self) -> NDArray[np.generic]:
@@ -70,7 +75,7 @@ class RemoteEpisodes:
         """End the process."""
         self._end()
 
-    def _ask(self, name: str, *words: Any) -> Any:
+    def _ask(self, name: str, *words: object) -> Any:
         if self._pipe.closed:
             raise SimulatorError("the environment has been closed", fix="make a new one")
         try:
@@ -86,7 +91,7 @@ class RemoteEpisodes:
         return answer
 
 
-def _end(process: subprocess.Popen[bytes], pipe: Connection[Any, Any], owner: int) -> None:
+def _end(process: subprocess.Popen[bytes], pipe: Ours, owner: int) -> None:
     """Have a process end; a copy of its owner, made by forking, has no say in that."""
     pipe.close()
     if os.getpid() != owner:
@@ -102,7 +107,7 @@ def main() -> None:
     """Answer until whoever asks is gone."""
     from crashhunt.envs._episodes import Episodes
 
-    pipe: Connection[Any, Any] = Connection(int(sys.argv[1]))
+    pipe: Ours = Connection(int(sys.argv[1]))
     parent = int(sys.argv[2])
     episodes: Episodes | None = None
     with suppress(EOFError, ConnectionError):
@@ -112,7 +117,7 @@ def main() -> None:
                 if os.getppid() != parent:
                     return
             name, words = pipe.recv()
-            answer: Any
+            answer: object
             try:
                 if episodes is None:
                     episodes = Episodes(*words)
@@ -128,7 +133,7 @@ def main() -> None:
         episodes.close()
 
 
-def _fail(pipe: Connection[Any, Any], error: Exception) -> None:
+def _fail(pipe: Ours, error: Exception) -> None:
     try:
         pipe.send((False, error))
     except Exception:  # it cannot be pickled

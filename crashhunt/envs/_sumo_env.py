@@ -87,7 +87,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.generic], dict[str, Any]]:
+    ) -> tuple[NDArray[np.generic], dict[str, object]]:
         """Begin an episode.
 
         Args:
@@ -99,7 +99,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._steps = 0
         return self._episodes.reset(drawn, (options or {}).get("arguments", {}))
 
-    def step(self, action: Any) -> tuple[NDArray[np.generic], float, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, bool, dict[str, object]]:
         """Advance one control step.
 
         Raises:

@@ -30,20 +30,21 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from types import TracebackType
 
+    from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
     from crashhunt.recording import BlackBox
-    from crashhunt.simulators import Observations, Simulator, StepResult
-    from crashhunt.trial import Disturbance
+    from crashhunt.simulators import Observations, Options, Simulator, StepResult
+    from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
 __all__ = ["Episode", "MakeAgent", "run_episode", "seed_everything"]
 
-MakeAgent = Callable[[str, "Simulator", "Mapping[str, Any]"], "Agent"]
+MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
 
-_ASK_ALL: Mapping[str, Any] = {}  # nobody writes to it
+_ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # nobody writes to it
 
 
 class Episode:
@@ -108,8 +109,8 @@ class Episode:
         self._max_steps = spec.max_steps
         self._advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] = simulator.step
         self._nothing: tuple[float, ...] = ()
-        self._encoders: list[Callable[[Any], NDArray[np.generic]]] = []
-        self._unflatten: dict[str, Callable[[Any], Any]] = {}
+        self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
+        self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
         # Only those that want to be told are called: this is done several times a step.
         self._on_begin = [one.begin for one in observers if type(one).begin is not Observer.begin]
         self._on_observation = [
@@ -230,7 +231,7 @@ class Episode:
         spec, simulator = self.spec, self.simulator
         agent = ""
         try:
-            options = {"arguments": spec.scenario_arguments}
+            options: Options = {"arguments": spec.scenario_arguments}
             self.observations, _ = simulator.reset(seed=spec.seed, options=options)
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
@@ -268,7 +269,7 @@ class Episode:
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
     def _judge(
-        self, finding: Finding | None, actions: Mapping[str, Any], truncations: Mapping[str, bool]
+        self, finding: Finding | None, actions: Mapping[str, object], truncations: Mapping[str, bool]
     ) -> TrialResult | None:
         """Say whether a step was the last one, and note who goes on."""
         if finding is not None:
@@ -373,7 +374,7 @@ def _agent_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
 
 
-def _unflattener(space: Any) -> Callable[[Any], Any]:
+def _unflattener(space: Space[object]) -> Callable[[NDArray[np.generic]], object]:
     """What makes a Dict or Tuple observation again of the flattened array, which is recorded."""
     from gymnasium.spaces import unflatten
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.episode._settings import WorkerSettings
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
+    from crashhunt.trial import Value
 
 __all__ = ["Braking", "Parts", "require_origin"]
 
@@ -79,14 +80,14 @@ class Parts:
         made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
         return made
 
-    def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Any]) -> Agent:
+    def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
         """Make the agent of a vehicle; files that its arguments name come from the snapshot.
 
         Raises:
             CrashhuntError: its module comes from elsewhere than the snapshot that has it.
         """
         factory, wanted = self._factory(agent)
-        given: dict[str, Any] = {}
+        given: dict[str, object] = {}
         if "observation_space" in wanted:
             shown = simulator.shown_spaces if offers(simulator, FlattensObservations) else {}
             given["observation_space"] = shown.get(agent) or simulator.observation_spaces[agent]
@@ -137,7 +138,7 @@ class Braking:
         self._step = 0
         self._driver.reset(seed)
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return the driver's action, or that of braking."""
         step, self._step = self._step, self._step + 1
         return self._driver.act(observation) if step < self._after else self._action

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from crashhunt.simulators import NamesObservations, TellsEvents
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
@@ -114,7 +115,7 @@ class Recorder(Observer):
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
 
 
-def _any_action(space: Any) -> Any:
+def _any_action(space: Space[object]) -> object:
     # Only the shape and type of the encoded action matter.
     space.seed(0)
     return space.sample()

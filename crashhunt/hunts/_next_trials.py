@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from heapq import heappop, heappush
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from crashhunt.hunts._ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["LAG", "Trials", "spec_of"]
 
@@ -143,8 +143,8 @@ def spec_of(
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     seed = int(rng.integers(2**31))
     proposal = sampler.ask(number, rng)
-    arguments: dict[str, dict[str, Any]] = {agent: {} for agent in settings.agents}
-    scenario_arguments: dict[str, Any] = {}
+    arguments: dict[str, dict[str, Value]] = {agent: {} for agent in settings.agents}
+    scenario_arguments: dict[str, Value] = {}
     for (agent, name), value in sorted(proposal.arguments.items()):
         (arguments[agent] if agent else scenario_arguments)[name] = value
     if proposal.seed is not None:

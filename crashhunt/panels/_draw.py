@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -41,7 +41,7 @@ _VIRIDIS = (
 
 
 @lru_cache(maxsize=16)
-def font(size: int) -> Any:
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return a font; Pillow brings it along."""
     return ImageFont.load_default(size)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +35,7 @@ def current_scope() -> tuple[str, ...]:
     return _scopes.get()
 
 
-def labelled(nest: Any) -> list[tuple[str, Panel]]:
+def labelled(nest: object) -> list[tuple[str, Panel]]:
     """Return every panel in a nest of mappings and sequences, with its label; whatever is no panel is passed over.
 
     A label is made of the scopes in which the panel was made, its keys in the nest, and its title. Of two panels with
@@ -46,7 +46,7 @@ def labelled(nest: Any) -> list[tuple[str, Panel]]:
     found: list[tuple[str, Panel]] = []
     labels: dict[str, int] = {}
 
-    def visit(value: Any, path: tuple[str, ...]) -> None:
+    def visit(value: object, path: tuple[str, ...]) -> None:
         if isinstance(value, Panel):
             label = "/".join(filter(None, (*value.scopes, *path, value.title)))
             labels[label] = labels.get(label, 0) + 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -293,7 +293,7 @@ def _bilinear(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[n
     return fine
 
 
-def _paste_map(canvas: Canvas, colors: NDArray[np.uint8], resample: Any) -> tuple[int, int, int, int]:
+def _paste_map(canvas: Canvas, colors: NDArray[np.uint8], resample: Image.Resampling) -> tuple[int, int, int, int]:
     """Stretch a picture over the room for it, and say where that is."""
     box = (_RIGHT, _TOP, canvas.width - 52, canvas.height - 8)
     canvas.image.paste(Image.fromarray(colors).resize((box[2] - box[0], box[3] - box[1]), resample), box[:2])

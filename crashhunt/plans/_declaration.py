@@ -119,7 +119,7 @@ class HuntOption:
         """What the command line says of it, with another default."""
         return f"{self.about.help or self.about.meaning}{f'; default: {default}' if default else ''}"
 
-    def checked(self, value: object) -> Any:
+    def checked(self, value: object) -> object:
         """Return a value of this option, plain where it was NumPy's.
 
         Raises:
@@ -139,7 +139,7 @@ class HuntOption:
         return plain
 
 
-def _plain(value: Any, form: Form) -> Any:
+def _plain(value: Any, form: Form) -> object:
     if form == "list":
         return tuple(value)
     if form == "integer":

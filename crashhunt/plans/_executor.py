@@ -45,7 +45,7 @@ def executor_of(word: str) -> Callable[..., Any]:
     if not any(known.name == "argument" or known.kind is known.VAR_KEYWORD for known in parameters):
         raise UsageError(f"--executor {word}: {name!r} takes no argument", fix=f"write --executor {name}")
 
-    def make(*args: Any, **kwargs: Any) -> Any:
+    def make(*args: object, **kwargs: object) -> object:
         return factory(*args, **kwargs, argument=argument)
 
     return make

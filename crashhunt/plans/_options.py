@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
 from crashhunt.trial import CRASHES
@@ -25,7 +25,7 @@ __all__ = [
 ]  # fmt: skip
 
 Spec = str | int | float | bool
-Driver = str | Callable[..., Any]  # a class is one, too
+Driver = str | Callable[..., object]  # a class is one, too
 
 _SPEC = "a value (20), a range (5:40, 5:40:5), a log range (log:1e-3:1) or a choice (a|b|c)"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from google.protobuf.timestamp_pb2 import Timestamp
     from numpy.typing import NDArray
 
     from crashhunt.recording._recording import Recording
@@ -67,7 +68,7 @@ def write_views(log: LogWriter, recording: Recording, lanes: Sequence[Lane], cra
         _write_crash(log, recording, scenes[-1], crash)
 
 
-def foxglove_layout(recording: Recording) -> dict[str, Any]:
+def foxglove_layout(recording: Recording) -> dict[str, object]:
     """Return a layout for Foxglove or Lichtblick: the scene from above, the metrics, the log."""
     ego = recording.agents[0] if recording.agents else "map"
     paths = [
@@ -164,7 +165,7 @@ def read_lanes(path: Path) -> list[tuple[NDArray[np.float64], NDArray[np.float64
     return []
 
 
-def _shifted(shape: Any, distance: float) -> Any:
+def _shifted(shape: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
     """A polyline moved sideways, to the left for a positive distance."""
     along = np.gradient(shape, axis=0)
     norm = np.hypot(along[:, 0], along[:, 1])
@@ -176,7 +177,7 @@ def _shifted(shape: Any, distance: float) -> Any:
 def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None) -> None:
     # Making a message is dear, changing one is cheap: each actor has one that is changed and serialised in every
     # step. A SceneUpdate is then put together from these; on the wire it is nothing but its parts in a row.
-    boxes: dict[Actor, Any] = {}
+    boxes: dict[Actor, SceneEntity] = {}
     transforms = FrameTransforms()
     children = {
         agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents
@@ -219,7 +220,7 @@ def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene],
         log.write("/ego/pose", PoseInFrame, pose.SerializeToString(), time_ns)
 
 
-def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> Any:
+def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> SceneEntity:
     role = (
         "ego"
         if actor.id == agents[0]
@@ -240,7 +241,7 @@ def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_n
     return entity
 
 
-def _bend(entity: Any, scene: Scene, row: int) -> None:
+def _bend(entity: SceneEntity, scene: Scene, row: int) -> None:
     """Make an actor of as many cubes as it has parts in this scene."""
     like, actor = entity.cubes[0], scene.roster.actors[row]
     parts = list(zip(outlines(scene, row), levels(scene, row), strict=True))
@@ -302,12 +303,12 @@ def _parties(crash: TrialResult | None) -> tuple[str, ...]:
     return (crash.collision.collider, crash.collision.victim) if crash and crash.collision else ()
 
 
-def _color(name: str) -> Any:
+def _color(name: str) -> Color:
     red, green, blue, alpha = _COLORS[name]
     return Color(r=red, g=green, b=blue, a=alpha)
 
 
-def _stamp(timestamp: Any, time_s: float) -> None:
+def _stamp(timestamp: Timestamp, time_s: float) -> None:
     timestamp.seconds, timestamp.nanos = divmod(to_ns(time_s), 1_000_000_000)
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from crashhunt.world import Roster
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.recording.records.prologue import Prologue
-    from crashhunt.world import Actor, Scene
+    from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
-__all__ = ["Reading", "StepRecord"]
+__all__ = ["Reading", "SceneParts", "StepRecord"]
 
 
 @dataclass(slots=True)
@@ -33,14 +34,25 @@ class StepRecord:
     step: int
     scene: Scene | None = None
     rewards: dict[str, float] = field(default_factory=dict)
-    observations: dict[str, NDArray[Any]] = field(default_factory=dict)
-    actions: dict[str, NDArray[Any]] = field(default_factory=dict)
+    observations: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+    actions: dict[str, NDArray[np.generic]] = field(default_factory=dict)
     more: dict[str, Any] = field(default_factory=dict)
 
     @property
     def whole(self) -> bool:
         """Whether the step was completed."""
         return self.scene is not None
+
+
+class SceneParts(TypedDict, total=False):
+    """What a scene has besides what a step says itself; see `Scene`."""
+
+    contacts: tuple[Contact, ...]
+    off_road: tuple[str, ...]
+    lanes: tuple[str, ...]
+    heights: list[float]
+    grades: list[float]
+    spines: dict[int, Spine]
 
 
 @dataclass(slots=True)
@@ -62,5 +74,5 @@ class Reading:
     steps: list[StepRecord] = field(default_factory=list)
     current: StepRecord = field(default_factory=lambda: StepRecord(0))
     roster: Roster = field(default_factory=lambda: Roster(()))
-    scene: dict[str, Any] = field(default_factory=dict)
-    events: tuple[Any, ...] = ()
+    scene: SceneParts = field(default_factory=SceneParts)
+    events: tuple[Event, ...] = ()

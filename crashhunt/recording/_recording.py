@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -64,14 +64,14 @@ class Recording:
         """How many steps were completed."""
         return max((step.step for step in self.all_steps if step.whole), default=0)
 
-    def observations(self, agent: str) -> NDArray[Any]:
+    def observations(self, agent: str) -> NDArray[np.generic]:
         """What an agent was shown, shape (steps it saw, *observation shape)."""
         channel = self._channel(agent)
         found = [step.observations[agent] for step in self.all_steps if agent in step.observations]
         shape = (len(found), *channel.observation_shape)
         return np.array(found, dtype=channel.observation_dtype).reshape(shape)
 
-    def actions(self, agent: str) -> NDArray[Any]:
+    def actions(self, agent: str) -> NDArray[np.generic]:
         """What an agent answered, shape (steps it acted, *action shape)."""
         channel = self._channel(agent)
         found = [step.actions[agent] for step in self.all_steps if agent in step.actions]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -11,6 +11,8 @@ from crashhunt.recording.records._type import BytesForm
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from crashhunt.recording.records._type import Message
 
 __all__ = ["MESSAGES", "NAMESPACE"]
 
@@ -39,7 +41,7 @@ _FILES: dict[str, Mapping[str, Mapping[str, str]]] = {
 }
 
 
-def _make() -> dict[str, Any]:
+def _make() -> dict[str, type[Message]]:
     # A pool of its own: another version of crashhunt in the same process must not clash with it.
     pool = descriptor_pool.DescriptorPool()
     for place, messages in _FILES.items():
@@ -52,7 +54,7 @@ def _make() -> dict[str, Any]:
     }
 
 
-def _file(place: str, messages: Mapping[str, Mapping[str, str]]) -> Any:
+def _file(place: str, messages: Mapping[str, Mapping[str, str]]) -> descriptor_pb2.FileDescriptorProto:
     file = descriptor_pb2.FileDescriptorProto(name=place, package=NAMESPACE.rstrip("."), syntax="proto3")
     for name, fields in messages.items():
         message = file.message_type.add(name=name)

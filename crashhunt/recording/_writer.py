@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mcap_protobuf.schema import build_file_descriptor_set
 
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mcap.writer import Writer
+
+    from crashhunt.recording.records._type import Message
 
 __all__ = ["LogWriter", "to_ns"]
 
@@ -30,7 +32,7 @@ class LogWriter:
     def write(
         self,
         topic: str,
-        kind: Any,
+        kind: type[Message],
         data: bytes,
         time_ns: int,
         sequence: int = 0,

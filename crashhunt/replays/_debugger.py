@@ -11,7 +11,7 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, final
+from typing import TYPE_CHECKING, TypedDict, final
 
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
@@ -172,7 +172,7 @@ class _Stopped:
     def reset(self, seed: int) -> None:
         self.agent.reset(seed)
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         # At hand in the debugger, whatever the agent calls its own.
         for name, value in (
             ("agent", self.agent), ("observation", observation), ("scene", self._scene), ("step", self._step),

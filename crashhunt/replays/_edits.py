@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.plans import Owners, Takes, takes_of
 from crashhunt.replays._disturbances import edited_disturbances, is_about_disturbances
-from crashhunt.trial import Constant, parse_spec
+from crashhunt.trial import Constant, Value, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Edits", "edited_spec"]
 
-Values = dict[tuple[str, str], Any]  # (agent, or empty for the scenario; name) to value
+Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name) to value
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:
     return found
 
 
-def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Any:
+def _constant(text: str, spec: ArgumentSpec | None, where: str) -> Value:
     distribution = parse_spec(text, spec.kind if spec else None, where=where)
     if not isinstance(distribution, Constant):
         raise ArgumentError(f"{where}: {text!r} is not one value, and a replay needs one", fix="give a value")
@@ -145,5 +145,5 @@ def _name(key: tuple[str, str]) -> str:
     return f"{agent}.{name}" if agent else name
 
 
-def _plain(value: Any) -> str:
+def _plain(value: Value) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

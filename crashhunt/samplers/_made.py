@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.blame import place_of
 from crashhunt.base.errors import CrashhuntError, PluginError
@@ -71,7 +71,7 @@ class NamedSampler:
             PluginError: it fails, or what it answers is none.
         """
         try:
-            answer: Any = self._sampler.ask(number, rng)
+            answer = self._sampler.ask(number, rng)
         except CrashhuntError:
             raise
         except Exception as error:

@@ -16,7 +16,7 @@ Then a ``scenario.toml`` may have a table ``[mysim]``, of which the simulator as
 from __future__ import annotations
 
 from dataclasses import dataclass, is_dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -114,7 +114,7 @@ class Backend:
     """
 
     title: str = ""
-    table: type[Any] | None = None
+    table: type | None = None
     example: str = "what it needs"
     keys: frozenset[str] | None = None
     shows_itself: bool = False

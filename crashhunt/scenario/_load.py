@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ScenarioError
@@ -20,8 +20,7 @@ from crashhunt.scenario._shipped import shipped_folder, shipped_scenarios
 from crashhunt.scenario._tables import AgentSetup, ObservationSetup
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+    from crashhunt.base.plain import Plain
     from crashhunt.scenario._backend import Configuration
 
 __all__ = ["endings", "load_scenario", "scenario_from_dict"]
@@ -59,7 +58,7 @@ def endings() -> tuple[str, ...]:
     return (".toml", *(configuration.endings[0] for configuration in configurations()))
 
 
-def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path, tolerant: bool = False) -> Scenario:
+def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool = False) -> Scenario:
     """Validate what a ``scenario.toml`` says, without looking at the files that it names.
 
     Args:
@@ -88,7 +87,7 @@ def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path, tol
         error=ScenarioError,
         keys=_keys_of_a_file,
     )
-    tables = {
+    tables: dict[str, object] = {
         name: validate(kind, data[name], where=where, error=ScenarioError, under=name)
         for name, kind in kinds.items()
         if data[name] is not None  # as an older crashhunt sends it to a worker
@@ -102,21 +101,21 @@ def scenario_from_dict(data: Mapping[str, Any], *, where: str, folder: Path, tol
     return replace(scenario, tables=tables, folder=folder, name=scenario.name or folder.name, observation=observation)
 
 
-def _known(data: Mapping[str, Any]) -> dict[str, Any]:
+def _known(data: Plain) -> dict[str, object]:
     tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
     rest = {name: value for name, value in data.items() if name not in tables}
-    known: dict[str, Any] = known_part(Scenario, rest)[0]
+    known: dict[str, object] = known_part(Scenario, rest)[0]
     own = data.get("simulator")  # of which the table is no addition of a later version, known or not
     known |= {name: value for name, value in rest.items() if name == own}
     return {**known, **{name: known_part(kind, data[name])[0] for name, kind in tables.items()}}
 
 
-def _table_kind(name: str) -> type[Any] | None:
+def _table_kind(name: str) -> type | None:
     backend = backend_of(name)
     return backend.table if backend is not None else None
 
 
-def _may_be_left_out(kind: type[Any]) -> bool:
+def _may_be_left_out(kind: type) -> bool:
     return all(item.default is not MISSING or item.default_factory is not MISSING for item in fields(kind))
 
 

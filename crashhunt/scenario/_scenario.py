@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ScenarioError
@@ -57,7 +57,7 @@ class Scenario:
     observation: ObservationSetup | None = None
     arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
     agents: dict[str, AgentSetup] = field(default_factory=lambda: {"ego": AgentSetup()})
-    tables: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, object] = field(default_factory=dict)
     events: dict[str, float] = field(default_factory=dict)
     disturbances: dict[str, float] = field(default_factory=dict)
     schema: Literal[1] = 1

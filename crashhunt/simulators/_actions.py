@@ -97,7 +97,7 @@ class MetaAction(SpaceAction):
         return super().encode(action).reshape(1)
 
 
-def cast(action: object, dtype: np.dtype[Any]) -> NDArray[np.generic]:
+def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
     """Return an action as an array of a type; an encoded one stays as it is.
 
     Raises:

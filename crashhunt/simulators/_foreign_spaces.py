@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gymnasium import spaces
@@ -97,7 +97,7 @@ def action_form(space: Space[object]) -> ActionForm:
     return SpaceAction(space) if isinstance(space, _ARRAYS) else FlatAction(space)
 
 
-def native(form: ActionForm, action: NDArray[np.generic]) -> Any:
+def native(form: ActionForm, action: NDArray[np.generic]) -> object:
     """Return an encoded action as the environment takes it: a number, an array or a structure."""
     if isinstance(form, FlatAction):
         return spaces.unflatten(form.space, action)

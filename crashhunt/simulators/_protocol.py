@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     import numpy as np
     from gymnasium import Space
 
-    from crashhunt.trial import Disturbance
+    from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Lane, Scene
 
 __all__ = [
@@ -27,8 +28,10 @@ __all__ = [
     "HasMap",
     "HasMeanings",
     "HasWindow",
+    "Info",
     "NamesObservations",
     "Observations",
+    "Options",
     "Simulator",
     "StepResult",
     "TellsEvents",
@@ -36,8 +39,20 @@ __all__ = [
     "Tidies",
 ]
 
+
+class Options(TypedDict, total=False):
+    """What an episode is asked for.
+
+    Args:
+        arguments: the arguments of the scenario, by name.
+    """
+
+    arguments: Mapping[str, Value]
+
+
 Observations = dict[str, NDArray[Any]]
-StepResult = tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+Info = Mapping[str, object]
+StepResult = tuple[Observations, Mapping[str, float], Mapping[str, bool], Mapping[str, bool], Mapping[str, Info]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +65,7 @@ class FullBraking:
         deceleration: what that amounts to, in m/s², where the simulator says so.
     """
 
-    action: Any
+    action: object
     how: str
     deceleration: float | None = None
 
@@ -100,7 +115,7 @@ class Simulator(Protocol):
     def step_length_s(self) -> float:
         """Simulation time between two steps, in s."""
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Begin an episode; return the first observation of every agent, and infos.
 
         Args:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import Scenario
     from crashhunt.scenario.backends.gym import CrashRule
-    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Info, Observations, Options, StepResult
+    from crashhunt.trial import Value
 
 __all__ = ["GymSimulator"]
 
@@ -64,7 +65,7 @@ class GymSimulator:
         except Exception as error:
             raise self._mistake(f"{type(error).__name__}: {error}") from error
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Make the environment and reset it."""
         self._env.close()
         try:
@@ -101,7 +102,7 @@ class GymSimulator:
         """Close the environment."""
         self._env.close()
 
-    def _shown(self, observation: Any) -> NDArray[np.generic]:
+    def _shown(self, observation: object) -> NDArray[np.generic]:
         """An observation as it is recorded; one that is not what the environment promises is told, once a hunt.
 
         The episode goes on: what an agent makes of it is its own business, and many environments stray by a rounding.
@@ -117,15 +118,15 @@ class GymSimulator:
                 logging.getLogger("crashhunt").warning("%s, for the first time at step %d", notice, self._steps)
         return array
 
-    def _find(self) -> Callable[..., Any]:
+    def _find(self) -> Callable[..., object]:
         name = self._setup.id
         if name.partition(":")[2].isidentifier():
-            factory: Callable[..., Any] = load_object(name)
+            factory: Callable[..., object] = load_object(name)
             return factory
         # The bound on steps is the trial's.
         return lambda **kwargs: gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
-    def _make(self, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    def _make(self, arguments: Mapping[str, Value]) -> gymnasium.Env[Any, Any]:
         kwargs = deepcopy(self._setup.kwargs)
         for table in as_tables(self._scenario, arguments):
             merge(kwargs, table)
@@ -162,7 +163,7 @@ class _Rule:
         self._rule = rule
         self._function = load_object(rule.function) if rule.function else None
 
-    def __call__(self, observation: Any, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]) -> str:
+    def __call__(self, observation: object, reward: float, terminated: bool, truncated: bool, info: Info) -> str:
         """Say what happened; nothing where it is no crash."""
         rule = self._rule
         if rule.info and info.get(rule.info):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Disturbing, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance
 
 __all__ = ["ToySimulator"]
@@ -61,7 +61,7 @@ class ToySimulator:
         }
         self.agents: list[str] = []
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Put everybody on the road, the leader in front."""
         self._arguments = dict((options or {}).get("arguments", {}))
         if self._argument("fail_reset", default=False):

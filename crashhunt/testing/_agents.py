@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,6 +13,8 @@ from crashhunt.base.faculties import offers
 from crashhunt.panels import labelled
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from crashhunt.simulators import ActionForm
 
 __all__ = ["AgentContract"]
@@ -38,12 +40,12 @@ class AgentContract:
         raise NotImplementedError("give the suite a fixture named form")
 
     @pytest.fixture
-    def observations(self) -> list[np.ndarray[Any, Any]]:
+    def observations(self) -> list[NDArray[np.generic]]:
         """Return what the agent is shown."""
         raise NotImplementedError("give the suite a fixture named observations")
 
     def test_it_acts_inside_its_space_and_by_its_seed_alone(
-        self, make: Make, form: ActionForm, observations: list[np.ndarray[Any, Any]]
+        self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
         """After a reset it does the same again, as does another instance."""
 
@@ -57,7 +59,7 @@ class AgentContract:
         assert drive(agent, 1) == first
         assert drive(make(), 1) == first
 
-    def test_it_leaves_what_it_is_shown_alone(self, make: Make, observations: list[np.ndarray[Any, Any]]) -> None:
+    def test_it_leaves_what_it_is_shown_alone(self, make: Make, observations: list[NDArray[np.generic]]) -> None:
         """Observations are shared with the recorder and other agents."""
         agent = make()
         agent.reset(1)
@@ -67,7 +69,7 @@ class AgentContract:
             assert np.array_equal(observation, before)
 
     def test_panels_are_pictures_and_change_nothing(
-        self, make: Make, form: ActionForm, observations: list[np.ndarray[Any, Any]]
+        self, make: Make, form: ActionForm, observations: list[NDArray[np.generic]]
     ) -> None:
         """`DrawsPanels`: it acts as it does when nobody looks, and what it shows can be drawn and told apart."""
 
@@ -87,7 +89,7 @@ class AgentContract:
         assert drive(looked_at=True) == drive(looked_at=False)
 
     def test_it_can_be_closed_whenever_a_trial_may_end(
-        self, make: Make, observations: list[np.ndarray[Any, Any]]
+        self, make: Make, observations: list[NDArray[np.generic]]
     ) -> None:
         """`Closes`: before its reset, after it, and after it has acted; and another one drives all the same."""
         for ends_after in (-1, 0, 1):

@@ -64,14 +64,14 @@ class RecordedThenBrakes:
         self._actions = read_log(Path(log)).actions(agent)
         self._after = after
         meta = offers(action_space, HasMeanings)
-        self._brake: Any = tuple(action_space.meanings).index("SLOWER") if meta else (0.0, 0)
+        self._brake: object = tuple(action_space.meanings).index("SLOWER") if meta else (0.0, 0)
         self._step = 0
 
     def reset(self, seed: int) -> None:
         """Begin at the first action."""
         self._step = 0
 
-    def act(self, observation: Any) -> Any:
+    def act(self, observation: object) -> object:
         """Return the next action."""
         step, self._step = self._step, self._step + 1
         return self._brake if step >= self._after else self._actions[min(step, len(self._actions) - 1)]

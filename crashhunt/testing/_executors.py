@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.recording import BlackBoxHeader
+    from crashhunt.trial import Value
 
 __all__ = ["ExecutorContract"]
 
@@ -53,7 +54,7 @@ class ExecutorContract:
         yield made
         made.close()
 
-    def _spec(self, number: int, **arguments: Any) -> TrialSpec:
+    def _spec(self, number: int, **arguments: Value) -> TrialSpec:
         return TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=30)
 
     def _collect(self, executor: Executor, count: int) -> dict[int, TrialResult]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,6 +12,9 @@ import pytest
 from crashhunt.samplers import Independent, OnlyAsked, Proposal, Sampler, Space
 from crashhunt.trial import Outcome, Range, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
+
+if TYPE_CHECKING:
+    from crashhunt.trial import Value
 
 __all__ = ["SamplerContract"]
 
@@ -93,7 +96,7 @@ class SamplerContract:
 
 
 def _ask(sampler: Sampler, number: int) -> Proposal:
-    answer: Any = sampler.ask(number, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(number,))))
+    answer = sampler.ask(number, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(number,))))
     return answer if isinstance(answer, Proposal) else Proposal(answer)
 
 
@@ -114,7 +117,7 @@ def _talk(sampler: Sampler) -> list[tuple[list[TrialResult], Proposal]]:
 
 def _result(number: int, proposal: Proposal) -> TrialResult:
     """How a trial might end: now and then without ever having been near to anything."""
-    arguments: dict[str, dict[str, Any]] = {}
+    arguments: dict[str, dict[str, Value]] = {}
     for (agent, name), value in proposal.arguments.items():
         arguments.setdefault(agent, {})[name] = value
     scenario = arguments.pop("", {})

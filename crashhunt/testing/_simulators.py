@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -26,11 +26,17 @@ from crashhunt.simulators import (
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.simulators import Observations
     from crashhunt.world import Event
 
 __all__ = ["SimulatorContract"]
 
 Make = Callable[[], Simulator]
+
+
+_Shown = tuple[float, bytes, list[str], list[tuple[str, bytes]], list[tuple[str, float]]]
 
 
 class SimulatorContract:
@@ -47,10 +53,10 @@ class SimulatorContract:
         """Return what makes a simulator."""
         raise NotImplementedError("give the suite a fixture named make")
 
-    def _drive(self, simulator: Simulator, seed: int) -> list[tuple[Any, ...]]:
+    def _drive(self, simulator: Simulator, seed: int) -> list[_Shown]:
         """Everything that an episode shows, as bytes and numbers."""
         observations, _ = simulator.reset(seed=seed)
-        trace: list[tuple[Any, ...]] = [self._shown(simulator, observations, {})]
+        trace: list[_Shown] = [self._shown(simulator, observations, {})]
         held = {}
         for agent in simulator.agents:
             simulator.actions[agent].space.seed(3)
@@ -66,7 +72,7 @@ class SimulatorContract:
             trace.append(self._shown(simulator, observations, rewards))
         return trace
 
-    def _shown(self, simulator: Simulator, observations: Any, rewards: Any) -> tuple[Any, ...]:
+    def _shown(self, simulator: Simulator, observations: Observations, rewards: Mapping[str, float]) -> _Shown:
         scene = simulator.scene()
         for agent, observation in observations.items():
             assert simulator.observation_spaces[agent].contains(observation)
@@ -208,7 +214,7 @@ class SimulatorContract:
         shown = simulator.shown_spaces if offers(simulator, FlattensObservations) else {}
         assert set(shown) <= set(observations)
         for agent, space in shown.items():
-            seen: Any = spaces.unflatten(space, observations[agent])
+            seen: object = spaces.unflatten(space, observations[agent])
             again = np.asarray(spaces.flatten(space, seen))
             assert np.array_equal(again, observations[agent], equal_nan=True)
         simulator.close()

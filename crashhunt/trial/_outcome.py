@@ -127,7 +127,7 @@ def outcome_of(data: HasOutcome) -> Outcome:
     """
     outcome = Outcome(data["outcome"])
     if outcome.is_own and "category" in data:
-        return Outcome.own(outcome.value, cast("Category", data["category"]))
+        return Outcome.own(outcome.value, cast(Category, data["category"]))
     return outcome
 
 

@@ -6,7 +6,7 @@ import inspect
 import types
 import typing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.base.names import one_of
@@ -47,7 +47,7 @@ class Signature:
                 raise ArgumentError(f"{where} takes no argument {name!r}", fix=fix)
 
 
-def signature_of(factory: Callable[..., Any]) -> Signature:
+def signature_of(factory: Callable[..., object]) -> Signature:
     """Read the arguments of a factory off its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to say what a hunt should try. Parameters named
@@ -75,7 +75,7 @@ def signature_of(factory: Callable[..., Any]) -> Signature:
     return Signature(arguments, is_open, tuple(given))
 
 
-def _annotation(parameter: inspect.Parameter, names: dict[str, Any]) -> Any:
+def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> object:
     """The annotation as an object; None where it cannot be had, such as a name imported for type checkers only."""
     if not isinstance(parameter.annotation, str):
         return parameter.annotation
@@ -85,7 +85,7 @@ def _annotation(parameter: inspect.Parameter, names: dict[str, Any]) -> Any:
         return None
 
 
-def _argument(parameter: inspect.Parameter, hint: Any) -> Argument:
+def _argument(parameter: inspect.Parameter, hint: object) -> Argument:
     default = parameter.default if isinstance(parameter.default, bool | int | float | str) else None
     declared = None
     if typing.get_origin(hint) is typing.Annotated:

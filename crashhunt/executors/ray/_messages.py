@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 if TYPE_CHECKING:
-    from crashhunt.base.errors import ErrorData, ErrorWords
+    from crashhunt.base.plain import ErrorData, ErrorWords
     from crashhunt.episode import SettingsData
     from crashhunt.trial import ResultData, SpecData
 

@@ -23,7 +23,7 @@ from crashhunt.trial import TrialSpec
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.base.errors import ErrorData
+    from crashhunt.base.plain import ErrorData
     from crashhunt.executors.ray._messages import Header, NodeJob, Submitted
     from crashhunt.executors.ray._store import Place
     from crashhunt.recording import BlackBoxHeader

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.recording.records._type import Fields, Message
     from crashhunt.recording.records.prologue import Prologue
 
 __all__ = ["ArrayForm", "difference", "message_of"]
@@ -35,12 +36,12 @@ class ArrayForm(Form):
     def __init__(self, what: str) -> None:
         self._what = what
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return the numbers, in the message that holds those of this type without losing a bit."""
         dtype = getattr(prologue.agents[aux], self._what)
         return message_of(dtype), {"values": np.frombuffer(payload, dtype).tolist()}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return their bytes."""
         if prologue is None:
             raise ValueError("an array comes before the beginning")
@@ -58,7 +59,12 @@ def message_of(dtype: str) -> str:
 
 
 def difference(
-    step: int, agent: str, kind: str, columns: tuple[str, ...], was: NDArray[Any] | None, now: NDArray[Any] | None
+    step: int,
+    agent: str,
+    kind: str,
+    columns: tuple[str, ...],
+    was: NDArray[np.generic] | None,
+    now: NDArray[np.generic] | None,
 ) -> Divergence | None:
     """Return the first difference between two arrays of an agent, either of which may be missing."""
     if was is None and now is None:
@@ -73,5 +79,5 @@ def difference(
     return Divergence(step, agent, field, was[where].item(), now[where].item(), (kind, where))
 
 
-def _plain(array: NDArray[Any] | None) -> Any:
+def _plain(array: NDArray[np.generic] | None) -> object:
     return None if array is None else array.tolist()

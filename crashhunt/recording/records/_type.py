@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.recording._divergence import Divergence
 
@@ -18,13 +18,21 @@ if TYPE_CHECKING:
 __all__ = [
     "SCENE",
     "BytesForm",
+    "Fields",
     "Form",
+    "Message",
     "RecordType",
     "TextForm",
     "scene_texts",
 ]
 
 SCENE = "scene"
+
+Message: TypeAlias = Any
+"""A protobuf message, of a class that is made when crashhunt is imported: its fields are those of `Form.messages`."""
+
+Fields: TypeAlias = "Mapping[str, object]"
+"""The values of a message's fields, by name."""
 
 
 class Form:
@@ -36,11 +44,11 @@ class Form:
 
     messages: Mapping[str, Mapping[str, str]]
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return the name of the message, and the values of its fields."""
         raise NotImplementedError
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return the payload that was given to `to_message`; the prologue itself is read without one."""
         raise NotImplementedError
 
@@ -50,11 +58,11 @@ class TextForm(Form):
 
     messages: Mapping[str, Mapping[str, str]] = {"Text": {"text": "string"}}
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return the text."""
         return "Text", {"text": payload}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return it again."""
         text: str = message.text
         return text.encode()
@@ -65,11 +73,11 @@ class BytesForm(Form):
 
     messages: Mapping[str, Mapping[str, str]] = {"Bytes": {"data": "bytes"}}
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return it as it is."""
         return "Bytes", {"data": payload}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return it as it was."""
         data: bytes = message.data
         return data
@@ -97,7 +105,7 @@ class RecordType:
     form: Form
     read: Callable[[Reading, int, bytes], None]
     difference: Difference | None = None
-    value: Callable[[StepRecord, str, tuple[int, ...]], Any] | None = None
+    value: Callable[[StepRecord, str, tuple[int, ...]], object] | None = None
 
     @property
     def per_agent(self) -> bool:

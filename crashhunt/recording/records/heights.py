@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.recording._reading import Reading
+    from crashhunt.recording.records._type import Fields, Message
     from crashhunt.recording.records.prologue import Prologue
     from crashhunt.world import Scene
 
@@ -26,11 +27,11 @@ def encode_heights(scene: Scene) -> bytes:
 class _HeightsForm(Form):
     messages: Mapping[str, Mapping[str, str]] = {"Heights": {"heights": "double*", "grades": "double*"}}
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         heights, grades = np.frombuffer(payload, "<f8").reshape(2, -1).tolist()
         return "Heights", {"heights": heights, "grades": grades}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         return np.array([*message.heights, *message.grades], "<f8").tobytes()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def _difference(left: StepRecord, right: StepRecord, agent: AgentChannel | None)
     return _arrays.difference(left.step, agent.id, "observation", agent.observation_names, was, now)
 
 
-def _value(step: StepRecord, agent: str, index: tuple[int, ...]) -> Any:
+def _value(step: StepRecord, agent: str, index: tuple[int, ...]) -> object:
     array = step.observations.get(agent)
     return None if array is None else array[index].item()
 

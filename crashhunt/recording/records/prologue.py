@@ -6,9 +6,11 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.tolerance import known_values
 from crashhunt.recording.records._type import RecordType, TextForm
 
 if TYPE_CHECKING:
+    from crashhunt.base.plain import Plain
     from crashhunt.recording._reading import Reading
 
 __all__ = ["TYPE", "AgentChannel", "Prologue"]
@@ -58,16 +60,13 @@ class Prologue:
     def decode(cls, payload: bytes) -> Prologue:
         """Rebuild what `encode` returned; what a later version has added is left out."""
         data = json.loads(payload)
-        channels: list[dict[str, Any]] = [
-            {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in agent.items()
-                if name in AgentChannel.__slots__
-            }
-            for agent in data["agents"]
-        ]
-        agents = tuple(AgentChannel(**channel) for channel in channels)
+        agents = tuple(AgentChannel(**_columns(agent)) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
+
+
+def _columns(agent: Plain) -> dict[str, Any]:
+    known = known_values(AgentChannel, agent)
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in known.items()}
 
 
 def _read(_reading: Reading, _aux: int, _payload: bytes) -> None:

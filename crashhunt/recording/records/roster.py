@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.recording._reading import Reading
+    from crashhunt.recording.records._type import Fields, Message
     from crashhunt.recording.records.prologue import Prologue
 
 __all__ = ["TYPE", "difference", "encode_roster"]
@@ -27,10 +28,10 @@ def encode_roster(numbers: list[int]) -> bytes:
 class _RosterForm(Form):
     messages: Mapping[str, Mapping[str, str]] = {"Roster": {"actors": "uint32*"}}
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         return "Roster", {"actors": np.frombuffer(payload, "<u4").tolist()}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         return encode_roster(message.actors)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from crashhunt.recording.records._type import Form, RecordType, scene_texts
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from numpy.typing import NDArray
+
     from crashhunt.recording._reading import Reading
+    from crashhunt.recording.records._type import Fields, Message
     from crashhunt.recording.records.prologue import Prologue
     from crashhunt.world import Scene, Spine
 
@@ -26,7 +29,7 @@ def encode_spines(scene: Scene) -> bytes:
     return _encode(scene.spines)
 
 
-def _encode(spines: Mapping[int, Any]) -> bytes:
+def _encode(spines: Mapping[int, Spine | NDArray[np.float64]]) -> bytes:
     return b"".join(_HEAD.pack(row, len(spine)) + np.array(spine, "<f8").tobytes() for row, spine in spines.items())
 
 
@@ -46,13 +49,13 @@ class _SpinesForm(Form):
         "Spines": {"rows": "uint32*", "points": "uint32*", "coordinates": "double*"}
     }
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         spines = _decode(payload)
         coordinates = [value for spine in spines.values() for point in spine for value in point]
         points = [len(spine) for spine in spines.values()]
         return "Spines", {"rows": list(spines), "points": points, "coordinates": coordinates}
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         values = np.array(list(message.coordinates), "<f8").reshape(-1, 3)
         ends = np.cumsum(list(message.points))[:-1]
         return _encode(dict(zip(message.rows, np.split(values, ends), strict=True)))

@@ -6,7 +6,7 @@ These are, of all actors of the roster, x and y alternating, then all headings, 
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from crashhunt.world import Scene
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from crashhunt.recording._reading import Reading
+    from crashhunt.recording._reading import Reading, SceneParts
+    from crashhunt.recording.records._type import Fields, Message
     from crashhunt.recording.records.prologue import AgentChannel, Prologue
 
 __all__ = ["TYPE", "time_of"]
@@ -45,7 +46,7 @@ class _StepForm(Form):
         }
     }
 
-    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, dict[str, Any]]:
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         step, time_s = _HEAD.unpack_from(payload)
         values = np.frombuffer(payload, "<f8", offset=_HEAD.size).tolist()
         agents = len(prologue.agents)
@@ -60,7 +61,7 @@ class _StepForm(Form):
             "speeds": scene[3 * count :],
         }
 
-    def to_payload(self, message: Any, prologue: Prologue | None, aux: int) -> bytes:
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         values = np.array([*message.rewards, *message.positions, *message.headings, *message.speeds], "<f8")
         return _HEAD.pack(message.step, message.time_s) + values.tobytes()
 
@@ -75,7 +76,7 @@ def _read(reading: Reading, _aux: int, payload: bytes) -> None:
         raise ValueError(f"step {step} follows {len(steps) - 1}")
     points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
     headings, speeds = values[2 * count : 3 * count], values[3 * count :]
-    parts = {"heights": [], "grades": [], **reading.scene}
+    parts: SceneParts = {"heights": [], "grades": [], **reading.scene}
     scene = current.scene = Scene(time_s, reading.roster, points, headings, speeds, **parts)
     if len(scene.heights) not in (0, count) or any(row >= count for row in scene.spines):
         raise ValueError(f"step {step} is about more actors than there are")
@@ -108,7 +109,7 @@ def _difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> 
     return Divergence(step, was.roster.actors[row].id, f"scene.{name}", *values, (SCENE, (column,)))
 
 
-def _value(step: StepRecord, actor: str, index: tuple[int, ...]) -> Any:
+def _value(step: StepRecord, actor: str, index: tuple[int, ...]) -> object:
     if step.scene is None or actor not in step.scene.roster.index:
         return None
     return float(step.scene.data[step.scene.roster.index[actor], index[0]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._backend import Backend
@@ -46,7 +46,7 @@ class GymSetup:
     """
 
     id: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
+    kwargs: dict[str, object] = field(default_factory=dict)
     crash: CrashRule = field(default_factory=CrashRule)
 
 

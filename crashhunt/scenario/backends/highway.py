@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._backend import Accelerator, Backend
@@ -36,7 +36,7 @@ class HighwaySetup:
     """
 
     id: str
-    config: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, object] = field(default_factory=dict)
     off_road: bool | None = None
     accelerate: bool = True
 
@@ -72,7 +72,7 @@ def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications
     return ""
 
 
-def _texts(value: Any) -> Iterator[str]:
+def _texts(value: object) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list | tuple):

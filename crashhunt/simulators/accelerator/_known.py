@@ -18,7 +18,7 @@ from crashhunt.scenario.backends.highway import ACCELERATED
 from crashhunt.simulators.accelerator._watch import MODULES, is_plain
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 __all__ = ["Kind", "Own", "are_numbers", "kind_of", "kinds_of", "left_alone", "originals", "reason_against"]
 
@@ -57,7 +57,7 @@ _ORIGINALS = {
 }
 _OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
 
-originals: dict[str, Any] = {}
+originals: dict[str, Callable[..., Any]] = {}
 """The methods of highway-env that are replaced, by name, as they were; nothing before the first time."""
 
 
@@ -84,7 +84,7 @@ class Own:
         """Whether it has another member of that name than its base."""
         return self._of(name) is not inspect.getattr_static(self._base, name, None)
 
-    def _of(self, name: str) -> Any:
+    def _of(self, name: str) -> object:
         return inspect.getattr_static(self._kind, name, None)
 
     @property
@@ -203,7 +203,7 @@ def reason_against() -> str:
 _FILES = {str(module.__file__) for module in _MODULES}
 
 
-def _functions() -> Iterator[tuple[str, Any]]:
+def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
     """All functions and methods that the sources of the modules define, by name, as they are now."""
     for module in _MODULES:
         source = Path(str(module.__file__)).read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
@@ -94,7 +94,9 @@ class Network:
             return False
         return same and [array.tobytes() for array in self._arrays] == self._contents
 
-    def on_axis(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Any, Any]:
+    def on_axis(
+        self, x: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Longitudinal and lateral coordinates on the lanes along an axis, each of shape (points, lanes)."""
         dx, dy = x[:, None] - self.start_x, y[:, None] - self.start_y
         # A scalar product begins with zero, which decides the sign of a result of zero.
@@ -145,7 +147,7 @@ class Network:
         )
 
 
-def _laid_out(network: RoadNetwork) -> tuple[list[tuple[Any, Any, int]], list[AbstractLane]]:
+def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
     """All keys and lanes, in the order in which highway-env compares lanes; nothing where it has methods of its own."""
     keys, lanes = [], []
     if type(network) is RoadNetwork and vars(network).keys() == {"graph"}:
@@ -157,7 +159,7 @@ def _laid_out(network: RoadNetwork) -> tuple[list[tuple[Any, Any, int]], list[Ab
     return keys, lanes
 
 
-def _values(lanes: list[AbstractLane]) -> list[tuple[Any, ...]]:
+def _values(lanes: list[AbstractLane]) -> list[tuple[object, ...]]:
     return [tuple(vars(lane).values()) if type(lane) in _KNOWN else () for lane in lanes]
 
 

@@ -7,7 +7,7 @@ know, such as a class that overrides what it speeds up, is left to highway-env's
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
 from highway_env.road.regulation import RegulatedRoad
@@ -21,11 +21,17 @@ from crashhunt.simulators.accelerator._network import Network
 from crashhunt.simulators.accelerator._observe import close_objects, fill_lanes, observe
 from crashhunt.simulators.accelerator._watch import Watch, is_plain
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from highway_env.road.lane import LaneIndex
+    from highway_env.vehicle.kinematics import Vehicle
+
 __all__ = ["is_on", "left_alone", "switch_off", "switch_on", "why_not"]
 
 _ROADS = 16  # that are remembered: those of several environments in one process
 _roads: dict[int, _Prepared] = {}
-_state: dict[str, Any] = {}  # "roads" and "observations": the watches, while it is fast
+_state: dict[str, Watch] = {}  # "roads" and "observations": the watches, while it is fast
 
 
 def switch_on() -> str:
@@ -152,7 +158,7 @@ def _step(self: Road, dt: float) -> None:
     collide(self, dt)
 
 
-def _neighbour_vehicles(self: Road, vehicle: Any, lane_index: Any = None) -> Any:
+def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
     frame = _frame_of(self)
     row = frame.row.get(id(vehicle)) if frame is not None else None
     key = lane_index or vehicle.lane_index
@@ -165,13 +171,13 @@ def _neighbour_vehicles(self: Road, vehicle: Any, lane_index: Any = None) -> Any
 
 def _close_objects_to(
     self: Road,
-    vehicle: Any,
+    vehicle: Vehicle,
     distance: float,
     count: int | None = None,
     see_behind: bool = True,
     sort: bool = True,
     vehicles_only: bool = False,
-) -> Any:
+) -> object:
     frame = _frame_of(self)
     if frame is not None:
         found = close_objects(
@@ -187,7 +193,7 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
         originals["enforce_road_rules"](self)
 
 
-def _observe(self: KinematicObservation) -> Any:
+def _observe(self: KinematicObservation) -> object:
     if _is_plain(self, KinematicObservation):
         found = observe(self, _frame_of(self.env.road))
         if found is not None:
@@ -205,7 +211,7 @@ def _fill_road_layer_by_lanes(
         originals["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
-def _is_plain(observation: Any, kind: Any) -> bool:
+def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
     """Whether an observation of a road is of a class that is known, and nobody has replaced a part of it."""
     return bool(
         type(observation) is kind
@@ -216,13 +222,13 @@ def _is_plain(observation: Any, kind: Any) -> bool:
     )
 
 
-def _methods(kind: Any) -> frozenset[str]:
+def _methods(kind: type) -> frozenset[str]:
     return frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
 
 
 _SHOWN = {kind: _methods(kind) for kind in (KinematicObservation, OccupancyGridObservation)}
 _ROAD_METHODS = _methods(RegulatedRoad) - _CALLED
-_REPLACED: tuple[tuple[Any, str, Any], ...] = (
+_REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (Road, "act", _act),
     (Road, "step", _step),
     (Road, "neighbour_vehicles", _neighbour_vehicles),

@@ -6,7 +6,7 @@ import builtins
 import inspect
 import logging
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
@@ -104,7 +104,7 @@ class _Place:
         else:  # of a namespace that is large and others' business, only these
             self._seen, self._but = frozenset(space), frozenset(space)
         self._names = names
-        self._get: Callable[[Any], tuple[object, ...]] = _getter(names)
+        self._get: Callable[[Mapping[str, object]], tuple[object, ...]] = _getter(names)
         self._values = self._get(space)
 
     def same(self) -> bool:
@@ -138,7 +138,7 @@ def _special(name: str) -> bool:
     return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
 
 
-def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[object, ...]]:
+def _getter(names: tuple[str, ...]) -> Callable[[Mapping[str, object]], tuple[object, ...]]:
     if len(names) > 1:
         return itemgetter(*names)
     return lambda space: tuple([space[name] for name in names])

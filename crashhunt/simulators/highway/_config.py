@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from highway_env.vehicle.objects import RoadObject
 
@@ -14,16 +14,20 @@ from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators._options import as_tables, merge
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from crashhunt.scenario import Scenario
+    from crashhunt.trial import Value
 
 __all__ = ["configured", "mistake", "restore_classes"]
 
-_pristine: dict[type, dict[str, Any]] = {}
+Config: TypeAlias = dict[str, Any]
+"""What an environment of highway-env is told; what each entry may be its classes know."""
+
+_pristine: dict[type, dict[str, int | float | str]] = {}
 
 
-def configured(default: Mapping[str, Any], scenario: Scenario, arguments: Mapping[str, Any]) -> dict[str, Any]:
+def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Value]) -> Config:
     """Return the configuration of an environment for one trial.
 
     Args:
@@ -70,7 +74,7 @@ def restore_classes() -> None:
                 setattr(kind, name, value)
 
 
-def _let_in(scenario: Scenario, config: dict[str, Any]) -> None:
+def _let_in(scenario: Scenario, config: Config) -> None:
     """As many controlled vehicles as the scenario has agents."""
     count = len(scenario.agents)
     if "controlled_vehicles" in config:
@@ -84,14 +88,14 @@ def _let_in(scenario: Scenario, config: dict[str, Any]) -> None:
                 config[key] = {"type": f"MultiAgent{key.capitalize()}", f"{key}_config": config[key]}
 
 
-def _check_keys(scenario: Scenario, config: Mapping[str, Any], table: Mapping[str, Any]) -> None:
+def _check_keys(scenario: Scenario, config: Config, table: Iterable[str]) -> None:
     for key in table:
         if key not in config and not key.endswith("_reward"):  # which is 0 where it is not there
             fix = did_you_mean(key, config) or f"it has {', '.join(config)}"
             raise mistake(scenario, "config", key, "is no entry of the environment's configuration", fix)
 
 
-def _use_tuples(table: Any) -> None:
+def _use_tuples(table: Config | list[object]) -> None:
     """Make the shapes in the configuration of an observation tuples, which TOML does not have."""
     for inner in table.values() if isinstance(table, dict) else table:
         if isinstance(inner, dict | list):

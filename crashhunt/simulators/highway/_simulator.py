@@ -38,14 +38,16 @@ from crashhunt.simulators.highway._config import configured, mistake, restore_cl
 from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from gymnasium import Space
+    from highway_env.envs.common.action import ActionType
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Info, Observations, Options, StepResult
+    from crashhunt.trial import Value
 
 __all__ = ["HighwaySimulator"]
 
@@ -87,7 +89,7 @@ class HighwaySimulator:
 
     told_events = BACKEND.told_events
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Make the environment, and let everybody in."""
         try:
             env = self._make((options or {}).get("arguments", {}))
@@ -179,7 +181,7 @@ class HighwaySimulator:
         """Close the environment."""
         self._env.close()
 
-    def _make(self, arguments: Mapping[str, Any]) -> AbstractEnv:
+    def _make(self, arguments: Mapping[str, Value]) -> AbstractEnv:
         """Make the environment with its configuration, which the next reset applies."""
         restore_classes()
         try:
@@ -236,7 +238,7 @@ class HighwaySimulator:
             return kind.actions_indexes["IDLE"]
         return space.n // 2 if isinstance(space, Discrete) else np.zeros(space.shape, space.dtype)
 
-    def _show(self, agents: Mapping[str, Any] | list[str], shown: Any) -> Observations:
+    def _show(self, agents: Iterable[str], shown: Any) -> Observations:
         if self._kinematics is not None:
             return {agent: self._observe(agent) for agent in agents}
         each = shown if self._many_see else (shown,)
@@ -354,7 +356,7 @@ class HighwaySimulator:
         return found
 
 
-def _form(kind: Any) -> ActionForm:
+def _form(kind: ActionType) -> ActionForm:
     if isinstance(kind, DiscreteMetaAction):
         return MetaAction(tuple(kind.actions[number] for number in range(len(kind.actions))))
     return action_form(kind.space())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import libsumo
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup, Scenario
-    from crashhunt.simulators._protocol import ActionForm, Disturbing, Observations, StepResult
+    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
@@ -100,7 +100,7 @@ class SumoSimulator:
                 libsumo.gui.trackVehicle(view, agent)
                 libsumo.gui.setZoom(view, libsumo.gui.getZoom(view) * max(1.0, self._span_m() / _SEEN_M))
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
         global _current
         arguments = (options or {}).get("arguments", {})
