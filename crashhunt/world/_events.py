@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypedDict
 
-from crashhunt.base.plain import finite
-from crashhunt.base.tolerance import known_values
-
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.base.plain import Plain
 
+# Imports that are not for the words stand inside: --help needs the words alone.
 __all__ = ["EVENT_WORDS", "LIMITS", "Event", "EventData", "event_counts"]
 
 EVENT_WORDS = {
@@ -71,6 +69,8 @@ class Event:
 
     def to_json(self) -> EventData:
         """Return plain strings and numbers; what is not a finite number is null."""
+        from crashhunt.base.plain import finite
+
         return {
             "kind": self.kind,
             "agent": self.agent,
@@ -85,6 +85,8 @@ class Event:
     @classmethod
     def from_json(cls, data: Plain) -> Event:
         """Rebuild what `to_json` returned; what a later version has added is left out."""
+        from crashhunt.base.tolerance import known_values
+
         known = known_values(cls, data, null=math.nan)
         return cls(**{**known, "others": tuple(known.get("others", ()))})
 
