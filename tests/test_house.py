@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import crashhunt
+from crashhunt.recording import RECORD_TYPES, Tag
 
 ROOT = Path(crashhunt.__file__).parent
 
@@ -110,3 +111,31 @@ def test_test_files_have_names_of_their_own():
     # pytest imports two of the same name as one module, and collects neither.
     names = [file.name for file in Path(__file__).parent.rglob("test_*.py")]
     assert sorted(set(names)) == sorted(names)
+
+
+def uses_of_any(file: Path) -> int:
+    """How often a file says `Any`: wherever it is imported, in annotations, and in those that are text."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    named = sum(isinstance(node, ast.Name) and node.id == "Any" for node in nodes)
+    imported = sum(isinstance(node, ast.alias) and node.name == "Any" for node in nodes)
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return (
+        named + imported + sum(len(re.findall(r"\bAny\b", text)) for text in texts if re.search(r"\[.*\bAny\b", text))
+    )
+
+
+def test_any_is_rare():
+    """Of Python's own functions `json.loads` returns it; what it is has a `TypedDict`, so that keys are checked."""
+    files = list(ROOT.rglob("*.py"))
+    lines = sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
+    assert sum(map(uses_of_any, files)) / lines * 1000 <= 6
+
+
+def test_every_use_of_any_is_counted(tmp_path):
+    file = tmp_path / "example.py"
+    file.write_text('from typing import Any\n"""Any text."""\nx: Any = 1\ny: "dict[str, Any]" = {}\n')
+    assert uses_of_any(file) == 3
+
+
+def test_the_tags_are_those_of_the_types_of_records():
+    assert {tag.value for tag in Tag} == RECORD_TYPES.keys()

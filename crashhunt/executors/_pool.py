@@ -243,8 +243,9 @@ class PoolExecutor:
             answer: Answer = json.loads(line)
             if "error" in answer:
                 raise CrashhuntError.from_json(answer)
-            change: object = answer.get("change", True)
+            change: str | bool = True
             if "result" in answer:
+                change = answer.get("change", True)
                 result = TrialResult.from_json(answer["result"])
                 if result.spec.number != attempt.spec.number:
                     return
