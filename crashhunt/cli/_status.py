@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
 _WIDTH = 120
+_NODES = 20  # of a hunt, one a line
 _COLORS = {"crashed": "red", "error": "red", "killed": "red", "running": "green", "interrupted": "yellow"}
 
 
@@ -99,6 +100,11 @@ def states_table(states: list[HuntState]) -> Table:
             str(state.errors),
             Text(said),
         )
+        for node in (state.nodes or [])[:_NODES]:
+            name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
+            table.add_row(Text(name), "", str(node["trials"]), f"{node['rate_per_s']:.1f}")
+        if len(state.nodes or []) > _NODES:
+            table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
     return table
 
 

@@ -1,7 +1,13 @@
 from ._fresh import FreshProcessExecutor as FreshProcessExecutor, fresh_environment as fresh_environment
 from ._make import make_executor as make_executor
 from ._pool import PoolExecutor as PoolExecutor
-from ._protocol import Executor as Executor, ExecutorFactory as ExecutorFactory, SizesItself as SizesItself
+from ._protocol import (
+    Executor as Executor,
+    ExecutorFactory as ExecutorFactory,
+    HasNodes as HasNodes,
+    NodeFigures as NodeFigures,
+    SizesItself as SizesItself,
+)
 from ._worker import (
     Worker as Worker,
     read_map as read_map,

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from crashhunt.plans import SizesItself
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from crashhunt.episode import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Executor", "ExecutorFactory", "SizesItself"]
+__all__ = ["Executor", "ExecutorFactory", "HasNodes", "NodeFigures", "SizesItself"]
 
 
 class Executor(Protocol):
@@ -31,7 +32,10 @@ class Executor(Protocol):
 
     @property
     def capacity(self) -> int:
-        """How many trials run at a time, now. The hunt hands over more than that, so that no worker waits for it."""
+        """How many trials run at a time, now. The hunt hands over more than that, so that no worker waits for it.
+
+        It may change, and is 1 at least: where nobody runs any for a while, the hunt waits for what it has handed over.
+        """
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
@@ -54,6 +58,30 @@ class Executor(Protocol):
 
     def close(self) -> None:
         """Stop every process, whatever it is doing. May be called twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeFigures:
+    """A machine on which trials run, for people who watch.
+
+    Args:
+        name: of it.
+        parallel: how many trials run there at a time.
+        trials: how many have ended there in this run of the hunt.
+        rate_per_s: trials a second since it takes part.
+    """
+
+    name: str
+    parallel: int
+    trials: int
+    rate_per_s: float
+
+
+class HasNodes(Protocol):
+    """The faculty of an executor that runs trials on several machines."""
+
+    def nodes(self) -> Sequence[NodeFigures]:
+        """Return those that take part now; none while all are waited for."""
 
 
 class ExecutorFactory(Protocol):

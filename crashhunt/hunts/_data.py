@@ -35,6 +35,7 @@ class Noted(TypedDict, total=False):
         lag: by how many trials a sampler that learns is told late.
         origins: whether its sampler says where trials come from.
         disturb: how often what disturbs its trials; None where nothing does.
+        nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
     """
 
     owner: Owner | None
@@ -47,6 +48,7 @@ class Noted(TypedDict, total=False):
     lag: int | None
     origins: bool
     disturb: list[str] | None
+    nodes: list[dict[str, Any]]
 
 
 class Facts(Noted, total=False):

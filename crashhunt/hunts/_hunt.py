@@ -169,7 +169,7 @@ class Hunt:
         reason = ""
         if stopped == "no_valid_trial" and progress.last_invalid is not None:
             reason = _why_invalid(progress.last_invalid, self.scenario)
-        ledger.enter(stopped, reason, heartbeat=time.time())
+        ledger.enter(stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
             self.directory,
@@ -243,7 +243,7 @@ class Hunt:
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
-                    ledger.note(heartbeat=time.time())
+                    ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
             if progress.found:
@@ -283,6 +283,7 @@ class Hunt:
         for note in executor.notes():
             ledger.remark(note)
             progress.notes.append(note)
+        progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")
         if self.settings.run.audit > 0:
@@ -377,6 +378,7 @@ class Hunt:
             progress.nearest,
             dict(workers or {}),
             len(progress.crashes) + (1 if progress.found else 0),
+            progress.nodes,
         )
 
 

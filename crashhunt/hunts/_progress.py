@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
+
+from crashhunt.base.faculties import offers
+from crashhunt.executors import HasNodes
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
+    from crashhunt.executors import Executor, NodeFigures
     from crashhunt.hunts._audit import AuditReport
+    from crashhunt.hunts._data import Noted
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 
@@ -30,6 +35,7 @@ class HuntStatus:
         nearest: the trial that came nearest to a crash without one.
         workers: trial number to where it is.
         crashes: saved so far.
+        nodes: the machines that take part now; None where there is this one only.
     """
 
     phase: str
@@ -41,6 +47,7 @@ class HuntStatus:
     nearest: TrialResult | None
     workers: dict[int, BlackBoxHeader]
     crashes: int
+    nodes: tuple[NodeFigures, ...] | None = None
 
 
 @dataclass(slots=True)
@@ -57,3 +64,13 @@ class Progress:
     last_invalid: TrialResult | None = None
     notes: list[str] = field(default_factory=list)
     audit: AuditReport | None = None
+    nodes: tuple[NodeFigures, ...] | None = None
+
+    def look_at(self, executor: Executor) -> None:
+        """Take note of where trials run."""
+        self.nodes = tuple(executor.nodes()) if offers(executor, HasNodes) else None
+
+    def noted(self) -> Noted:
+        """Return what the ledger is to say about now."""
+        nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
+        return {"heartbeat": time.time(), **nodes}

@@ -9,7 +9,7 @@ import time
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
@@ -65,6 +65,7 @@ class HuntState:
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
     """
 
     dir: str
@@ -80,6 +81,7 @@ class HuntState:
     owner_alive: bool = False
     damaged: bool = False
     disturbed: int | None = None
+    nodes: list[dict[str, Any]] | None = None
 
     @property
     def failed(self) -> bool:
@@ -91,6 +93,8 @@ class HuntState:
         data = asdict(self)
         if self.disturbed is None:
             del data["disturbed"]
+        if self.nodes is None:
+            del data["nodes"]
         return data
 
 
@@ -178,6 +182,7 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         (planned - run) / rate if state == "running" and rate > 0 else None,
         alive,
         disturbed=_disturbed(directory) if facts.get("disturb") else None,
+        nodes=facts.get("nodes"),
     )
 
 

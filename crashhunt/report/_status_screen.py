@@ -86,7 +86,8 @@ class Watcher:
                 near = Text(near.plain, no_wrap=True, overflow="ellipsis")
             left -= len(self._console.render_lines(near))
             rows.append(near)
-        return Group(*rows, _workers(status, width, max(1, left)))
+        nodes = _nodes(status, max(1, left // 2))
+        return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
     def _head(self, status: HuntStatus, width: int) -> Text:
         now = f"   {status.phase}   {format_seconds(status.elapsed_s)}"
@@ -104,6 +105,21 @@ def _bar(status: HuntStatus, width: int) -> RenderableType:
     bar = ProgressBar(total=max(1, status.planned), completed=status.done, width=max(1, min(30, room)))
     table.add_row(bar, *said)
     return table
+
+
+def _nodes(status: HuntStatus, lines: int) -> list[RenderableType]:
+    """The machines that take part, one a line."""
+    if status.nodes is None:
+        return []
+    if not status.nodes:
+        return [Text("no node takes part now; the hunt waits", style="yellow")]
+    found = [
+        f"node {one_line(node.name)}   {node.parallel} at a time   {node.trials} trials   {node.rate_per_s:.1f}/s"
+        for node in status.nodes
+    ]
+    if len(found) > lines:
+        found = [*found[: lines - 1], f"and {len(found) - lines + 1} more nodes"]
+    return [Text(line, no_wrap=True, overflow="ellipsis") for line in found]
 
 
 def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
@@ -160,6 +176,8 @@ def _line(status: HuntStatus) -> str:
     line = f"{status.phase}: {status.done}/{status.planned} trials ({outcomes})"
     if status.phase == "hunting" and status.done:
         line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
+    if status.phase == "hunting" and status.nodes is not None:
+        line += f"; nodes that take part: {len(status.nodes)}" if status.nodes else "; no node takes part now"
     return line
 
 

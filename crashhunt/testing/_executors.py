@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from crashhunt.base import layout
+from crashhunt.base.faculties import offers
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import Executor
+from crashhunt.executors import Executor, HasNodes
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
@@ -67,6 +68,15 @@ class ExecutorContract:
                 found[result.spec.number] = result
         return found
 
+    def _see_nodes(self, executor: Executor, place: HasNodes, ended: int) -> None:
+        """What people are told of nodes adds up, within some seconds."""
+        deadline = time.monotonic() + 30
+        while sum(node.trials for node in place.nodes()) != ended:
+            assert time.monotonic() < deadline, f"{ended} trials have ended, and the nodes are {place.nodes()}"
+            assert list(executor.completed(0.1)) == []
+        assert sum(node.parallel for node in place.nodes()) == executor.capacity
+        assert all(node.name and node.rate_per_s >= 0 for node in place.nodes())
+
     def test_every_trial_comes_back_once(self, executor: Executor) -> None:
         """And with the specification that was submitted."""
         specs = [self._spec(number) for number in range(6)]
@@ -76,6 +86,8 @@ class ExecutorContract:
         assert [found[spec.number].spec for spec in specs] == specs
         assert {result.outcome for result in found.values()} == {Outcome.SURVIVED}
         assert list(executor.completed(0.0)) == []
+        if offers(executor, HasNodes):
+            self._see_nodes(executor, executor, len(specs))
 
     def test_a_failure_costs_its_own_trial_only(self, executor: Executor) -> None:
         """Good trials between an exception, an exit, a segmentation fault and a hang are what they would be alone."""

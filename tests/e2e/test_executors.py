@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 
 import pytest
@@ -63,6 +64,11 @@ class Everywhere(Logged):
     def __init__(self, settings, *, parallel, recycle_after):
         super().__init__(settings, parallel=parallel or 2, recycle_after=recycle_after, argument=f"asked {parallel}")
 
+    def nodes(self):
+        from crashhunt.executors import NodeFigures
+
+        return [NodeFigures("there", self.capacity, 3, 1.5)]
+
 
 class Broken:
     def __init__(self, settings, *, parallel, recycle_after):
@@ -121,7 +127,11 @@ def test_it_may_know_better_than_this_machine_what_0_stands_for(mine):
     mine.crashhunt(*WORDS[:2], "0", *WORDS[3:], "--executor", "mine:Everywhere")
     assert calls(mine)[0] == "made 2 1000 asked 0"
     assert tomllib.loads((mine.folder / "h" / "hunt.toml").read_text())["run"]["parallel"] == 0
+    (state,) = mine.crashhunt("status", "h", "--json").json["hunts"]
+    assert state["nodes"] == [{"name": "there", "parallel": 2, "trials": 3, "rate_per_s": 1.5}]
+    assert re.search(r"^ +there \(2 at a time\) +3 +1\.5 *$", mine.crashhunt("status", "h").out, re.MULTILINE)
     mine.crashhunt("run", "g", "0", *WORDS[3:], "--executor", "mine:Logged")
+    assert "nodes" not in mine.crashhunt("status", "g", "--json").json["hunts"][0]
     assert calls(mine)[0] == f"made {min(4, len(os.sched_getaffinity(0)))} 1000 "
 
 

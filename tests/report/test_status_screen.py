@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import pty
 import subprocess
+from dataclasses import replace
 
 import pytest
 from conftest import CRASHHUNT
 from rich.console import Console
 
+from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
@@ -55,6 +57,27 @@ def test_where_not_all_fit_it_says_how_many_more():
     assert len(lines) < 12
     assert "and 53 more" in lines[-1]
     assert lines[4].startswith("nearest miss: trial 123, 0.42 s")
+
+
+def test_nodes_are_on_the_screen_and_in_the_line():
+    nodes = tuple(NodeFigures(f"n{number}", 4, 10 * number, 1.25) for number in range(9))
+    for shown, expected in (
+        (nodes[:2], ["node n0   4 at a time   0 trials   1.2/s", "node n1   4 at a time   10 trials   1.2/s"]),
+        (nodes, ["node n0   4 at a time   0 trials   1.2/s", "and 8 more nodes"]),
+        ((), ["no node takes part now; the hunt waits"]),
+    ):
+        console = Console(width=60, height=12, force_terminal=True, color_system=None)
+        with console.capture() as captured:
+            console.print(Watcher(console, TITLE)._screen(replace(status(2), nodes=shown)))
+        lines = [line.rstrip() for line in captured.get().splitlines()]
+        assert len(lines) < 12
+        assert [line for line in lines if "node" in line] == expected or len(shown) == 9
+        assert expected[-1] in lines or len(shown) == 9
+    plain = Console(width=200, force_terminal=False)
+    for shown, expected in ((nodes, "left; nodes that take part: 9"), ((), "left; no node takes part now")):
+        with plain.capture() as captured:
+            Watcher(plain, TITLE)(replace(status(2), nodes=shown))
+        assert captured.get().rstrip().endswith(expected)
 
 
 def on_a_terminal(folder, *words: str) -> tuple[int, str]:

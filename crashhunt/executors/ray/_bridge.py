@@ -207,12 +207,14 @@ class Bridge:
         """Pass on what has happened on a node."""
         if news.map:
             self._maps[node.id] = news.map
-        for ended in news.ended:
-            if self._roster.ended(node, ended.ticket):
-                self._losses.pop(node.id, None)
-                if ended.files:
-                    self._keep(node, ended)
-                self._control.sendall(ended.line)
+        found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
+        if found:
+            self._losses.pop(node.id, None)
+            self._tell_figures(now=self._roster.idle)  # before the last result, after which nobody listens
+        for ended in found:
+            if ended.files:
+                self._keep(node, ended)
+            self._control.sendall(ended.line)
         self._hand_out()
         for note in news.notes:
             self._say(note=note)
@@ -264,7 +266,7 @@ class Bridge:
         self._looked = 0.0
         self._say(note=f"node {node.name} takes no part: {why}", capacity=self._roster.capacity, node=node.id, where={})
 
-    def _tell_figures(self) -> None:
-        if time.monotonic() - self._told > _LOOK_EVERY_S:
+    def _tell_figures(self, *, now: bool = False) -> None:
+        if now or time.monotonic() - self._told > _LOOK_EVERY_S:
             self._told = time.monotonic()
             self._say(nodes=[node.figures() for node in self._roster.nodes.values() if node.ready])

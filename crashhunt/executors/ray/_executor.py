@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, ClassVar
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.executors._notes import Notes
+from crashhunt.executors._protocol import NodeFigures
 from crashhunt.executors.ray._address import answers, cluster_of, require_ray
 from crashhunt.executors.ray._parcel import Parcel
 from crashhunt.executors.ray._site import code_digest
@@ -125,6 +126,10 @@ class RayExecutor:
         running = {spec.number for spec in self._open.values()}
         found = [pair for headers in self._where.values() for pair in headers.items()]
         return {number: header for number, header in found if number in running}
+
+    def nodes(self) -> list[NodeFigures]:
+        """Return the nodes that take part now."""
+        return [NodeFigures(**figures) for figures in self._nodes]
 
     def notes(self) -> list[str]:
         """Return what people should be told that has not been returned before."""
@@ -234,6 +239,7 @@ class RayExecutor:
         self._end()
         self._slots, self._lost_at = 0, time.monotonic()
         self._where.clear()
+        self._nodes = []
         self._losses += 1
         if not self._ever_up or (not self._address and self._losses >= _LOSSES):
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()

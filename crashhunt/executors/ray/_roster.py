@@ -91,6 +91,11 @@ class Roster:
         """How many trials run at a time, on nodes that are ready."""
         return sum(node.slots for node in self.nodes.values() if node.ready)
 
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self.waiting and not any(node.running for node in self.nodes.values())
+
     def assign(self) -> dict[Node, list[Trial]]:
         """Give trials that wait to nodes, in their order, each to the one that has least to do; return who got what."""
         given: dict[Node, list[Trial]] = {}
