@@ -54,6 +54,9 @@ class Kinematics:
 
     Args:
         setup: rows, columns, normalisation.
+
+    Attributes:
+        hidden: who does not see whom, though it is there; by their ids.
     """
 
     def __init__(self, setup: ObservationSetup) -> None:
@@ -68,6 +71,7 @@ class Kinematics:
         )
         self._pack = struct.Struct(f"<{setup.vehicles * len(self.features)}f").pack
         self._usual = self.features == _USUAL and not setup.normalize  # spares every row a choice
+        self.hidden: set[tuple[str, str]] = set()
         self._blank = (0.0,) * len(self.features)
 
     @property
@@ -113,6 +117,9 @@ class Kinematics:
         nearest = scene.neighbors(row)
         if scene.heights:
             nearest = [(squared, other) for squared, other in nearest if on_one_level(scene, row, other)]
+        if self.hidden:
+            own_id = actors[row].id
+            nearest = [found for found in nearest if (own_id, actors[found[1]].id) not in self.hidden]
         nearest = nearest[: self._others]
         for _, other in nearest:
             heading = headings[other]

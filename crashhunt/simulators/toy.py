@@ -18,6 +18,7 @@ from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators._unseen import Unseen
 from crashhunt.world import Actor, Contact, Lane, Roster, Scene
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class ToySimulator:
         self._v = dict.fromkeys(names, float(self._argument("leader_speed", 10.0)))
         self._start = dict(self._x)
         self._touched: set[str] = set()
+        self._kinematics.hidden.clear()
         self._disturbed: dict[str, float] = {}  # who errs, and the speed that it brakes to in the next step, in m/s
         self._enlist()
         self._look(())
@@ -125,7 +127,7 @@ class ToySimulator:
             return FullBraking(META_ACTIONS.index("SLOWER"), "by answering SLOWER in every step")
         return FullBraking((0.0, 0), "all that it can do", _BRAKING)
 
-    disturbing_kinds = ("brake", "stop")
+    disturbing_kinds = ("brake", "stop", "unseen")
 
     def whom(self, disturbance: Disturbance) -> str:
         """Return the leader where it is next ahead; everybody else is an agent."""
@@ -133,7 +135,9 @@ class ToySimulator:
         return _LEADER if disturbance.who == "ahead" and ahead == [_LEADER] else ""
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing:
-        """Brake, as hard as vehicles can at most."""
+        """Brake, as hard as vehicles can at most, or be unseen."""
+        if disturbance.what == "unseen":
+            return Unseen(self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
     def brake(self, vehicle: str, deceleration: float) -> None:

@@ -189,6 +189,19 @@ def test_while_no_action_comes_no_lane_is_changed_and_nothing_is_pressed_again(r
         assert seen == expected
 
 
+def test_a_vehicle_that_is_not_seen_is_there_all_the_same(run):
+    _, without = run(steps=30)
+    unseen = planned(11, "unseen", "ahead", 1.0, 1.0)
+    result, recording = run(unseen, steps=30)
+    shown, true = recording.observations("ego"), without.observations("ego")
+    hidden = true.copy()
+    hidden[11:21, 1:] = 0.0  # what it sees after the steps in which it does not
+    assert (shown == hidden).all()
+    assert speeds(recording) == speeds(without)
+    assert result.disturbances[0].words == "ego does not see leader for 1 s"
+    assert (run(steps=30)[1].observations("ego") == true).all()
+
+
 def test_what_fails_in_the_step_that_is_disturbed_is_disturbed(run):
     agent = Counts()
     agent.fail_at = 6

@@ -211,7 +211,24 @@ def test_an_agent_that_has_left_has_nobody_around_it(drive):
     assert episode.simulator.whom(planned(1, "brake")) == ""
 
 
-RATES = {"brake": 0.6, "stop": 0.1, "dawdle": 0.2, "speed": 0.4, "cut_in": 0.6, "ignore_priority": 0.3}
+def test_who_is_not_seen_is_left_out_of_the_observation_and_nothing_else_changes(drive):
+    seen = []
+    for disturbances in ((), (planned(3, "unseen", "behind", 1.0, 1.0),)):
+        episode, watch = drive(*disturbances)
+        shown = []
+        for _ in range(16):
+            shown.append(episode.observations["ego"].copy())
+            episode.step()
+        seen.append((shown, watch.speeds("lead"), watch.speeds("follow")))
+        assert [one.vehicle for one in watch.told] == ["follow"] * len(disturbances)
+    (plain, *others), (hidden, *same) = seen
+    assert others == same
+    counts = [int(observation[:, 0].sum()) for observation in hidden]
+    assert counts == [3] * 3 + [2] * 10 + [3] * 3
+    assert all((a == b).all() for a, b in zip(plain[:3] + plain[13:], hidden[:3] + hidden[13:], strict=True))
+
+
+RATES = {"unseen": 0.3, "brake": 0.6, "stop": 0.1, "dawdle": 0.2, "speed": 0.4, "cut_in": 0.6, "ignore_priority": 0.3}
 
 
 @pytest.mark.parametrize("name", ["merge", "intersection"])

@@ -35,6 +35,7 @@ from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._standstill import Standstill
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
+from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
 
 if TYPE_CHECKING:
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Info, Observations, Options, StepResult
-    from crashhunt.trial import Value
+    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
+    from crashhunt.trial import Disturbance, Value
 
 __all__ = ["HighwaySimulator"]
 
@@ -88,6 +89,7 @@ class HighwaySimulator:
             raise ScenarioError(str(error), fix="see [highway] and the arguments", where=scenario.origin) from error
 
     told_events = BACKEND.told_events
+    disturbing_kinds = BACKEND.disturbances or ()
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Make the environment, and let everybody in."""
@@ -111,6 +113,7 @@ class HighwaySimulator:
         self._driven = dict.fromkeys(self.agents, 0.0)
         self._places = {agent: vehicle.position.tolist() for agent, vehicle in self._controlled.items()}
         self._on_road = {agent: bool(vehicle.on_road) for agent, vehicle in self._controlled.items()}
+        self._disturbances = HighwayDisturbances(env.road, self._controlled.values())
         self._watch()
         self._standstill = Standstill(self.step_length_s, self._scenario.events)
         self._wrong: set[str] = set()
@@ -172,6 +175,16 @@ class HighwaySimulator:
         if isinstance(kind, DiscreteMetaAction) and "SLOWER" in kind.actions_indexes:
             return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
         return None
+
+    def whom(self, disturbance: Disturbance) -> str:
+        """Return who is at a place around an agent, along the lanes."""
+        found = self._disturbances.at(self._controlled[disturbance.agent], disturbance.who)
+        return "" if found is None else self._actor(found).id
+
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+        """Overrule a vehicle until its disturbance ends."""
+        thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
+        return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
     def tidy(self) -> None:
         """Undo what the environment has changed in classes."""
@@ -265,7 +278,10 @@ class HighwaySimulator:
         road = self._env.road
         advance = road.step
 
+        erring = self._disturbances
+
         def step(dt: float) -> None:
+            erring.before_moving(dt)
             advance(dt)
             for agent, vehicle in self._controlled.items():
                 if vehicle.crashed and agent not in self._crashed:

@@ -17,6 +17,7 @@ from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
+from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
@@ -119,6 +120,7 @@ class SumoSimulator:
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._steps = 0
         self._sight.reset()
+        self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         self._look()
         observations = {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
@@ -186,6 +188,8 @@ class SumoSimulator:
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
         """Command a vehicle until its disturbance ends."""
+        if disturbance.what == "unseen":
+            return Unseen(self._kinematics, disturbance.agent, vehicle)
         return self._disturbances.disturb(vehicle, disturbance)
 
     def close(self) -> None:

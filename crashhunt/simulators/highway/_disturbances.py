@@ -1,0 +1,172 @@
+"""Vehicles of highway-env that err: what they have decided is overruled in every sub-step, and then no more.
+
+That happens between deciding and moving, so that it makes no difference whether the accelerator decides for them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from highway_env.vehicle.behavior import IDMVehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from highway_env.road.road import Road
+
+    from crashhunt.simulators._protocol import Disturbing
+    from crashhunt.trial import Disturbance
+
+__all__ = ["HighwayDisturbances"]
+
+_IN_LANE_M, _BESIDE_M = 100.0, 50.0  # who is further away than that is not meant
+_GENTLY = 1.5  # m/s²; how a dawdler slows down
+
+
+class HighwayDisturbances:
+    """Finds who is meant in one episode, and overrules them.
+
+    Args:
+        road: of the episode.
+        controlled: the vehicles that are driven from outside, which are never meant.
+    """
+
+    def __init__(self, road: Road, controlled: Collection[Any]) -> None:
+        self._road = road
+        self._controlled = controlled
+        self._erring: list[_Errs] = []
+
+    def before_moving(self, dt: float) -> None:
+        """Overrule what erring vehicles have decided, in the sub-step that follows."""
+        for errs in self._erring:
+            if not errs.vehicle.crashed:
+                errs.overrule(dt)
+
+    def at(self, agent: Any, who: str) -> Any | None:
+        """Return the vehicle at a place around an agent, along its lane and those beside it; None where nobody is."""
+        side, _, along = who.rpartition(" ") if who in ("ahead", "behind") else who.partition(" ")
+        start, end, number = agent.lane_index
+        lane = (start, end, number + {"left": -1, "right": 1}.get(side, 0))
+        if not 0 <= lane[2] < len(self._road.network.graph[start][end]):
+            return None
+        near = []
+        for other in self._road.neighbour_vehicles(agent, lane):
+            if not isinstance(other, IDMVehicle) or any(other is vehicle for vehicle in self._controlled):
+                continue
+            distance = float(agent.lane_distance_to(other))
+            beside = bool(side) and abs(distance) < (agent.LENGTH + other.LENGTH) / 2
+            place = "" if beside else "ahead" if distance > 0 else "behind"
+            if place == along and abs(distance) <= (_BESIDE_M if side else _IN_LANE_M):
+                near.append((abs(distance), other))
+        return min(near, key=lambda found: found[0])[1] if near else None
+
+    def disturb(self, vehicle: Any, disturbance: Disturbance, agent: Any) -> Disturbing | None:
+        """Overrule a vehicle until its disturbance ends; None where it cannot do that."""
+        strong = disturbance.how_strong
+        hardest = min(strong, float(vehicle.ACC_MAX))
+        errs: _Errs
+        if disturbance.what in ("brake", "stop"):
+            errs = _Slows(vehicle, self._let_go, hardest, hardest)
+        elif disturbance.what == "dawdle":
+            errs = _Slows(vehicle, self._let_go, strong, _GENTLY, target=(1.0 - strong) * float(vehicle.speed))
+        elif disturbance.what == "speed":
+            errs = _Speeds(vehicle, self._let_go, strong)
+        else:
+            same_road = vehicle.lane_index[:2] == agent.lane_index[:2]
+            if not same_road or vehicle.lane_index != vehicle.target_lane_index:
+                return None  # as it is on another road, or changes lanes already
+            errs = _CutsIn(vehicle, self._let_go, hardest, agent.lane_index)
+        self._erring.append(errs)
+        return errs
+
+    def _let_go(self, errs: _Errs) -> None:
+        self._erring.remove(errs)
+
+
+class _Errs:
+    """A vehicle that errs, until it is let go."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+        self.vehicle = vehicle
+        self.how_strong = how_strong
+        self._let_go = let_go
+
+    def overrule(self, dt: float) -> None:
+        """Change what it has decided for a sub-step of so many s."""
+
+    def keep(self) -> None:
+        """Go on; it is overruled in every sub-step anyway."""
+
+    def end(self) -> None:
+        """Let it drive by itself again."""
+        self._let_go(self)
+
+    def _brake(self, deceleration: float, dt: float, down_to: float = 0.0) -> None:
+        """Brake at least so hard, and down to a speed at most."""
+        action, speed = self.vehicle.action, float(self.vehicle.speed)
+        wanted = max(-deceleration, min(0.0, (down_to - speed) / dt))
+        if speed <= down_to:
+            wanted = (down_to - speed) / dt if down_to > 0 else 0.0
+        action["acceleration"] = min(float(action["acceleration"]), wanted)
+
+
+class _Slows(_Errs):
+    """Brakes down to a speed, and keeps to it."""
+
+    def __init__(
+        self,
+        vehicle: Any,
+        let_go: Callable[[_Errs], None],
+        how_strong: float,
+        deceleration: float,
+        *,
+        target: float = 0.0,
+    ) -> None:
+        super().__init__(vehicle, let_go, how_strong)
+        self._deceleration = deceleration
+        self._target = target
+
+    def overrule(self, dt: float) -> None:
+        self._brake(self._deceleration, dt, self._target)
+
+
+class _Speeds(_Errs):
+    """Wants to drive faster than before, and keeps its distance as before."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], share: float) -> None:
+        super().__init__(vehicle, let_go, share)
+        self._before = vehicle.target_speed
+        vehicle.target_speed = (1.0 + share) * self._before
+
+    def end(self) -> None:
+        self.vehicle.target_speed = self._before
+        super().end()
+
+
+class _CutsIn(_Errs):
+    """Changes lanes as soon as nobody is in the very place, and may brake in the new one."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], deceleration: float, lane: Any) -> None:
+        super().__init__(vehicle, let_go, deceleration)
+        self._lane = lane
+        self._before = vehicle.enable_lane_change
+        vehicle.enable_lane_change = False  # its own mind would have it turn back
+        self._begin()
+
+    def overrule(self, dt: float) -> None:
+        if self.vehicle.target_lane_index != self._lane:
+            self._begin()
+        if self.how_strong and self.vehicle.lane_index == self._lane:
+            self._brake(self.how_strong, dt)
+
+    def _begin(self) -> None:
+        vehicle = self.vehicle
+        for other in vehicle.road.neighbour_vehicles(vehicle, self._lane):
+            room = (vehicle.LENGTH + other.LENGTH) / 2 if other is not None else 0.0
+            if other is not None and abs(vehicle.lane_distance_to(other)) <= room:
+                return
+        vehicle.target_lane_index = self._lane
+
+    def end(self) -> None:
+        self.vehicle.enable_lane_change = self._before
+        super().end()

@@ -1,0 +1,170 @@
+"""Vehicles of highway-env that err: who is meant, what they do, and that the accelerator makes no difference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from highway_env.vehicle.behavior import IDMVehicle
+
+from crashhunt.disturbances import disturber_of
+from crashhunt.episode import Episode, Observer
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.scenario.backends.highway import HighwaySetup
+from crashhunt.simulators.highway import HighwaySimulator
+from crashhunt.trial import Disturbance, TrialSpec
+
+CONFIG = {"simulation_frequency": 5, "policy_frequency": 5, "vehicles_count": 12, "lanes_count": 3, "duration": 999}
+RATES = {"brake": 1.0, "stop": 0.2, "dawdle": 0.5, "speed": 1.0, "cut_in": 1.0}
+
+
+class Idle(Observer):
+    """Goes on as it is, and keeps what takes place."""
+
+    def __init__(self):
+        self.scenes, self.told = [], []
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return 1
+
+    def scene(self, step, scene, rewards):
+        self.scenes.append(scene.data.tobytes())
+
+    def disturbance(self, disturbance):
+        self.told.append(disturbance)
+
+
+def scenario(*, accelerate=True, **config):
+    setup = HighwaySetup(id="highway-fast-v0", config={**CONFIG, **config}, accelerate=accelerate)
+    return Scenario(simulator="highway", agents={"ego": AgentSetup()}, tables={"highway": setup})
+
+
+@pytest.fixture
+def begin():
+    made = []
+
+    def start(*disturbances, steps=100, seed=1, accelerate=True, **config):
+        simulator, idle = HighwaySimulator(scenario(accelerate=accelerate, **config), None), Idle()
+        spec = TrialSpec(0, seed, {}, {}, steps, disturbances=disturbances)
+        episode = Episode(spec, simulator=simulator, make_agent=lambda *_: idle, observers=(idle,))
+        made.append(episode)
+        episode.start()
+        assert episode.result is None, episode.result.failure
+        return episode, idle
+
+    yield start
+    for episode in made:
+        episode.close()
+        episode.simulator.close()
+
+
+def place(episode, lane, ahead_m, speed=20.0):
+    """Put a vehicle somewhere around the agent, alone with it on the road."""
+    road = episode.simulator._env.road
+    agent = episode.simulator._env.vehicle
+    agent.position[:] = (100.0, 4.0)
+    agent.target_lane_index = agent.lane_index = ("0", "1", 1)
+    agent.speed = agent.target_speed = 20.0
+    other = IDMVehicle(road, np.array([100.0 + ahead_m, 4.0 * lane]), 0.0, speed, target_speed=speed, timer=0.0)
+    road.vehicles[:] = [agent, other]
+    episode.simulator._look(())
+    return other
+
+
+def planned(step, what, who="ahead", strong=3.0, long=1.0):
+    return Disturbance(step, who, what, strong, long, "ego")
+
+
+def follow(episode, vehicle, steps):
+    speeds = [vehicle.speed]
+    for _ in range(steps):
+        episode.step()
+        speeds.append(vehicle.speed)
+    return speeds
+
+
+def test_whoever_is_ahead_brakes_and_drives_on_by_itself(begin):
+    episode, idle = begin(planned(3, "brake"))
+    other = place(episode, 1, 40.0)
+    speeds = follow(episode, other, 12)
+    assert np.allclose(np.diff(speeds)[2:7] / 0.2, -3.0)
+    assert speeds[-1] > speeds[7]
+    (told,) = idle.told
+    assert told == replace(planned(3, "brake"), vehicle=told.vehicle)
+    assert told.vehicle.startswith("vehicle.")
+
+
+def test_nobody_brakes_harder_than_the_model_or_drives_backwards(begin):
+    episode, idle = begin(planned(1, "stop", strong=20.0, long=5.0))
+    other = place(episode, 1, 99.0, speed=10.0)
+    speeds = follow(episode, other, 18)
+    assert idle.told[0].how_strong == other.ACC_MAX == 6.0
+    assert min(np.diff(speeds)) / 0.2 == pytest.approx(-6.0)
+    assert speeds[-5:] == [0.0] * 5
+
+
+def test_a_dawdler_and_a_speeder(begin):
+    episode, _ = begin(planned(1, "dawdle", strong=0.25, long=8.0))
+    other = place(episode, 1, 60.0)
+    assert follow(episode, other, 35)[-1] == pytest.approx(15.0, abs=0.2)
+    episode, _ = begin(planned(1, "speed", "behind", 0.5, 2.0))
+    other = place(episode, 1, -60.0)
+    follow(episode, other, 5)
+    assert other.target_speed == 30.0
+    follow(episode, other, 7)
+    assert other.target_speed == 20.0
+
+
+@pytest.mark.parametrize(
+    ("lane", "ahead", "who"),
+    [(0, 20, "left ahead"), (0, 2, "left"), (0, -20, "left behind"), (2, 20, "right ahead"), (1, -9, "behind")],
+)
+def test_places_are_along_the_lanes(begin, lane, ahead, who):
+    episode, _ = begin()
+    place(episode, lane, float(ahead))
+    found = {cell for cell in ("left ahead", "left", "left behind", "ahead", "behind", "right ahead", "right")
+             if episode.simulator.whom(planned(1, "brake", cell))}  # fmt: skip
+    assert found == {who}
+
+
+def test_somebody_cuts_in_and_nobody_into_a_side(begin):
+    episode, idle = begin(planned(2, "cut_in", "left ahead", 2.0, 3.0))
+    other = place(episode, 0, 15.0)
+    follow(episode, other, 16)
+    assert other.lane_index[2] == 1
+    assert idle.told[0].how_strong == 2.0
+    follow(episode, other, 2)
+    assert other.enable_lane_change
+    episode, idle = begin(planned(2, "cut_in", "left", 0.0, 1.0))
+    other = place(episode, 0, 1.0)
+    follow(episode, other, 6)
+    assert idle.told[0].vehicle
+    assert other.lane_index[2] == 0
+
+
+def test_the_same_with_and_without_the_accelerator(begin):
+    drawn = disturber_of(RATES, agents=("ego",), step_length_s=0.2).draw(3, 40)
+    found = []
+    for accelerate in (True, False):
+        episode, idle = begin(*drawn, steps=40, seed=3, accelerate=accelerate)
+        while episode.result is None:
+            episode.step()
+        found.append((idle.scenes, idle.told, episode.result.disturbances))
+    assert found[0] == found[1]
+    assert len(found[0][2]) > 2
+
+
+def test_a_hunt_with_disturbances(shell):
+    words = ("--scenario", "highway", "--disturb", "brake=0.5,cut_in=0.5", "--seed", "1", "--no-snapshot", "--json")
+    done = shell.crashhunt("run", "h", "1", "2", "20", *words)
+    assert done.json["trials_run"] == 2
+    assert (
+        "cannot do 'ignore_priority'"
+        in shell.crashhunt(
+            "run", "h2", "1", "2", "20", "--scenario", "highway", "--disturb", "ignore_priority=1", expect=2
+        ).err
+    )
