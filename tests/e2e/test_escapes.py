@@ -22,7 +22,7 @@ def told(folder: Path) -> Counter[str]:
 
 
 def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_told(toy):
-    toy.crashhunt("run", "h", "2", "6", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
+    toy.crashhunt("run", "h", "2", "4", "300", "--scenario", "toy", "--arg", "speed=12:14", *KEEP)
     assert told(toy.folder / "h")["wrong"] == 0
     bundles = list_bundles(toy.folder / "h")
     assert sum(bundle.result.escape is not None for bundle in bundles) >= 3
@@ -33,7 +33,7 @@ def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_told(toy):
 
 
 def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
-    shell.crashhunt("run", "h", "2", "4", "600", "--arg", "speed=20:25", *KEEP)
+    shell.crashhunt("run", "h", "2", "3", "600", "--arg", "speed=20:25", *KEEP)
     told_of = told(shell.folder / "h")
     assert told_of["wrong"] == 0
     assert told_of["right"] >= 2
@@ -51,7 +51,7 @@ def test_long_steps(shell, length):
     assert "step_length_s = 0.1" in text
     (folder / "scenario.toml").write_text(text.replace("step_length_s = 0.1", f"step_length_s = {length}"))
     words = ("--arg", "speed=15:25", "--set", "vehicles=35", *KEEP)
-    shell.crashhunt("run", "h", "2", "3", "200", "--scenario", "slow", *words)
+    shell.crashhunt("run", "h", "2", "2", "200", "--scenario", "slow", *words)
     assert told(shell.folder / "h")["wrong"] == 0
 
 

@@ -119,11 +119,17 @@ def test_several_crashes_in_one_film(toy):
     assert "names several" in done.err
 
 
-@pytest.mark.parametrize("agent", ["Segfaults", "HangsHoldingTheInterpreter"])
-def test_a_crash_that_kills_the_process_is_filmed_up_to_it(shell, agent):
-    words = ("--agent", f"faulty:{agent}", "--arg", "at=15", "--set", "vehicles=10", "--seed", "1", "--timeout", "2")
-    shell.crashhunt("run", "h", "1", "1", "40", *words)
-    done = shell.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json").json
+@pytest.mark.parametrize(
+    ("agent", "where"),
+    [
+        ("Segfaults", ("--set", "vehicles=10")),
+        ("HangsHoldingTheInterpreter", ("--scenario", "toy", "--timeout", "1")),
+    ],
+)
+def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
+    words = ("--agent", f"faulty:{agent}", "--arg", "at=15", "--seed", "1", *where)
+    toy.crashhunt("run", "h", "1", "1", "40", *words)
+    done = toy.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json").json
     assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 14)
     assert done["written"] == {"f": 14 + 1 + 10}
 

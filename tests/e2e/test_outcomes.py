@@ -38,7 +38,7 @@ ON_SUMO = ("Raises", "Segfaults", "HangsHoldingTheInterpreter")
 @pytest.mark.parametrize(("agent", "outcome", "kind", "message"), FAULTS, ids=[fault[0] for fault in FAULTS])
 def test_a_software_fault_is_found_saved_and_replayed(toy, agent, outcome, kind, message):
     where = QUIET if agent in ON_SUMO else TOY
-    limit = ("--timeout", "2") if outcome == "hang" else ()
+    limit = ("--timeout", "2" if agent in ON_SUMO else "1") if outcome == "hang" else ()
     words = ("run", "h", "2", "8", "200", "--agent", f"faulty:{agent}", *where, *limit, "--json")
     report = toy.crashhunt(*words).json
     assert report["stopped_because"] == "crash"

@@ -16,11 +16,11 @@ from crashhunt.scenario import shipped_scenarios
 
 SEEDS = {  # with which a crash comes soon
     "highway": 3,
-    "highway-policy": 8,
-    "intersection": 1,
+    "highway-policy": 5,
+    "intersection": 4,
     "intersection-highway-env": 4,
     "intersection-two-agents": 4,
-    "loop": 6,
+    "loop": 1,
     "merge": 7,
     "motorway": 6,
     "roundabout": 2,

@@ -55,7 +55,7 @@ def left_in(folder: Path) -> list[int]:
 @pytest.mark.parametrize("everybody", [True, False], ids=["every process", "the group"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
-    words = ("run", "h", "2", "12", "40", *FINE, *SLOW, "--json")
+    words = ("run", "h", "2", "8", "30", *FINE, *SLOW, "--json")
     process = toy.start(*words, start_new_session=True)
     wait_for(lambda: len(rows(toy.folder / "h")) >= 2)
     if everybody:  # as systemd and SLURM do; the workers come first
@@ -70,12 +70,12 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
     assert json.loads(out)["stopped_because"] == "interrupted"
     assert set(rows(toy.folder / "h").values()) == {"survived"}
     wait_for(lambda: not left_in(toy.folder))
-    assert toy.crashhunt(*words).json["outcomes"] == {"survived": 12}
+    assert toy.crashhunt(*words).json["outcomes"] == {"survived": 8}
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
-    words = ("run", "h", "1", "2", "60", *FINE, *SLOW, "--json")
+    words = ("run", "h", "1", "2", "40", *FINE, *SLOW, "--json")
     process = toy.start(*words)
     box = toy.folder / "h" / ".scratch" / "trial-000000" / "blackbox.bin"
     wait_for(box.exists)
@@ -117,7 +117,7 @@ def test_a_killed_replay_leaves_no_process(toy):
 
 def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     words = ("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Hangs", "--arg", "at=5")
-    process = toy.start(*words, "--timeout", "5", "--json")
+    process = toy.start(*words, "--timeout", "3", "--json")
     wait_for(lambda: list((toy.folder / "h" / "crashes").glob("*-hang")))
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=90)
