@@ -10,7 +10,7 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.tolerance import ESSENTIAL, not_understood, required_in
+from crashhunt.base.tolerance import ESSENTIAL, merged, not_understood, required_in
 from crashhunt.base.version import __version__
 from crashhunt.scenario import as_in_file
 from crashhunt.trial import Outcome
@@ -96,11 +96,13 @@ class WorkerSettings:
         """Return plain dicts, strings and numbers."""
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
-        scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file)))
+        scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file, added={})))
         requires = required_in(self)
         data: SettingsData = {
             "schema": _SCHEMA,
-            "scenario": {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)},
+            "scenario": merged(
+                {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)}, self.scenario.added
+            ),
             "oracles": self.oracles,
             "crash_on": [str(outcome) for outcome in self.crash_on],
             "scratch": str(self.scratch),

@@ -64,4 +64,4 @@ def as_plain_data(scenario: Scenario) -> dict[str, object]:
     for later in ("events", "disturbances"):  # which an earlier crashhunt does not know
         if not data[later]:
             del data[later]
-    return {key: value for key, value in data.items() if key not in ("folder", "file", "notes")}
+    return {key: value for key, value in data.items() if key not in ("folder", "file", "notes", "added")}

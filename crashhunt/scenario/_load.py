@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["endings", "load_scenario", "scenario_from_dict"]
 
-_INTERNAL = ("folder", "file", "notes")  # of a Scenario, and not of a file
+_INTERNAL = ("folder", "file", "notes", "added")  # of a Scenario, and not of a file
 
 
 def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Scenario:
@@ -65,13 +66,15 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
         data: what it says.
         where: the file, for the error.
         folder: where its files are.
-        tolerant: crashhunt itself has written it, perhaps another version: keys that are not known are left out.
+        tolerant: crashhunt itself has written it, perhaps another version: keys that are not known are kept
+            as ``added``.
 
     Raises:
         ScenarioError: with the key, its value and the fix.
     """
+    added: dict[str, object] = {}
     if tolerant:
-        data = _known(data)
+        data, added = _known(data)
     known = {item.name for item in fields(Scenario)} - {"tables"}
     asked = {name: _table_kind(name) for name in data if name not in known}
     kinds = {name: kind for name, kind in asked.items() if kind is not None}
@@ -98,16 +101,23 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
     observation = scenario.observation
     if observation is None and not scenario.backend.shows_itself:
         observation = ObservationSetup()  # said in full, so that a snapshot says it too
-    return replace(scenario, tables=tables, folder=folder, name=scenario.name or folder.name, observation=observation)
+    name = scenario.name or folder.name
+    return replace(scenario, tables=tables, folder=folder, name=name, observation=observation, added=added)
 
 
-def _known(data: Plain) -> dict[str, object]:
+def _known(data: Plain) -> tuple[dict[str, object], dict[str, object]]:
+    """What this version has fields for, and what a later one has added."""
     tables = {name: kind for name in data if (kind := _table_kind(name)) is not None}
     rest = {name: value for name, value in data.items() if name not in tables}
-    known: dict[str, object] = known_part(Scenario, rest)[0]
+    known: dict[str, object]
+    added: dict[str, object]
+    known, added = known_part(Scenario, rest)
     own = data.get("simulator")  # of which the table is no addition of a later version, known or not
-    known |= {name: value for name, value in rest.items() if name == own}
-    return {**known, **{name: known_part(kind, data[name])[0] for name, kind in tables.items()}}
+    known |= {name: added.pop(name) for name in list(added) if name == own}
+    for name, kind in tables.items():
+        known[name], more = known_part(kind, data[name])
+        added |= {name: more} if more else {}
+    return known, json.loads(json.dumps(added, default=str))  # it crosses to a worker, which JSON's types do alone
 
 
 def _table_kind(name: str) -> type | None:

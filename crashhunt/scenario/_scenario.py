@@ -47,6 +47,7 @@ class Scenario:
         folder: where its files are; not part of the file.
         file: what was read, relative to the folder; not part of it, and not of what crosses to a worker.
         notes: what was decided on the user's behalf, for people; not part of the file.
+        added: what a later version has written into the file, for a worker of that version; nothing here reads it.
     """
 
     title: str = ""
@@ -65,6 +66,7 @@ class Scenario:
     folder: Path = Path()
     file: str = layout.SCENARIO
     notes: tuple[str, ...] = ()
+    added: dict[str, object] = field(default_factory=dict, compare=False)
 
     @property
     def origin(self) -> str:

@@ -153,6 +153,9 @@ def test_a_snapshot_of_a_later_version_is_read(hunt, data):
     place.write_text(tomli_w.dumps(said))
     kept = dataclasses.replace(Snapshot(snapshot.path).scenario(), folder=before.scenario().folder)
     assert kept == before.scenario()
+    crossed = dataclasses.replace(worker(hunt), scenario=kept).to_json()["scenario"]
+    assert later_keys(crossed) == later_keys(said)  # for the worker of the version that has written them
+    assert crossed["agents"]["ego"]["later"] == said["agents"]["ego"]["later"]
     with pytest.raises(ScenarioError, match="unknown key"):  # which somebody has written
         load_scenario(place)
     place.write_text((original / "scenario" / "scenario.toml").read_text())
