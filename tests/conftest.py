@@ -136,6 +136,20 @@ def _commands_end() -> Iterator[None]:
         _commands.cache_clear()
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes longest, in every worker of pytest-xdist: else one of them is alone with it in the end."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    long, others = ([item for item in items if (item.get_closest_marker("long") is None) == short] for short in (0, 1))
+    each = len(items) // workers  # which is how they are handed out at first
+    items.clear()
+    for worker in range(workers):
+        items += long[worker::workers]
+        rest = each * (worker + 1) - len(items) if worker + 1 < workers else len(others)
+        items += others[: max(rest, 0)]
+        del others[: max(rest, 0)]
+
+
 @pytest.fixture(autouse=True)
 def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test itself replays, end to end, starts as little as what its commands do."""

@@ -58,6 +58,7 @@ class Reader:
         return ["--seed", drawn[1], "--deterministic"]
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)  # half a minute of hunts, and more on a machine with something else to do
 @pytest.mark.parametrize("root", ROOTS)
 def test_every_command_does_what_it_says(root, shell):

@@ -27,6 +27,7 @@ SEEDS = {  # with which a crash comes soon
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", sorted(shipped_scenarios()))
 def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
     seed = str(SEEDS.get(scenario, 1))

@@ -120,6 +120,7 @@ def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
     assert "out/a-word/0: --arg speed: 'fast' is not a number" in " ".join(table.split())
 
 
+@pytest.mark.long
 def test_what_failed_runs_again_and_nothing_else(toy):
     written(toy, SUITE.replace("runs = 2\n", "") + BROKEN.partition('[[hunts]]\nid = "raises"')[0])
     toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)
@@ -139,6 +140,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
     assert toy.crashhunt("replay", "out/fast/0.replaced-0", "--json").json["verdict"] == "reproduced"
 
 
+@pytest.mark.long
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     written(toy, SLOW.replace("80", "60"))
     process = toy.start("suite", "run", "suite.toml", "out", "2")
@@ -171,6 +173,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
     assert "no request.json" in toy.crashhunt("logs", "out", "--errors-only").out
 
 
+@pytest.mark.long
 def test_two_at_once_do_not_disturb_each_other(toy):
     written(toy, SLOW.replace("80", "24"))
     first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
