@@ -5,8 +5,6 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing, suppress
-from multiprocessing import get_context
-from pathlib import Path
 
 import pytest
 from hypothesis import given, strategies as st
@@ -94,30 +92,37 @@ def test_an_empty_file_is_no_ledger_yet(tmp_path):
         assert ledger.outcomes() == {}
 
 
-def _read_when_there(folder, said):
-    said.put("ready")
-    wrong = []
-    for number in range(120):
-        path = folder / f"{number}.sqlite"
-        while not path.exists():
-            pass
-        try:
-            Ledger(path).close()
-        except HuntDirectoryError as error:
-            wrong.append(str(error))
-    said.put(wrong)
+READS_WHEN_THERE = """
+import sys, time
+from pathlib import Path
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import Ledger
+
+print("ready", flush=True)
+end = time.monotonic() + 60
+for number in range(80):
+    path = Path(sys.argv[1], f"{number}.sqlite")
+    while not path.exists():  # at once, without a pause
+        if time.monotonic() > end:
+            sys.exit("it never came")
+    try:
+        Ledger(path).close()
+    except HuntDirectoryError as error:
+        print(error)
+"""
 
 
 def test_whoever_sees_a_ledger_can_read_it(tmp_path):
-    context = get_context("spawn")  # forking a process with threads is asking for it
-    said = context.Queue()
-    reader = context.Process(target=_read_when_there, args=(tmp_path, said))
-    reader.start()
-    assert said.get(timeout=150) == "ready"
-    for number in range(120):
-        Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
-    assert said.get(timeout=150) == []
-    reader.join()
+    command = [sys.executable, "-c", READS_WHEN_THERE, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+        try:
+            assert reader.stdout.readline() == "ready\n"
+            for number in range(80):
+                Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
+            assert reader.communicate(timeout=90) == ("", None)
+        finally:
+            reader.kill()
+    assert reader.returncode == 0
 
 
 def test_damage_in_the_middle_is_told_whatever_is_read(tmp_path):
@@ -173,15 +178,14 @@ def test_facts_are_kept_and_none_removes_one(tmp_path_factory, facts):
 def test_what_a_killed_writer_recorded_is_there(tmp_path):
     path = tmp_path / "ledger.sqlite"
     script = (
-        "import sys, time; sys.path.insert(0, sys.argv[2]); from test_ledger import result\n"
-        "from pathlib import Path; from crashhunt.hunts import Ledger\n"
+        "import sys, time; from pathlib import Path\n"
+        "from crashhunt.hunts import Ledger; from crashhunt.trial import Outcome, TrialResult, TrialSpec\n"
         "ledger = Ledger(Path(sys.argv[1]), writable=True)\n"
-        "for number in range(100): ledger.record(result(number), snapshot='')\n"
+        "for number in range(100):\n"
+        "    ledger.record(TrialResult(TrialSpec(number, 1, {}, {}, max_steps=9), Outcome.SURVIVED), snapshot='')\n"
         "print('written', flush=True); time.sleep(60)\n"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", script, str(path), Path(__file__).parent], stdout=subprocess.PIPE
-    ) as process:
+    with subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"written\n"
         process.send_signal(signal.SIGKILL)
