@@ -59,7 +59,7 @@ anything = st.one_of(
 
 
 @pytest.mark.parametrize("name", FORMS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 @given(action=anything)
 def test_an_action_is_taken_as_it_is_or_refused(name, action):
     form = FORMS[name]

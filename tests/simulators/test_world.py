@@ -165,8 +165,8 @@ def track(edges):
 def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, step_s):
     traffic = (
         TRAIN
-        + vehicle("ego", "ina inb inc", kind="train", departPos="base", departSpeed="max")
-        + vehicle("other", "outa outb outc", kind="train", departPos="base", departSpeed="max")
+        + vehicle("ego", "outa outb outc", kind="train", departPos="base", departSpeed="max")
+        + vehicle("other", "ina inb inc", kind="train", departPos="base", departSpeed="max")
     )
     result, recording, _ = drive("rail", traffic, steps=round(28 / step_s), step_s=step_s)
     assert result.outcome is Outcome.SURVIVED
@@ -176,7 +176,7 @@ def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, st
     assert len(bent) > 10
     assert min(moment.gap_m for moment in Encounter(recording, "ego", "other").moments) == result.closest.gap_m
     middle = bent[len(bent) // 2]
-    for actor, edges in (("ego", ("ina", "inb", "inc")), ("other", ("outa", "outb", "outc"))):
+    for actor, edges in (("ego", ("outa", "outb", "outc")), ("other", ("ina", "inb", "inc"))):
         row = middle.roster.index[actor]
         spine = np.array(middle.spines[row])[:, :2]
         cloud = dense(recording, middle, actor, track(edges))
@@ -186,21 +186,12 @@ def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, st
     if step_s == 0.1:
         again = same_after_the_log(recording, tmp_path)
         assert again.scenes()[-1].spines == recording.scenes()[-1].spines
-
-
-def test_trains_without_their_bends_would_have_collided(drive):
-    traffic = (
-        TRAIN
-        + vehicle("ego", "outa outb outc", kind="train", departPos="base", departSpeed="max")
-        + vehicle("other", "ina inb inc", kind="train", departPos="base", departSpeed="max")
-    )
-    result, recording, _ = drive("rail", traffic, steps=280)
-    assert result.outcome is Outcome.SURVIVED
-    hits = 0
-    for scene in recording.scenes():
-        scene.spines = {}
-        hits += bool(Overlap().check(scene, ["ego"]))
-    assert hits > 20
+        # Without their bends they would have collided.
+        hits = 0
+        for scene in read_log(tmp_path / "log.mcap").scenes():
+            scene.spines = {}
+            hits += bool(Overlap().check(scene, ["ego"]))
+        assert hits > 20
 
 
 def test_an_articulated_bus_clips_who_stands_in_its_bend_and_nobody_beside_it(drive):
