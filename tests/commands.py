@@ -65,16 +65,24 @@ class Commands:
         )
 
     def run(
-        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], timeout_s: float
+        self,
+        words: Sequence[str],
+        folder: Path,
+        environment: Mapping[str, str],
+        timeout_s: float,
+        *,
+        terminal: int | None = None,
     ) -> tuple[int, str, str]:
         """Run a command to its end; return its exit code, or minus its signal, and what it has printed.
+
+        Its standard error is the terminal, where one is given, and then not returned.
 
         Raises:
             subprocess.TimeoutExpired: it took too long, and was killed.
         """
         request = json.dumps({"words": words, "folder": str(folder), "environment": dict(environment)}).encode()
         with self._lock, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-            socket.send_fds(self._control, [request], [out.fileno(), err.fileno()])
+            socket.send_fds(self._control, [request], [out.fileno(), terminal or err.fileno()])
             self._control.settimeout(None)
             pid = json.loads(self._control.recv(_MESSAGE))
             self._control.settimeout(timeout_s)

@@ -47,8 +47,9 @@ _ROOM = 4 << 30  # bytes; a session needs a tenth of it
 _write_to_memory()
 
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
+# The examples are others at every run, so that many runs see what few examples do not.
 hypothesis.settings.register_profile(
-    "crashhunt", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+    "crashhunt", max_examples=50, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("crashhunt")
 
@@ -78,12 +79,17 @@ class Shell:
         self.folder = folder
         self.environment = _usual_environment()
 
-    def crashhunt(self, *words: str, expect: int | None = 0) -> Done:
-        """Run a command to its end: in a fork of a process that has imported what it needs, where that is the same."""
+    def crashhunt(self, *words: str, expect: int | None = 0, terminal: int | None = None) -> Done:
+        """Run a command to its end: in a fork of a process that has imported what it needs, where that is the same.
+
+        Standard error goes to the terminal, where one is given by its descriptor.
+        """
         commands = _commands()
         if not commands.fits(self.environment):
+            assert terminal is None, "cannot be a fork"
             return self.process(*words, expect=expect)
-        return _ended(words, Done(*commands.run(words, self.folder, self.environment, _TIMEOUT_S)), expect)
+        done = Done(*commands.run(words, self.folder, self.environment, _TIMEOUT_S, terminal=terminal))
+        return _ended(words, done, expect)
 
     def process(self, *words: str, expect: int | None = 0) -> Done:
         """Run a command to its end as a shell does it, for tests of how it starts and ends."""

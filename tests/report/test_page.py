@@ -43,12 +43,12 @@ def browser(tmp_path_factory):
 
 def hunted(shell):
     words = ("--arg", "speed=20:25", "--seed", "1", "--keep-going")
-    shell.crashhunt("run", "<b>bold&", "2", "5", "800", *words)
+    shell.crashhunt("run", "<b>bold&", "2", "3", "800", *words)
 
 
 @pytest.fixture
 def hunt(shell, made_once):
-    """Five real crashes, in a directory whose name would be markup."""
+    """Three real crashes, in a directory whose name would be markup."""
     return made_once(hunted, shell)
 
 
@@ -77,7 +77,7 @@ def test_the_hunt_and_its_crashes_are_shown(hunt, browser):
     opened(browser, hunt.folder / done["file"])
     bundles = list_bundles(hunt.folder / "<b>bold&")
     assert text(browser, "title") == "<b>bold&"  # as text, not as markup
-    assert text(browser, "tiles").split("\n")[:4] == ["5 of 5", "trials", str(len(bundles)), "crashes"]
+    assert text(browser, "tiles").split("\n")[:4] == ["3 of 3", "trials", str(len(bundles)), "crashes"]
     assert "collision" in text(browser, "outcomes")
     listed = browser.find_elements(By.CSS_SELECTOR, "#list button")
     assert sorted(button.text.split("\n")[0] for button in listed) == [bundle.id for bundle in bundles]
@@ -253,14 +253,15 @@ def contrast_part(color) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
-def test_software_faults_exports_and_hunts_without_crashes(shell, browser):
-    shell.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:Raises", "--set", "vehicles=10")
+def test_software_faults_exports_and_hunts_without_crashes(toy, browser):
+    shell = toy
+    shell.crashhunt("run", "h", "1", "1", "100", "--scenario", "toy", "--agent", "faulty:Raises")
     shell.crashhunt("export", "h", "one crash.zip")
     done = shell.crashhunt("report", "one crash.zip", "--json").json
     assert done["file"] == "one crash.zip.html"
     opened(browser, shell.folder / done["file"])
     assert "ValueError: no plan" in text(browser, "words")
-    shell.crashhunt("run", "calm", "1", "2", "50", "--agent", "keep-lane", "--arg", "speed=5", "--crash-on", "hang")
+    shell.crashhunt("run", "calm", "1", "2", "50", "--scenario", "toy", "--arg", "speed=5", "--crash-on", "hang")
     shell.crashhunt("report", "calm")
     browser.get((shell.folder / "calm" / "report.html").as_uri())
     assert text(browser, "tiles").startswith("2 of 2")
@@ -270,7 +271,7 @@ def test_software_faults_exports_and_hunts_without_crashes(shell, browser):
     trial = browser.execute_script("return PLOTS[0].dots[0].trial")
     command = browser.find_element(By.CSS_SELECTOR, "#picked code").text
     assert shlex.split(command)[:6] == ["crashhunt", "run", "again", "0", "100", "50"]
-    assert f"--set vehicles={trial['values']['vehicles']}" in command
+    assert f"--set gap_m={trial['values']['gap_m']}" in command
     words = shlex.split(command.replace("run again 0 100 50", "run again 1 1 50"))
     shell.crashhunt(*words[1:])
     (result,) = HuntResults(shell.folder / "again").results()

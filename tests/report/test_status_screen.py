@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import pty
-import subprocess
+import threading
 from dataclasses import replace
 
 import pytest
-from conftest import CRASHHUNT
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
@@ -80,11 +79,19 @@ def test_nodes_are_on_the_screen_and_in_the_line():
         assert captured.get().rstrip().endswith(expected)
 
 
-def on_a_terminal(folder, *words: str) -> tuple[int, str]:
+def on_a_terminal(shell, *words: str) -> tuple[int, str]:
     """Run a command whose standard error is a terminal; return its exit code and what was shown there."""
     ours, theirs = pty.openpty()
-    done = subprocess.Popen([str(CRASHHUNT), *words], cwd=folder, stdout=subprocess.PIPE, stderr=theirs, text=True)
-    os.close(theirs)
+    codes = []
+
+    def run():
+        try:
+            codes.append(shell.crashhunt(*words, expect=None, terminal=theirs).code)
+        finally:
+            os.close(theirs)
+
+    running = threading.Thread(target=run)
+    running.start()
     shown = b""
     try:
         while more := os.read(ours, 4096):
@@ -92,8 +99,8 @@ def on_a_terminal(folder, *words: str) -> tuple[int, str]:
     except OSError:  # Linux says so when the other end is closed
         pass
     os.close(ours)
-    done.communicate()
-    return done.returncode, shown.decode(errors="replace")
+    running.join()
+    return codes[0], shown.decode(errors="replace")
 
 
 def test_reports_exports_and_films_say_how_far_they_are(toy):
@@ -104,11 +111,11 @@ def test_reports_exports_and_films_say_how_far_they_are(toy):
         (("export", "h", "h.zip"), "h.zip"),
         (("replay", "h", "--from-log", "--gif", "h.gif", "--last-seconds", "0.3"), "h.gif"),
     ):
-        code, shown = on_a_terminal(toy.folder, *words)
+        code, shown = on_a_terminal(toy, *words)
         assert code == 0, shown
         assert f"writing {file}" in shown
         assert "\x1b[?25h" in shown  # the cursor is there again
-    code, shown = on_a_terminal(toy.folder, "report", "h", "--json")
+    code, shown = on_a_terminal(toy, "report", "h", "--json")
     assert code == 0
     assert "writing" not in shown
     assert "\x1b" not in shown
