@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
     from crashhunt.crashes import Archive, Bundle
     from crashhunt.render import FilmOptions
-    from crashhunt.replays import Look, ReplayOptions, ReplayReport
+    from crashhunt.replays import Look, ReplayData, ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
 
@@ -137,8 +137,8 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     for path, count in written.items():
         say(f"{path} has {count} pictures", as_json=options.json)
     if options.json:
-        answer = answers[0] if len(answers) == 1 else {"crashes": answers}
-        print(json.dumps(answer | ({"written": written} if film is not None else {})))
+        told: dict[str, object] = dict(answers[0]) if len(answers) == 1 else {"crashes": answers}
+        print(json.dumps(told | ({"written": written} if film is not None else {})))
     return 0 if good else 1
 
 
@@ -166,9 +166,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
             raise UsageError(f"--times {options.times}: {name} looks at one run", fix="leave one of the two out")
 
 
-def _replay_one(
-    options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions
-) -> tuple[ReplayReport, dict[str, object]]:
+def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, ReplayData]:
     from crashhunt.crashes import partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
@@ -19,7 +19,25 @@ from crashhunt.recording import Recording, first_divergence, read_black_box
 if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
-__all__ = ["Audit", "AuditReport", "Difference"]
+__all__ = ["Audit", "AuditData", "AuditReport", "Difference", "DifferenceData"]
+
+
+class DifferenceData(TypedDict):
+    """The plain data of a `Difference`."""
+
+    trial: int
+    step: int
+    agent: str
+    field: str
+    recorded: object
+    replayed: object
+
+
+class AuditData(TypedDict):
+    """The plain data of an `AuditReport`."""
+
+    trials: int
+    differences: list[DifferenceData]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +67,16 @@ class Difference:
             f"{self.recorded} and is {self.replayed}"
         )
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> DifferenceData:
         """Return plain strings and numbers."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        return {
+            "trial": self.trial,
+            "step": self.step,
+            "agent": self.agent,
+            "field": self.field,
+            "recorded": self.recorded,
+            "replayed": self.replayed,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +91,7 @@ class AuditReport:
     trials: int = 0
     differences: tuple[Difference, ...] = ()
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> AuditData:
         """Return the shape that ``run --json`` prints."""
         return {"trials": self.trials, "differences": [found.to_json() for found in self.differences]}
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
@@ -22,9 +22,33 @@ if TYPE_CHECKING:
 
     from crashhunt.plans import HuntSettings
 
-__all__ = ["Checked", "Finding", "check", "intact_snapshots"]
+__all__ = ["Checked", "CheckedData", "Finding", "FindingData", "check", "intact_snapshots"]
 
 _SHOWN = 5
+
+
+class FindingData(TypedDict):
+    """The plain data of a `Finding`."""
+
+    where: str
+    what: str
+    lost: str
+    fix: str
+    damaged: bool
+
+
+class CheckedData(TypedDict):
+    """What ``check --json`` prints of a hunt, a crash or an exported crash."""
+
+    dir: str
+    kind: str
+    fine: bool
+    protected: bool
+    trials: int
+    damaged_trials: list[int]
+    crashes: list[str]
+    damaged_crashes: list[str]
+    findings: list[FindingData]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +68,16 @@ class Finding:
     lost: str = ""
     fix: str = ""
     damaged: bool = True
+
+    def to_json(self) -> FindingData:
+        """Return plain strings."""
+        return {
+            "where": self.where,
+            "what": self.what,
+            "lost": self.lost,
+            "fix": self.fix,
+            "damaged": self.damaged,
+        }
 
 
 @dataclass(slots=True)
@@ -75,7 +109,7 @@ class Checked:
         """Whether nothing is damaged."""
         return not any(finding.damaged for finding in self.findings)
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> CheckedData:
         """Return the shape of one hunt in ``check --json``."""
         return {
             "dir": str(self.dir),
@@ -86,7 +120,7 @@ class Checked:
             "damaged_trials": sorted(self.damaged_trials),
             "crashes": self.crashes,
             "damaged_crashes": self.damaged_crashes,
-            "findings": [asdict(finding) for finding in self.findings],
+            "findings": [finding.to_json() for finding in self.findings],
         }
 
 

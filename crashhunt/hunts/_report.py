@@ -3,18 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from crashhunt.crashes import Bundle
-    from crashhunt.hunts._audit import AuditReport
+    from crashhunt.crashes import Bundle, CrashSummary
+    from crashhunt.hunts._audit import AuditData, AuditReport
     from crashhunt.plans import HuntSettings
 
-__all__ = ["HuntReport", "StoppedBecause"]
+__all__ = ["EventCount", "HuntReport", "HuntReportData", "StoppedBecause"]
 
 StoppedBecause = Literal["crash", "all_trials", "interrupted", "no_valid_trial"]
+
+
+class EventCount(TypedDict):
+    """How many traffic events of a kind there were, and in how many trials."""
+
+    count: int
+    trials: int
+
+
+class HuntReportData(TypedDict):
+    """What ``run --json`` prints of a hunt."""
+
+    dir: str
+    hunt_seed: int
+    trials_planned: int
+    trials_run: int
+    outcomes: dict[str, int]
+    stopped_because: StoppedBecause
+    wall_s: float
+    steps_total: int
+    events: dict[str, EventCount]
+    crashes: list[CrashSummary]
+    notes: list[str]
+    audit: AuditData | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +71,7 @@ class HuntReport:
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
     audit: AuditReport | None = None
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
         return {
             "dir": str(self.directory),

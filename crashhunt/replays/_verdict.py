@@ -3,22 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
 
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.snapshots import environment_changes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
+    from crashhunt.base.plain import Plain
     from crashhunt.crashes import Bundle
-    from crashhunt.recording import AgentChannel, Prologue
+    from crashhunt.recording import AgentChannel, DivergenceData, Prologue
     from crashhunt.replays._prepare import Code, Rerun
     from crashhunt.trial import TrialResult
 
-__all__ = ["ReplayReport", "Verdict", "judged", "up_to"]
+__all__ = ["ReplayData", "ReplayReport", "Verdict", "judged", "up_to"]
 
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
+
+
+class ReplayData(TypedDict):
+    """What ``replay --json`` prints of a crash; ``table`` has the fields that were asked for, a row a step."""
+
+    crash: str
+    verdict: Verdict
+    code: Code
+    steps_recorded: int
+    steps_replayed: int
+    digest_recorded: str
+    digest_replayed: str
+    divergence: DivergenceData | None
+    outcome_recorded: str
+    outcome_replayed: str
+    reason: str
+    edits: list[str]
+    warnings: list[str]
+    times: int
+    agreed: int
+    verdicts: dict[Verdict, int]
+    table: NotRequired[Sequence[Plain]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +78,7 @@ class ReplayReport:
         """How many steps it completed."""
         return self.recording.steps
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> ReplayData:
         """Return the shape that ``replay --json`` prints."""
         return {
             "crash": self.bundle.id,

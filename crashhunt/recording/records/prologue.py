@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from crashhunt.base.tolerance import known_values
 from crashhunt.recording.records._type import RecordType, TextForm
@@ -59,9 +59,14 @@ class Prologue:
     @classmethod
     def decode(cls, payload: bytes) -> Prologue:
         """Rebuild what `encode` returned; what a later version has added is left out."""
-        data = json.loads(payload)
+        data: _Said = json.loads(payload)
         agents = tuple(AgentChannel(**_columns(agent)) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
+
+
+class _Said(TypedDict):
+    agents: list[Plain]
+    step_length_s: float
 
 
 def _columns(agent: Plain) -> dict[str, Any]:
