@@ -14,6 +14,7 @@ from crashhunt.base.faculties import members, offers
 from crashhunt.simulators import (
     FACULTIES,
     BrakesFully,
+    Disturbs,
     FlattensObservations,
     FullBraking,
     HasMap,
@@ -23,7 +24,7 @@ from crashhunt.simulators import (
     TellsNotices,
     Tidies,
 )
-from crashhunt.trial import Outcome
+from crashhunt.trial import CELLS, Disturbance, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -235,6 +236,40 @@ class SimulatorContract:
         kinds = tuple(simulator.told_events) if offers(simulator, TellsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
+        simulator.close()
+
+    def test_others_err_and_the_next_episode_knows_nothing_of_it(self, make: Make) -> None:
+        """`Disturbs`: who is meant is in the scene and no agent; what goes on is forgotten by the next `reset`."""
+        simulator = make()
+        if not offers(simulator, Disturbs):
+            simulator.close()
+            return
+        assert all(isinstance(kind, str) for kind in simulator.disturbing_kinds)
+        before = self._drive(simulator, 1)
+        simulator.reset(seed=1)
+        agents = tuple(simulator.agents)
+        for agent in agents:
+            simulator.actions[agent].space.seed(3)
+        held = {name: simulator.actions[name].encode(simulator.actions[name].space.sample()) for name in agents}
+        erring = {}
+        for number, kind in enumerate(simulator.disturbing_kinds):
+            for cell in CELLS:
+                planned = Disturbance(number + 1, cell, kind, 0.5, 1.0, agents[0])
+                vehicle = simulator.whom(planned)
+                assert vehicle == "" or vehicle in simulator.scene().roster.index
+                assert vehicle not in agents
+                if vehicle and vehicle not in erring:
+                    erring[vehicle] = simulator.disturb(vehicle, planned)
+            if simulator.agents:
+                simulator.step({name: held[name] for name in simulator.agents})
+            for errs in erring.values():
+                if errs is not None:
+                    assert np.isfinite(errs.how_strong)
+                    errs.keep()
+        for errs in list(erring.values())[::2]:  # the others still go on at the end
+            if errs is not None:
+                errs.end()
+        assert self._drive(simulator, 1) == before
         simulator.close()
 
     def test_notices_are_lines(self, make: Make) -> None:

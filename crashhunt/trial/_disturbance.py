@@ -99,7 +99,7 @@ class Disturbance:
     def words(self) -> str:
         """What happens, for people; such as ``main.35 brakes with 4 m/s² for 2 s``."""
         agent = self.agent or "the agent"
-        vehicle = self.vehicle or (agent if self.who == "itself" else f"whoever is {_PLACES[self.who].format(agent)}")
+        vehicle = self.vehicle or (agent if self.who == "itself" else f"whoever is {self.place}")
         kind = KINDS.get(self.what)
         if kind is None:
             return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
@@ -111,7 +111,9 @@ class Disturbance:
     @property
     def place(self) -> str:
         """Where it is, for people; such as ``ahead of ego to the left``."""
-        return _PLACES[self.who].format(self.agent or "the agent")
+        agent = self.agent or "the agent"
+        # A later version may know more places.
+        return _PLACES[self.who].format(agent) if self.who in _PLACES else f"{self.who} of {agent}"
 
     def to_json(self) -> DisturbanceData:
         """Return plain text and numbers; who was meant only where that is known."""

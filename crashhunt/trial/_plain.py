@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from crashhunt.base.integrity import typed
@@ -91,6 +92,8 @@ def check_disturbances(disturbances: Sequence[DisturbanceData] | None) -> None:
         typed({"disturbance": one}, {"disturbance": dict})
         typed(one, _DISTURBANCE)
         typed_where_there(one, dict.fromkeys(("agent", "vehicle"), str))
+        if one["step"] < 1 or not math.isfinite(one["how_strong"]) or not 0 < one["how_long"] < math.inf:
+            raise ValueError("a disturbance is out of its range")
 
 
 def check_parts(

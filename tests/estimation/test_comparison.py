@@ -10,7 +10,19 @@ from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettin
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
-def hunt(path, crashes, *, gap="20.0:30.0", digest="a", sampler="random", seed=1, trials=40, shift=0.0, max_steps=9):
+def hunt(
+    path,
+    crashes,
+    *,
+    gap="20.0:30.0",
+    digest="a",
+    sampler="random",
+    seed=1,
+    trials=40,
+    shift=0.0,
+    max_steps=9,
+    disturb=(),
+):
     """A hunt whose trials below ``crashes`` crash, without running it."""
     path.mkdir()
     settings = HuntSettings(
@@ -23,6 +35,7 @@ def hunt(path, crashes, *, gap="20.0:30.0", digest="a", sampler="random", seed=1
         agents={"ego": AgentSettings(agent="keep-lane", arguments={"speed": ArgumentSpec(spec="4.0")})},
         scenario_arguments={"gap_m": ArgumentSpec(spec=gap, kind="float")},
         run=RunSettings(keep_going=True),
+        disturb=disturb,
     )
     write_settings(path / "hunt.toml", settings, ["crashhunt"])
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
@@ -45,6 +58,7 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
         ("other seeds", {"seed": 1000}, "have no seed in common"),
         ("other draws", {"sampler": "halton", "shift": 0.5}, "have other values of the scenario's arguments"),
         ("own draws", {"sampler": "halton"}, ""),
+        ("disturbed", {"disturb": ("brake=0.1",)}, "have no disturbances and the disturbances brake=0.1, so that"),
     ):  # fmt: skip
         (pair,) = crashhunt.compare(first, hunt(tmp_path / name, 2, **options)).pairs
         if not says:

@@ -1,0 +1,93 @@
+"""A disturbance as plain data and in words."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.trial import (
+    CELLS,
+    KINDS,
+    OF_AGENT,
+    Disturbance,
+    Outcome,
+    TrialResult,
+    TrialSpec,
+    check_disturbances,
+    check_plain,
+    in_effect,
+)
+
+texts = st.text(max_size=9)
+disturbances = st.builds(
+    Disturbance,
+    st.integers(1, 10**6),
+    st.sampled_from(CELLS) | texts,
+    st.sampled_from(sorted(KINDS)) | texts,
+    st.floats(0, 1e6),
+    st.floats(1e-3, 1e6),
+    texts,
+    texts,
+)
+
+
+@given(st.lists(disturbances).map(tuple), st.lists(disturbances).map(tuple), st.none() | st.floats(-1e9, 0))
+def test_a_disturbed_trial_survives_json_and_can_be_told(planned, happened, likely):
+    spec = TrialSpec(3, 1, {}, {}, 9, disturbances=planned)
+    result = TrialResult(spec, Outcome.SURVIVED, steps=9, disturbances=happened, log_likelihood=likely)
+    data = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    check_plain(data)
+    assert TrialResult.from_json(data) == result
+    for one in planned + happened:
+        assert one.words
+        assert one.place
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"step": "1"}, "step"),
+        ({"step": 0}, "out of its range"),
+        ({"how_long": 0.0}, "out of its range"),
+        ({"how_long": 1e999}, "out of its range"),
+        ({"how_strong": -1e999}, "out of its range"),
+        ({"who": 3}, "who"),
+        ({"agent": None}, "agent"),
+    ],
+)
+def test_data_that_make_no_sense_are_refused(change, says):
+    data = Disturbance(1, "ahead", "brake", 2.0, 1.0, "ego").to_json()
+    check_disturbances([data])
+    with pytest.raises(ValueError, match=says):
+        check_disturbances([data | change])
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "words"),
+    [
+        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego", "main.35"), "main.35 brakes with 4 m/s² for 2 s"),
+        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego"), "whoever is ahead of ego brakes with 4 m/s² for 2 s"),
+        (Disturbance(1, "left", "cut_in", 0.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s"),
+        (Disturbance(1, "left", "cut_in", 2.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s and brakes with 2 m/s²"),
+        (Disturbance(1, "behind", "speed", 0.2, 9.0, "ego", "b"), "b wants to drive 20 % faster for 9 s"),
+        (Disturbance(1, "itself", "late_action", 0.2, 1.0, "ego"), "what ego does takes effect 0.2 s late for 1 s"),
+        (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "whoever is above of {ego}: fly 2 for 1 s"),
+    ],
+)
+def test_words(disturbance, words):
+    assert disturbance.words == words
+
+
+def test_what_had_an_effect_began_by_the_end_with_somebody_there():
+    there, nobody = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego", "b"), Disturbance(3, "ahead", "brake", 4.0, 2.0)
+    result = TrialResult(TrialSpec(3, 1, {}, {}, 9), Outcome.COLLISION, steps=5)
+    assert in_effect(result, [nobody, there]).disturbances == (there,)
+    assert in_effect(result, [nobody]).disturbances == ()
+    result = TrialResult(TrialSpec(3, 1, {}, {}, 9), Outcome.COLLISION, steps=4)
+    assert not in_effect(result, [there]).disturbed
+
+
+def test_the_eyes_and_hands_of_agents_are_no_business_of_simulators():
+    assert {"late_observation", "noisy_observation", "late_action"} == OF_AGENT
