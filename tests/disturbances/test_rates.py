@@ -125,6 +125,15 @@ def test_another_model_or_agent_shifts_no_draw():
     assert len(two) > len(alone)
 
 
+def test_models_and_agents_are_drawn_independently_of_each_other():
+    drawn = disturber_of({"brake": 0.5, "stop": 0.5}, agents=("ego", "second"), step_length_s=DT).draw(7, 500)
+    begins = [
+        tuple(one.step for one in drawn if (one.what, one.agent) == pair)
+        for pair in (("brake", "ego"), ("stop", "ego"), ("brake", "second"), ("stop", "second"))
+    ]
+    assert len(set(begins)) == 4
+
+
 def test_they_begin_as_often_as_the_rate_says():
     disturber = make(brake=0.4)
     count = sum(len(disturber.draw(seed, 1000)) for seed in range(100))  # 4000 expected of 100,000 steps

@@ -66,7 +66,7 @@ def drive(tmp_path):
     """Starts an episode on a street with a signal; returns it and who watches."""
     made = []
 
-    def begin(*disturbances, traffic=AHEAD + BEHIND, steps=400, dt=0.1, agent=None):
+    def begin(*disturbances, traffic=AHEAD + BEHIND, steps=400, dt=0.1, agent=None, driven=()):
         folder = tmp_path / f"s{len(made)}"
         (folder / "stage").mkdir(parents=True)
         shutil.copy(NET, folder)
@@ -74,7 +74,10 @@ def drive(tmp_path):
         scenario = Scenario(
             step_length_s=dt,
             warmup_s=1.0,
-            agents={"ego": AgentSetup(route="across", type="fast", depart_lane="0", depart_pos="35", depart_speed="8")},
+            agents={
+                "ego": AgentSetup(route="across", type="fast", depart_lane="0", depart_pos="35", depart_speed="8"),
+                **dict.fromkeys(driven, AgentSetup(existing=True)),
+            },
             tables={"sumo": SumoSetup(net=NET.name, routes=("r.rou.xml",))},
             folder=folder,
         )
@@ -130,6 +133,12 @@ def test_nobody_brakes_harder_than_its_type_can(drive):
     advance(episode, 15)
     assert watch.told[0].how_strong == 4.5
     assert min(np.diff(watch.speeds("lead")) / 0.1) == pytest.approx(-4.5)
+
+
+def test_who_is_driven_by_an_agent_is_never_meant(drive):
+    episode, watch = drive(planned(3, "brake"), driven=("lead",))
+    advance(episode, 5)
+    assert watch.told == [planned(3, "brake")]
 
 
 def test_a_sudden_stop_lasts_and_ends(drive):
