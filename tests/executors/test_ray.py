@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+import socket
 import sqlite3
 import time
 from dataclasses import replace
@@ -22,6 +23,7 @@ from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.executors.ray import RayExecutor
+from crashhunt.executors.ray._address import cluster_of
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import ExecutorContract
 from crashhunt.trial import CRASHES, TrialSpec
@@ -272,6 +274,31 @@ def test_the_address_may_stand_in_the_environment(settings, monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: nobody answers there"):
         RayExecutor(settings)
+
+
+def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_path):
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    assert cluster_of("").address == ""
+    assert cluster_of("").environment != cluster_of("local").environment, "our own get a new one each"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        (tmp_path / "ray").mkdir()
+        (tmp_path / "ray" / "ray_current_cluster").write_text(address)
+        assert cluster_of("") == cluster_of("auto") == (address, {})
+        (tmp_path / ".ray").mkdir()
+        (tmp_path / ".ray" / "auth_token").write_text("secret")
+        assert cluster_of("") == (address, {"RAY_AUTH_MODE": "token"})
+        assert cluster_of(address) == (address, {})
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+        assert cluster_of("") == (address, {})
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        assert cluster_of("auto") == (address, {})
+        assert cluster_of("local").address == ""
+    monkeypatch.delenv("RAY_ADDRESS")
+    assert cluster_of("").address == "", "one that has ended is none"
 
 
 def test_without_ray_it_says_how_to_get_it(settings, monkeypatch):

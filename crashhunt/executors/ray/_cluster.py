@@ -81,7 +81,8 @@ class Cluster:
             said = " ".join(str(error).split()) or type(error).__name__
             raise UnreachableError(
                 f"the Ray cluster at {self.address} cannot be used: {said}",
-                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
+                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python, and set "
+                "RAY_AUTH_MODE=token where it asks for a token",
             ) from error
         cloudpickle.register_pickle_by_value(_site)
         kind = ray.remote(concurrency_groups={_ORDERS: 1, _ANSWERS: 1}, max_restarts=0, max_task_retries=0)

@@ -67,7 +67,7 @@ class RayExecutor:
         self, settings: WorkerSettings, *, parallel: int = 0, recycle_after: int = 1000, argument: str = ""
     ) -> None:
         require_ray()
-        self._address = cluster_of(argument)
+        self._address, self._environment = cluster_of(argument)
         Parcel.of(settings)
         self._settings = settings
         self._parallel = parallel
@@ -171,7 +171,7 @@ class RayExecutor:
             self._kept = Kept(
                 "crashhunt.executors.ray._bridge",
                 [str(theirs.fileno()), str(job)],
-                environment={**os.environ, **_QUIET},
+                environment={**os.environ, **_QUIET, **self._environment},
                 inherited=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -275,6 +275,7 @@ class RayExecutor:
 _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_gcs_rpc_server_reconnect_timeout_s": "10",
+    "RAY_NUM_REDIS_GET_RETRIES": "5",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "PYTHONUNBUFFERED": "1",
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -126,7 +127,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
                 found[entry.filename] = digest_of_file(path)
         if digest_of_data(found) != digest:
             raise ValueError("its digest is another one")
-    except (ValueError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise BundleError(f"the parcel {digest} is damaged: {error}", fix="have it sent again") from None
 
 

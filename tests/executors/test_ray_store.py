@@ -1,0 +1,157 @@
+"""What travels to nodes, what they keep of it, and who gets which trial; without Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from crashhunt.base.errors import BundleError
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
+from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
+from crashhunt.executors.ray._store import Store
+from crashhunt.scenario import Scenario
+from crashhunt.trial import CRASHES
+
+
+@pytest.fixture
+def settings(tmp_path):
+    for name, text in (("code/mine/agent.py", "x = 1"), ("code/mine/agent.pyc", "?"), ("files/w.npz", "w")):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return WorkerSettings(
+        scenario=Scenario(simulator="toy", folder=tmp_path),
+        oracles=(),
+        crash_on=CRASHES,
+        scratch=tmp_path / "scratch",
+        code=(str(tmp_path / "code"),),
+        argument_files={"weights": str(tmp_path / "files" / "w.npz")},
+    )
+
+
+def test_a_parcel_arrives_as_it_was_sent(settings, tmp_path):
+    parcel = Parcel.of(settings)
+    unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
+    there = settings_in(settings, parcel.folders, tmp_path / "there", tmp_path / "scratch there")
+    assert [path.read_text() for path in (tmp_path / "there").rglob("*.py")] == ["x = 1"]
+    assert not list((tmp_path / "there").rglob("*.pyc"))
+    assert there.code == (str(tmp_path / "there" / "code" / "0"),)
+    assert Path(there.argument_files["weights"]).read_text() == "w"
+    assert there.scenario.folder.is_dir()
+    assert there.scratch == tmp_path / "scratch there"
+
+
+def test_a_parcel_that_is_not_what_was_sent_is_refused(settings, tmp_path):
+    parcel = Parcel.of(settings)
+    packed, digest = parcel.packed(), parcel.digest()
+    (tmp_path / "code" / "mine" / "agent.py").write_text("x = 2")
+    assert Parcel.of(settings).digest() != digest
+    changed = Parcel.of(settings).packed()
+    leading_out = io.BytesIO()
+    with zipfile.ZipFile(leading_out, "w") as archive:
+        archive.writestr("../out.py", "x = 3")
+    for number, bad in enumerate((changed, packed[:-30], b"", leading_out.getvalue())):
+        with pytest.raises(BundleError, match="is damaged"):
+            unpack(bad, digest, tmp_path / str(number))
+    assert not (tmp_path / "out.py").exists()
+    for at in range(0, len(packed), 3):  # some of which say nothing about what is in it
+        with contextlib.suppress(BundleError):
+            unpack(packed[:at] + bytes([packed[at] ^ 64]) + packed[at + 1 :], digest, tmp_path / f"flipped {at}")
+            assert (tmp_path / f"flipped {at}" / "code" / "0" / "mine" / "agent.py").read_text() == "x = 1"
+
+
+def test_what_is_kept_is_bounded_and_what_is_damaged_is_let_go(settings, tmp_path):
+    store = Store(tmp_path / "store", kept_bytes=250)
+    for number, name in enumerate("abc"):
+        store.keep(name, bytes(100))
+        os.utime(tmp_path / "store" / f"{name}.zip", (number, number))
+    assert store.find("a") is None, "the one that was used longest ago"
+    assert store.find("b") == bytes(100)  # which is use
+    store.keep("d", bytes(100))
+    assert store.find("c") is None
+    store.keep("large", bytes(1000))
+    assert store.find("large") == bytes(1000), "what is in use is kept, whatever its size"
+    store.drop("large")
+    assert store.find("large") is None
+
+
+def test_a_place_is_removed_by_whoever_comes_after_its_owner(tmp_path):
+    store = Store(tmp_path / "store")
+    mine = store.place()
+    left = store.place()
+    left._lock.close()  # as when its process is killed
+    other = Store(tmp_path / "store").place()
+    assert mine.path.exists()
+    assert not left.path.exists()
+    for place in (mine, other):
+        place.remove()
+    assert not list((tmp_path / "store").iterdir())
+
+
+def test_a_folder_of_somebody_else_is_not_used(tmp_path):
+    (tmp_path / "open").mkdir(mode=0o777)
+    (tmp_path / "open").chmod(0o777)
+    (tmp_path / "open" / "a.zip").write_bytes(b"planted")
+    assert Store(tmp_path / "open").find("a") is None
+
+
+@pytest.mark.parametrize(
+    ("free", "wanted", "expected"),
+    [
+        ({"a": 4, "b": 2}, None, {"a": 4, "b": 2}),
+        ({"a": 4, "b": 0}, None, {"a": 4}),
+        ({"a": 4, "b": 2}, 3, {"a": 2, "b": 1}),
+        ({"a": 2, "b": 2}, 2, {"a": 1, "b": 1}),
+        ({"a": 1, "b": 1}, 9, {"a": 1, "b": 1}),
+        ({"a": 3}, 0, {}),
+    ],
+)
+def test_trials_at_a_time_are_divided_evenly(free, wanted, expected):
+    assert shares(free, wanted) == expected
+
+
+def roster(**slots):
+    found = Roster()
+    found.nodes = {name: Node(name, name, count, None, ready=True) for name, count in slots.items()}
+    return found
+
+
+def numbers(given):
+    return {node.name: [trial.number for trial in trials] for node, trials in given.items()}
+
+
+def test_trials_go_to_whoever_has_least_to_do_in_their_order():
+    found = roster(a=2, b=1)
+    found.waiting += [Trial(number, {"number": number}) for number in range(9)]
+    assert numbers(found.assign()) == {"a": [0, 2, 3, 5], "b": [1, 4]}
+    assert [trial.number for trial in found.waiting] == [6, 7, 8]
+    assert found.ended(found.nodes["b"], 1)
+    assert not found.ended(found.nodes["b"], 1), "it has ended"
+    assert numbers(found.assign()) == {"b": [6]}
+    found.cancel(4)
+    assert not found.ended(found.nodes["b"], 6), "it was given up"
+    assert not found.waiting
+    assert not found.idle
+
+
+def test_what_was_on_a_lost_node_runs_again_and_what_ends_every_node_in_the_end_alone():
+    found = roster(a=1, b=1)
+    found.waiting += [Trial(number, {"number": number}) for number in range(5)]
+    given = numbers(found.assign())
+    assert given == {"a": [0, 2], "b": [1, 3]}
+    assert found.lose(found.nodes["a"]) == []
+    assert [trial.number for trial in found.waiting] == [0, 2, 4]
+    found.nodes["a"] = Node("a", "a", 1, None, ready=True)
+    assert numbers(found.assign()) == {"a": [0, 2]}
+    assert found.lose(found.nodes["a"]) == []
+    found.nodes["a"] = Node("a", "a", 1, None, ready=True)
+    assert numbers(found.assign()) == {"a": [0]}, "0 has been lost twice, and is alone now"
+    assert numbers(found.assign()) == {}, "nobody joins it, and 2 waits for a node of its own"
+    (culprit,) = found.lose(found.nodes["a"])
+    assert culprit.number == 0
+    assert 0 not in [trial.number for trial in found.waiting]
