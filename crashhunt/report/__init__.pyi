@@ -1,4 +1,5 @@
 from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
+from ._groups import describe_groups as describe_groups
 from ._listing import (
     ArgumentEntry as ArgumentEntry,
     ListingEntry as ListingEntry,

@@ -1,0 +1,36 @@
+"""The kinds of crashes, for people."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.triage import Group
+
+__all__ = ["describe_groups"]
+
+
+def describe_groups(groups: Sequence[Group]) -> str:
+    """Return a line a kind of crash, with the one to look at first."""
+    if not groups:
+        return "No crash was saved."
+    hunts = {bundle.hunt for group in groups for bundle in group.bundles}
+    rows = [["crashes", "kind", "shortest", "steps"]]
+    for group in groups:
+        shortest = group.shortest
+        name = shortest.id if len(hunts) == 1 else str(shortest.path)
+        rows.append([str(len(group.bundles)), str(group.signature), name, str(shortest.result.steps)])
+    count = sum(len(group.bundles) for group in groups)
+    words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'kind' if len(groups) == 1 else 'kinds'}"
+    return "\n".join([f"{words}:", "", *_lines(rows)])
+
+
+def _lines(rows: list[list[str]]) -> list[str]:
+    """Numbers to the right, words to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        f"{count:>{widths[0]}}  {kind:<{widths[1]}}  {name:<{widths[2]}}  {steps:>{widths[3]}}"
+        for count, kind, name, steps in rows
+    ]

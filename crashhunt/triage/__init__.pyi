@@ -1,0 +1,2 @@
+from ._groups import Group as Group, GroupData as GroupData, Groups as Groups, group_crashes as group_crashes
+from ._signature import Signature as Signature, signature_of as signature_of

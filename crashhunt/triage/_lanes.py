@@ -1,0 +1,140 @@
+"""Who changes lanes before a crash, and whether it is where lanes cross, as the map and the recording show it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.world import Scene
+
+__all__ = ["LaneMap"]
+
+_NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
+_ALONG = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
+_CROSSES = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
+_END_M = 0.5  # who is nearer to the end of a lane leaves it ahead, not sideways
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a point is, as seen from a lane."""
+
+    aside_m: float  # to the left of the centre line
+    along_m: float  # from the beginning
+    heading: float  # of the lane there
+    inside: bool  # between its beginning and its end
+
+
+class _Lane:
+    """The centre line of a lane."""
+
+    def __init__(self, right: NDArray[np.float64], left: NDArray[np.float64]) -> None:
+        self.points = (right + left) / 2
+        self.half_width = float(np.hypot(*(left - right).T).mean()) / 2
+        steps = np.diff(self.points, axis=0)
+        self._lengths = np.maximum(np.hypot(*steps.T), 1e-9)
+        self._directions = steps / self._lengths[:, None]
+        self._starts = np.concatenate(([0.0], np.cumsum(self._lengths)))
+
+    def place(self, point: NDArray[np.float64]) -> _Place:
+        offset = point - self.points[:-1]
+        along = np.clip(np.einsum("ij,ij->i", offset, self._directions), 0.0, self._lengths)
+        away = np.hypot(*(offset - along[:, None] * self._directions).T)
+        nearest = int(np.argmin(away))
+        dx, dy = self._directions[nearest]
+        aside = float(dx * offset[nearest, 1] - dy * offset[nearest, 0])
+        driven = float(self._starts[nearest] + along[nearest])
+        inside = _END_M < driven < self._starts[-1] - _END_M
+        return _Place(math.copysign(float(away[nearest]), aside), driven, math.atan2(dy, dx), inside)
+
+
+class LaneMap:
+    """The lanes around a place.
+
+    Args:
+        borders: of each lane of the map, right and left, shape (n, 2) each, in m; as `crashhunt.recording.read_lanes`
+            returns them.
+        around: x and y of the place, in m.
+    """
+
+    def __init__(
+        self, borders: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], around: tuple[float, float]
+    ) -> None:
+        center = np.array(around)
+        self._lanes = []
+        for right, left in borders:
+            if len(right) < 2 or len(right) != len(left):
+                continue
+            low = np.minimum(right.min(axis=0), left.min(axis=0)) - _NEAR_M
+            high = np.maximum(right.max(axis=0), left.max(axis=0)) + _NEAR_M
+            if bool(np.all((low < center) & (center < high))):
+                self._lanes.append(_Lane(right, left))
+
+    def __bool__(self) -> bool:
+        return bool(self._lanes)
+
+    def cross(self, point: tuple[float, float]) -> bool:
+        """Whether lanes of different directions lie over each other there, in m."""
+        spot = np.array(point)
+        headings = [
+            place.heading
+            for lane in self._lanes
+            if abs((place := lane.place(spot)).aside_m) < lane.half_width and place.inside
+        ]
+        return any(
+            abs(math.remainder(one - two, math.tau)) > _CROSSES
+            for number, one in enumerate(headings)
+            for two in headings[:number]
+        )
+
+    def leaves_sideways(self, scenes: Sequence[Scene], actor: str) -> bool:
+        """Whether an actor leaves a lane over its side, and goes on beside it.
+
+        Who drives on where its lane ends, or turns off from it, does not.
+        """
+        poses = [
+            (np.array(scene.points[row]), scene.headings[row])
+            for scene in scenes
+            if (row := scene.roster.index.get(actor)) is not None
+        ]
+        return any(
+            self._has_left(lane, after)
+            for before, after in pairwise(poses)
+            if (lane := self._driven(before)) is not None
+        )
+
+    def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
+        """The lane along which it drives: of several that lie over each other, the one whose middle is nearest."""
+        point, heading = pose
+        found = [
+            (abs(place.aside_m), number, lane)
+            for number, lane in enumerate(self._lanes)
+            if abs((place := lane.place(point)).aside_m) <= lane.half_width
+            and place.inside
+            and abs(math.remainder(place.heading - heading, math.tau)) < _ALONG
+        ]
+        return min(found)[2] if found else None
+
+    def _has_left(self, lane: _Lane, pose: tuple[NDArray[np.float64], float]) -> bool:
+        point, heading = pose
+        place = lane.place(point)
+        if not place.inside or abs(place.aside_m) <= lane.half_width:
+            return False
+        if abs(math.remainder(place.heading - heading, math.tau)) >= _ALONG:
+            return False  # it turns off
+        return any(
+            abs(other.aside_m) <= beside.half_width
+            and abs(math.remainder(other.heading - place.heading, math.tau)) < _ALONG
+            for beside in self._lanes
+            if beside is not lane
+            for other in (beside.place(point),)
+        )

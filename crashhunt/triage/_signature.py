@@ -1,0 +1,183 @@
+"""The signature of a crash: what makes two crashes the same one."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.crashes import Encounter
+from crashhunt.triage._lanes import LaneMap
+from crashhunt.world import is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.trial import Collision, Failure, TrialResult
+
+__all__ = ["Signature", "SignatureData", "signature_of"]
+
+_BEFORE_S = 3.0  # a lane change that began longer ago is over
+_CALLERS = ("_episode.py", "episode.py")  # of agents, simulators and oracles; the second one in earlier versions
+_CHANGES = {
+    "agent": "while the agent changes lanes",
+    "other": "while the other changes lanes",
+    "both": "while both change lanes",
+}
+_FRAMES = 3  # of a stack, the innermost ones
+_FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line \d+,? in (?P<function>\S+)', re.MULTILINE)
+_NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
+
+
+class SignatureData(TypedDict):
+    """A signature as JSON."""
+
+    outcome: str
+    role: str
+    manner: str
+    lane_change: str
+    place: str
+    where: str
+    disturbed: bool
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Signature:
+    """What makes two crashes the same one. No speeds, ids and times: they differ from trial to trial.
+
+    Args:
+        outcome: how the trial ended.
+        role: the agent's: ``collider``, ``victim``, ``alone``; empty where it is no collision.
+        manner: ``rear end``, ``side swipe``, ``crossing from the left`` (that is where the other one came from),
+            ``crossing from the right``, ``head-on``, ``pedestrian``, ``off road``; what kind of event; the exception,
+            signal or exit code of a software fault.
+        lane_change: who was changing lanes: ``agent``, ``other``, ``both`` or empty.
+        place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty where
+            the map is not known, or it is no matter of place.
+        where: of a software fault, the innermost functions of the agent's, or what is said where there are none.
+        disturbed: whether disturbances took place before it; in undisturbed traffic it is another crash.
+    """
+
+    outcome: str
+    role: str = ""
+    manner: str = ""
+    lane_change: str = ""
+    place: str = ""
+    where: str = ""
+    disturbed: bool = False
+
+    def to_json(self) -> SignatureData:
+        """Return plain words."""
+        return {
+            "outcome": self.outcome,
+            "role": self.role,
+            "manner": self.manner,
+            "lane_change": self.lane_change,
+            "place": self.place,
+            "where": self.where,
+            "disturbed": self.disturbed,
+        }
+
+    def __str__(self) -> str:
+        words = self.manner or self.outcome
+        words += {"collider": ", the agent into the other", "victim": ", the other into the agent"}.get(self.role, "")
+        words += f", {_CHANGES[self.lane_change]}" if self.lane_change else ""
+        words += ", where lanes cross" if self.place == "crossing" else ""
+        words += f" in {self.where}" if self.where else ""
+        return f"{words}, disturbed" if self.disturbed else words
+
+
+def signature_of(bundle: Bundle) -> Signature:
+    """Return the signature of a crash; no code of the bundle is run.
+
+    Raises:
+        BundleError: its log is missing or damaged.
+    """
+    result = bundle.result
+    hit = result.collision
+    if hit is None:
+        found = _of_a_fault(result)
+    else:
+        from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
+
+        found = _of_a_collision(result, hit, bundle.recording(), read_lanes(bundle.path / layout.LOG))
+    return replace(found, disturbed=result.disturbed)
+
+
+def _of_a_collision(
+    result: TrialResult,
+    hit: Collision,
+    recording: Recording,
+    borders: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]],
+) -> Signature:
+    scenes = recording.scenes()
+    first = scenes[-1].time_s - _BEFORE_S
+    scenes = [scene for scene in scenes if scene.time_s >= first]
+    lanes = LaneMap(borders, (hit.x, hit.y))
+    place = ("crossing" if lanes.cross((hit.x, hit.y)) else "road") if lanes else ""
+    outcome = str(result.outcome)
+    if not hit.other:
+        return Signature(outcome, hit.role, "off road", place=place)
+    changes = [lanes.leaves_sideways(scenes, actor) for actor in (hit.agent, hit.other)]
+    lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
+    return Signature(outcome, hit.role, _manner(recording, hit), lane_change, place)
+
+
+def _manner(recording: Recording, hit: Collision) -> str:
+    if is_person(hit.other):
+        return "pedestrian"
+    encounter = Encounter(recording, hit.agent, hit.other)
+    last = encounter.moments[-1].step if encounter.moments else -1
+    position = encounter.position(last)
+    manner = encounter.manner(last)
+    if position is None or manner is None:
+        return ""
+    if position.faces == "other":
+        return "head-on"
+    if position.faces == "same":
+        return "rear end" if position.place in ("ahead", "behind") else "side swipe"
+    return manner
+
+
+def _of_a_fault(result: TrialResult) -> Signature:
+    outcome, failure, event = str(result.outcome), result.failure, result.event
+    if event is not None:
+        return Signature(outcome, manner=event.kind)
+    if failure is None:
+        return Signature(outcome)
+    return Signature(outcome, manner=_kind(failure), where=_where(failure))
+
+
+def _kind(failure: Failure) -> str:
+    """The exception's type; of a process that died, of what."""
+    return f"{failure.kind} {failure.exit_code}" if failure.exit_code is not None else failure.kind
+
+
+def _where(failure: Failure) -> str:
+    """The innermost functions that are the agent's own, or what was said, without its numbers."""
+    frames = _frames(failure.traceback) or _frames(failure.last_output)
+    ours = [number for number, (file, _) in enumerate(frames) if file.name in _CALLERS]
+    inner = frames[: min(ours)] if ours else frames  # what the episode has called
+    own = [frame for frame in inner if not _is_of_a_library(frame[0])]
+    chosen = own or inner
+    if chosen:
+        return " < ".join(f"{file.name}:{function}" for file, function in chosen[:_FRAMES])
+    return _NUMBERS.sub("#", failure.message)
+
+
+def _frames(text: str) -> list[tuple[PurePath, str]]:
+    """The file and function of each call, the innermost first."""
+    found = [(PurePath(match["file"]), match["function"]) for match in _FRAME.finditer(text)]
+    # A stuck or dead process has written its stack that way already, an exception the other way.
+    return found if "most recent call first" in text else found[::-1]
+
+
+def _is_of_a_library(file: PurePath) -> bool:
+    return any(part in ("site-packages", "dist-packages") or part.startswith("python3") for part in file.parts)
