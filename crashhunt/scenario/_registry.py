@@ -29,9 +29,7 @@ def _own() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in pkgutil.iter_modules(crashhunt.scenario.backends.__path__)))
 
 
-@cache
 def _others() -> Mapping[str, EntryPoint]:
-    # Once a process: every look at entry points reads through all that is installed, and every crash asks for versions.
     return registered("backends")
 
 

@@ -13,7 +13,9 @@ from pages import PAGES, ROOT, Page, prepare, tree
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
 # How many trials have ended beside the one that crashed depends on time; which one crashed does not.
-VARIES = re.compile(r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/tmp/\S+|\d+(\.\d+)?|[─ ]+")
+VARIES = re.compile(
+    r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/(tmp|dev/shm)/\S+|\d+(\.\d+)?|[─ ]+"
+)
 NOW_AND_THEN = re.compile(
     r"hunting:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
 )
