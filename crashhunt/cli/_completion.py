@@ -66,6 +66,7 @@ def _attach(parser: argparse.ArgumentParser) -> None:
         "--agent": lambda **_: _registered("agents"),
         "--sampler": lambda **_: _registered("samplers"),
         "--executor": lambda **_: _registered("executors"),
+        "--disturb": _several(lambda **_: [f"{name}=" for name in _registered("disturbances")]),
         "--crash-on": _several(lambda **_: _outcomes(crashes=True)),
         "--outcome": _several(lambda **_: _outcomes(crashes=False)),
         "--print": _several(lambda **_: _FIELDS),

@@ -1,4 +1,4 @@
-"""``crashhunt agents``, ``crashhunt oracles`` and ``crashhunt scenarios``."""
+"""``crashhunt agents``, ``disturbances``, ``oracles`` and ``scenarios``."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ def add_lists(commands: Commands) -> None:
     """Add the commands."""
     for name, command, text in (
         ("agents", _agents, "list the agents that come with crashhunt or are installed, with their arguments"),
+        ("disturbances", _disturbances, "list the disturbances that come with crashhunt or are installed"),
         ("oracles", _oracles, "list the oracles that come with crashhunt or are installed, with their arguments"),
         ("scenarios", _scenarios, "list the scenarios that come with crashhunt, with their arguments"),
     ):
@@ -35,6 +36,12 @@ def _agents(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import list_agents
 
     return _print_listing("agents", list_agents(), as_json=options.json)
+
+
+def _disturbances(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.report import list_disturbances
+
+    return _print_listing("disturbances", list_disturbances(), as_json=options.json)
 
 
 def _oracles(options: argparse.Namespace, _words: list[str]) -> int:

@@ -147,7 +147,7 @@ class Bundle:
         """Return the shape that ``run --json`` prints."""
         plain = self.result.to_json()
         spec = plain["spec"]
-        return {
+        found: CrashSummary = {
             "id": self.id,
             "trial": spec["number"],
             "seed": spec["seed"],
@@ -159,6 +159,10 @@ class Bundle:
             "digest": plain["digest"],
             "confirmed": self.confirmed,
         }
+        if "log_likelihood" in plain:
+            found["disturbed"] = self.result.disturbed
+            found["log_likelihood"] = plain["log_likelihood"]
+        return found
 
     def write(self, into: Path | None = None) -> None:
         """Write ``crash.json``, all of it or nothing; into another folder where the bundle is still being built."""

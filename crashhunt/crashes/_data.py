@@ -71,6 +71,8 @@ class CrashSummary(TypedDict):
     path: str
     digest: str
     confirmed: bool | None
+    disturbed: NotRequired[bool]
+    log_likelihood: NotRequired[float | None]
 
 
 class ArchiveIndex(TypedDict):

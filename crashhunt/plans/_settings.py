@@ -140,7 +140,7 @@ def _flat(data: object, prefix: str = "") -> dict[str, str]:
             found |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
         return found
     if isinstance(data, list | tuple):
-        return {prefix: ",".join(str(item) for item in data)}
+        return {prefix: ",".join(str(item) for item in data) or "none"}
     return {prefix.removesuffix(".spec"): str(data)}
 
 

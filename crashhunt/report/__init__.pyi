@@ -5,6 +5,7 @@ from ._listing import (
     ListingEntry as ListingEntry,
     describe as describe,
     list_agents as list_agents,
+    list_disturbances as list_disturbances,
     list_oracles as list_oracles,
     list_scenarios as list_scenarios,
 )

@@ -16,7 +16,15 @@ if TYPE_CHECKING:
     from crashhunt.base.plugins import Group
     from crashhunt.trial import Argument, Kind, Value
 
-__all__ = ["ArgumentEntry", "ListingEntry", "describe", "list_agents", "list_oracles", "list_scenarios"]
+__all__ = [
+    "ArgumentEntry",
+    "ListingEntry",
+    "describe",
+    "list_agents",
+    "list_disturbances",
+    "list_oracles",
+    "list_scenarios",
+]
 
 
 class ArgumentEntry(TypedDict):
@@ -45,6 +53,11 @@ class ListingEntry(TypedDict):
 def list_agents() -> list[ListingEntry]:
     """Return the registered agents. One that cannot be imported is listed with a warning: nobody asked for it."""
     return _list("agents")
+
+
+def list_disturbances() -> list[ListingEntry]:
+    """Return the registered models of disturbances, likewise."""
+    return _list("disturbances")
 
 
 def list_oracles() -> list[ListingEntry]:

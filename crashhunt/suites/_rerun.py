@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.disturbances import NONE
 from crashhunt.hunts import HuntState, Ledger, hunt_state
 from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
@@ -98,7 +99,7 @@ def _request_of(settings: HuntSettings) -> Request:
     }
     options = {name: getattr(settings, name) for name in fields_of(TrialOptions)}
     return Request(
-        **{**options, "crash_on": settings.crash_on_words},
+        **{**options, "crash_on": settings.crash_on_words, "disturb": settings.disturb or (NONE,)},
         trials=settings.trials,
         max_steps=settings.max_steps,
         scenario=settings.scenario,

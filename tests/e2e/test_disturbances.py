@@ -23,6 +23,8 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     assert all(crash["confirmed"] for crash in crashes)
     saved = [json.loads((toy.folder / crash["path"] / "crash.json").read_text()) for crash in crashes]
     disturbed = [data for data in saved if data["disturbed"]]
+    for crash, data in zip(crashes, saved, strict=True):
+        assert (crash["disturbed"], crash["log_likelihood"]) == (data["disturbed"], data["log_likelihood"])
     assert disturbed
     assert all(bool(data["disturbances"]) == data["disturbed"] for data in saved)
     assert all(one["vehicle"] == "leader" for data in saved for one in data["disturbances"])
@@ -49,8 +51,15 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     assert (table["disturbances"] > 0).sum() >= len(disturbed)
 
 
+def test_they_are_listed(toy):
+    found = toy.crashhunt("disturbances", "--json").json["disturbances"]
+    assert {entry["name"] for entry in found} >= {"brake", "cut_in", "late_action"}
+    assert "Whoever is ahead brakes hard, and lets go again." in toy.crashhunt("disturbances").out
+
+
 def test_what_is_not_asked_for_is_nowhere(toy):
     done = hunt(toy, trials="2")
+    assert all("disturbed" not in crash for crash in done.json["crashes"])
     assert "isturb" not in done.err
     assert "disturb" not in (toy.folder / "h" / "hunt.toml").read_text()
     assert "log_likelihood" not in toy.crashhunt("trials", "h").out
@@ -76,6 +85,19 @@ def test_a_scenario_says_it_and_none_takes_it_back(toy):
     assert "\ndisturb" not in (toy.folder / "h" / "hunt.toml").read_text()
     file.write_text(f"{before}\n[disturbances]\nbraek = 0.5\n")
     assert "did you mean 'brake'" in hunt_refused(toy)
+
+
+def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
+    file = toy.folder / "toy" / "scenario.toml"
+    hunt(toy, "--disturb", "brake=0.5", trials="1")
+    done = toy.crashhunt("run", "h", "1", "2", "100", *WORDS, expect=2)
+    assert "another hunt is there: disturb was brake=0.5 and is now none" in done.err
+    toy.crashhunt("rerun", "h", "--to", "again")
+    assert crashhunt.load(toy.folder / "again").settings.disturb == ("brake=0.5",)
+    hunt(toy, "--overwrite", trials="1")
+    file.write_text(f"{file.read_text()}\n[disturbances]\nbrake = 0.5\n")  # which is said later
+    toy.crashhunt("rerun", "h", "--to", "once_more")
+    assert crashhunt.load(toy.folder / "once_more").settings.disturb == ()
 
 
 def hunt_refused(shell, *more):
