@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.trial import Outcome, ResultData, Value
+    from crashhunt.world import ClosestData
 
 __all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "Cell", "TrialRow"]
 
@@ -34,8 +35,8 @@ Cell: TypeAlias = "Value | None"
 class TrialRow:
     """One trial of many.
 
-    It is made of plain data, as ledgers yield them: a table has a million trials, and a `TrialResult` takes three
-    times as long.
+    What an earlier version did not write is missing here. It is made of plain data, as ledgers yield them: a table has
+    a million trials, and a `TrialResult` takes three times as long.
 
     Args:
         data: of the trial.
@@ -56,17 +57,17 @@ class TrialRow:
     @property
     def time_to_collision_s(self) -> float | None:
         """The least; None where no course ever crossed."""
-        return self.data["closest"]["time_to_collision_s"]
+        return _closest(self.data).get("time_to_collision_s")
 
     @property
     def arguments(self) -> Mapping[str, Mapping[str, Value]]:
         """What its agents were given, by agent and name."""
-        return self.data["spec"]["arguments"]
+        return self.data["spec"].get("arguments", {})
 
     @property
     def scenario_arguments(self) -> Mapping[str, Value]:
         """What its scenario was given, by name."""
-        return self.data["spec"]["scenario_arguments"]
+        return self.data["spec"].get("scenario_arguments", {})
 
     def cells(self, columns: Sequence[str]) -> dict[str, Cell]:
         """Return it as a row of a table that has some columns.
@@ -75,18 +76,18 @@ class TrialRow:
             columns: some of `FACTS`, `DISTURBANCES` and `ORIGINS`, ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
         """
         data = self.data
-        spec, closest, events = data["spec"], data["closest"], data.get("events")
+        spec, closest, events = data["spec"], _closest(data), data.get("events")
         found: dict[str, Cell] = {
             "number": spec["number"],
             "seed": spec["seed"],
             "outcome": data["outcome"],
             "steps": data["steps"],
-            "sim_time_s": data["sim_time_s"],
-            "time_to_collision_s": closest["time_to_collision_s"],
-            "gap_m": closest["gap_m"],
-            "required_deceleration": closest["required_deceleration"],
-            "wall_s": data["wall_s"],
-            "digest": data["digest"],
+            "sim_time_s": data.get("sim_time_s"),
+            "time_to_collision_s": closest.get("time_to_collision_s"),
+            "gap_m": closest.get("gap_m"),
+            "required_deceleration": closest.get("required_deceleration"),
+            "wall_s": data.get("wall_s"),
+            "digest": data.get("digest"),
             "parent": spec.get("parent"),
             "origin": spec.get("origin", ""),
             "disturbances": len(data.get("disturbances", ())),
@@ -95,9 +96,13 @@ class TrialRow:
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)
             found |= events
-        for agent, given in spec["arguments"].items():
+        for agent, given in self.arguments.items():
             for name, value in given.items():
                 found[f"{agent}.{name}"] = value
-        for name, value in spec["scenario_arguments"].items():
+        for name, value in self.scenario_arguments.items():
             found[f"scenario.{name}"] = value
         return {name: found.get(name) for name in columns}
+
+
+def _closest(data: ResultData) -> ClosestData:
+    return data.get("closest") or {}

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 __all__ = ["ClosestApproach", "ClosestData"]
 
 
-class ClosestData(TypedDict):
-    """The plain data of a `ClosestApproach`."""
+class ClosestData(TypedDict, total=False):
+    """The plain data of a `ClosestApproach`; an earlier version may have written less."""
 
     time_to_collision_s: float | None
     gap_m: float | None

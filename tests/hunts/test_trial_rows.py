@@ -1,0 +1,68 @@
+"""What tables and pages tell of a trial, and the plain data that they take it from."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+from crashhunt.hunts import FACTS, TrialRow
+from crashhunt.trial import EVENTS, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach, Event
+
+SPEC = TrialSpec(3, 7, {"ego": {"speed": 11.5}}, {"gap_m": 4}, max_steps=100, parent=1, origin="climb")
+# Every value is another one, so that none stands in another's place unnoticed.
+RESULT = TrialResult(
+    SPEC,
+    Outcome.COLLISION,
+    steps=9,
+    sim_time_s=0.9,
+    digest="ab",
+    closest=ClosestApproach(0.25, 0.5, 6.5),
+    collision=Collision("ego", "victim", "car", "ego", ("overlap",), "junction", 1.5, 2.5, "a_0", 12.5, 13.5, 0.875),
+    failure=Failure("KeyError", "'x'", "Trace", "other", -9, "out"),
+    wall_s=2.25,
+    setup_s=1.75,
+    worker=99,
+    kept=True,
+    escape=Escape(4, 5, 7.5, "by braking"),
+    event=Event("teleport", "ego", "car was moved", ("car",), "b_0", 3.5, 4.5, 14.5),
+    events={"teleport": 2},
+)
+
+
+def test_plain_data_has_every_value_of_a_result():
+    """A field that is added, and not written or not read, shows here, as long as it is given above."""
+    assert TrialResult.from_json(json.loads(json.dumps(RESULT.to_json()))) == RESULT
+    for part in (RESULT.collision, RESULT.failure, RESULT.escape, RESULT.event, RESULT.closest):
+        assert list(part.to_json()) == [item.name for item in dataclasses.fields(part)]
+
+
+def test_a_row_has_every_column():
+    columns = (*FACTS, "parent", "origin", "ego.speed", "scenario.gap_m", "ego.other")
+    row = TrialRow(RESULT.to_json()).cells(columns)
+    assert row == {
+        "number": 3, "seed": 7, "outcome": "collision", "steps": 9, "sim_time_s": 0.9, "time_to_collision_s": 0.25,
+        "gap_m": 0.5, "required_deceleration": 6.5, "wall_s": 2.25, "digest": "ab",
+        **dict.fromkeys(EVENTS, 0), "teleport": 2,
+        "parent": 1, "origin": "climb", "ego.speed": 11.5, "scenario.gap_m": 4, "ego.other": None,
+    }  # fmt: skip
+    assert tuple(row) == columns
+
+
+def test_where_nobody_looked_for_events_a_row_does_not_say_that_there_were_none():
+    unseen = dataclasses.replace(RESULT, events=None, closest=ClosestApproach())
+    row = TrialRow(unseen.to_json())
+    assert set(row.cells([str(kind) for kind in EVENTS]).values()) == {None}
+    assert (row.number, row.outcome, row.time_to_collision_s) == (3, Outcome.COLLISION, None)
+    assert (row.arguments, row.scenario_arguments) == ({"ego": {"speed": 11.5}}, {"gap_m": 4})
+
+
+def test_a_row_of_an_earlier_version_has_what_that_wrote():
+    row = TrialRow({"spec": {"number": 3, "seed": 7, "max_steps": 9}, "outcome": "survived", "steps": 9})
+    assert (row.time_to_collision_s, row.arguments, row.scenario_arguments) == (None, {}, {})
+    assert row.cells(("seed", "gap_m", "wall_s", "digest")) == {
+        "seed": 7,
+        "gap_m": None,
+        "wall_s": None,
+        "digest": None,
+    }
