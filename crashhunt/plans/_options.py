@@ -159,8 +159,8 @@ class RunOptions(_Options):
     )  # fmt: skip
     executor: str = option(
         "pool", "where trials run: its name, and perhaps ``:ARG``",
-        help="where trials run: pool (warm processes on this machine), fresh (a new process for each) or "
-        "module:attribute; ARG is for one that takes an argument",
+        help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "
+        "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; ARG is for one that takes an argument",
         flag="--executor", metavar="NAME[:ARG]", anywhere=True,
     )  # fmt: skip
 
