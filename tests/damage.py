@@ -102,7 +102,7 @@ def damage_ledger(path: Path, generator: random.Random) -> str:
             "row": [(f"DELETE FROM {table} WHERE {key} = ?", (chosen,))],
             "column": [(f"ALTER TABLE {table} DROP COLUMN {column}", ())],
             "table": [(f"DROP TABLE {table}", ())],
-            "version": [(f"PRAGMA user_version = {generator.choice((0, 1, 3, 99))}", ())],
+            "version": [(f"PRAGMA user_version = {generator.choice((0, 1, 2, 99))}", ())],
             "index": [("DROP INDEX trials_by_outcome", ())],
             "add": [(f"INSERT INTO {table} SELECT * FROM {table} LIMIT 1", ())],
         }[kind]  # fmt: skip
