@@ -202,7 +202,8 @@ def test_the_same_is_drawn_in_every_run(run, monkeypatch):
     random.seed(5)
     run(again)
     assert first.asked == again.asked
-    assert seeds["ego"][0] != seeds["second"][0]
+    # What a policy draws follows from them, and so do the digests of crashes.
+    assert [log[0] for log in seeds.values()] == [("seed", 774435325), ("seed", 327075251)]
     seeded = []
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(manual_seed=seeded.append))
     run(other)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import Parts, WorkerSettings, require_origin
+from crashhunt.episode import Parts, WorkerSettings, _parts, require_origin, seal
 from crashhunt.scenario import load_scenario
 
 AGENT = """
@@ -117,3 +120,23 @@ def test_a_module_of_the_snapshot_may_come_from_nowhere_else(made, tmp_path):
         require_origin("elsewhere_agent", (str(package.parent),))
     sys.modules["elsewhere_agent"].__file__ = None  # as a namespace has none
     require_origin("elsewhere_agent", (str(package.parent),))
+
+
+def test_a_strangers_code_is_confined_to_its_scratch_folder(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(_parts, "confine", lambda folder, readable: asked.append((folder, list(readable))))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    monkeypatch.chdir(tmp_path)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    scenario = replace(load_scenario("loop"), folder=tmp_path / "scenario")
+    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=scratch)
+    before = dict(os.environ)
+    seal(settings)  # our own code works where it was started, with what it was given
+    assert (Path.cwd(), os.environ, asked) == (tmp_path, before, [])
+    for _ in range(2):  # the next worker finds the folder
+        seal(replace(settings, sealed=("/code", "/files")))
+    home = scratch / "home"
+    assert Path.cwd() == home
+    assert os.environ == {**before, "HOME": str(home), "TMPDIR": str(home)}
+    assert asked == [(scratch, [tmp_path / "scenario", "/code", "/files"])] * 2

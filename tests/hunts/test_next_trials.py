@@ -6,13 +6,14 @@ import random
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from climber import Climber
 from hypothesis import given, settings as how, strategies as st
 
 from crashhunt.errors import PluginError
-from crashhunt.hunts import Ledger, Trials
+from crashhunt.hunts import Ledger, Trials, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
 from crashhunt.trial import Outcome, TrialResult
@@ -133,6 +134,17 @@ def test_what_a_killed_hunt_had_started_is_what_runs_after(tmp_path_factory, see
                 sampler.tell(ledger.result(number))
             assert turn.spec.origin.split()[1] == str(sampler._told)
             assert turn.spec == ran[turn.spec.number]
+
+
+def test_each_trial_is_drawn_from_its_number_and_the_seed_of_the_hunt():
+    chosen = settings("random")
+    sampler = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+    specs = [spec_of(number, chosen, sampler) for number in range(3)]
+    # The same for ever: a hunt that is gone on with, or repeated, has the trials that it had.
+    assert [spec.seed for spec in specs] == [1359935555, 1529200838, 1894986895]
+    assert [spec.arguments["ego"]["speed"] for spec in specs] == pytest.approx([8.196639, 5.231068, 8.460145])
+    other = replace(chosen, seed=4)
+    assert spec_of(0, other, sampler).seed not in [spec.seed for spec in specs]
 
 
 def test_with_one_worker_nothing_depends_on_time(tmp_path):

@@ -112,8 +112,11 @@ def scene(gap_m, *, speed=10.0, other_speed=5.0, turn=0.0):
 @pytest.mark.parametrize("turn", [0.0, 1.5707963267948966])
 def test_a_near_miss_is_a_gap_below_the_limit_and_no_contact(turn):
     oracle = TooClose(gap_m=0.5)
-    (finding,) = oracle.check(scene(0.3, turn=turn), ["ego"])
+    near = scene(0.3, turn=turn)
+    near.agent_lanes = {"ego": "east_1"}
+    (finding,) = oracle.check(near, ["ego"])
     assert finding.outcome == "too_close"
+    assert finding.event.lane == "east_1"
     assert finding.event.what == "ego came within 0.30 m of left.3"
     assert finding.event.others == ("left.3",)
     assert finding.event.speed == 10.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
 
-from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, TooClose, merge_findings
 from crashhunt.trial import Collision, Outcome
 from crashhunt.world import (
     Actor,
@@ -105,6 +105,19 @@ def test_time_to_contact_agrees_with_moving_there(one, two, vx, vy):
         assert touching < 1e-6
     else:
         assert not any(outlines_overlap(one, at(time)) for time in np.linspace(0, 5, 60))
+
+
+@given(rectangles, rectangles)
+def test_a_near_miss_is_as_near_as_points_of_the_outlines_say(one, two):
+    roster = Roster((Actor("ego", "car", *one[3:]), Actor("other", "car", *two[3:])))
+    scene = Scene(0.0, roster, [one[:2], two[:2]], [one[2], two[2]], [0.5, 0.0])
+    found = TooClose(gap_m=6.0, speed=0.0).check(scene, ["ego"])
+    distance = border_distance(one, two)
+    if outlines_overlap(one, two) or distance > 6.2:
+        assert found == []
+    elif 0.1 < distance < 6.0:
+        said = float(found[0].event.what.split()[3])
+        assert -0.01 < distance - said < 0.2
 
 
 def test_time_to_contact_of_vehicles_in_line():

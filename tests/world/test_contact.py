@@ -7,7 +7,7 @@ import math
 import pytest
 from scenes import scene
 
-from crashhunt.world import first_contact
+from crashhunt.world import _contact, first_contact
 
 TURNS = [0.0, 0.8, -2.6]
 
@@ -133,9 +133,10 @@ def test_who_was_not_there_or_was_put_there_did_not_drive():
     fresh = scene(("other", 12, 0, 0, 0), time_s=0.0)
     assert first_contact(fresh, there, 0, 1).share == 1
     # 1.5 times as far as its speed explains, and a metre; sideways twelve metres more.
-    for x, share in ((15.9, 7 / 15.9), (16.1, 1.0)):
-        far = scene(("ego", x, 0, 0, 10), ("other", 12, 0, 0, 0), time_s=1.0, swept=True)
-        assert first_contact(before, far, 0, 1).share == pytest.approx(share, abs=1e-6)
+    for turned in TURNS:
+        for x, share in ((15.9, 7 / 15.9), (16.1, 1.0)):
+            found = touched(turned, [(0, 0, 0, 10), (12, 0, 0, 0)], [(x, 0, 0, 10), (12, 0, 0, 0)])
+            assert found.share == pytest.approx(share, abs=1e-6)
     slowing = scene(("ego", 12, 0, 0, 0), ("other", 14, 0, 0, 0), time_s=1.0, swept=True)
     assert first_contact(before, slowing, 0, 1) is not None  # it is the faster of both scenes that counts
     wide = scene(("ego", 10, 27, 0, 10), ("other", 12, 0, 0, 0), time_s=1.0, swept=True)
@@ -271,6 +272,22 @@ def test_who_does_not_drive_as_cars_do_goes_straight(turned, who, away):
     heading = before[2] + (after[2] - before[2]) * (found.share if found else 0) - math.atan2(8, 6)
     reach = (abs(math.cos(heading)) + abs(math.sin(heading))) / 2  # of its corner, along the way
     assert found.share == pytest.approx((away - reach) / 10, abs=0.005)
+
+
+@pytest.mark.parametrize("end", [(6.0, 1.0, 0.4), (5.0, -2.0, -0.9), (7.0, 4.0, 0.0)], ids=["left", "right", "jump"])
+def test_which_way_it_moves_is_how_its_place_changes(end):
+    """What decides between two that touch side by side."""
+    way = _contact._Way((1.0, 2.0, 0.3, 4.0, 1.8), (1.0 + end[0], 2.0 + end[1], 0.3 + end[2], 4.0, 1.8), bends=True)
+    assert way.reach == pytest.approx(math.hypot(4.0, 1.8) / 2)
+    for share in (0.1, 0.5, 0.9):
+        before, after = (_contact._center(way.at(share + change)) for change in (-1e-6, 1e-6))
+        rate = [(now - was) / 2e-6 for was, now in zip(before, after, strict=True)]
+        assert way.moving(share) == pytest.approx(rate, abs=1e-5)
+    if any(way.jump):  # at once, at the end
+        assert way.moving(1.0) == way.jump
+        assert math.hypot(*way.jump) > 1.5
+    else:
+        assert way.moving(1.0) == pytest.approx(way.moving(1 - 1e-9), abs=1e-6)
 
 
 def test_what_brushes_past_in_a_bend_has_not_touched():
