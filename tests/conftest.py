@@ -13,6 +13,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import hypothesis
@@ -160,7 +161,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test itself replays, end to end, starts as little as what its commands do."""
     if request.path.parent.name == "e2e":
-        monkeypatch.setattr("crashhunt.base.keeper.subprocess", _commands().warm.subprocess)
+        monkeypatch.setattr(
+            "crashhunt.base.keeper.subprocess",
+            SimpleNamespace(
+                Popen=lambda *words, **options: _commands().warm.popen(*words, **options),
+                TimeoutExpired=subprocess.TimeoutExpired,
+            ),
+        )
 
 
 def needed(*names: str) -> str:
