@@ -10,13 +10,10 @@ import math
 from collections.abc import Mapping
 from typing import TypeAlias, TypedDict, final
 
-__all__ = ["ErrorData", "ErrorWords", "Json", "JsonObject", "Plain", "finite", "finite_values"]
+__all__ = ["ErrorData", "ErrorWords", "Json", "Plain", "finite", "finite_values"]
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 """What `json.loads` returns."""
-
-JsonObject: TypeAlias = "dict[str, Json]"
-"""An object of it, as `crashhunt.base.integrity.read_object` returns one."""
 
 Plain: TypeAlias = Mapping[str, object]
 """An object that is only looked through or written: any `TypedDict` is one."""
