@@ -3,20 +3,39 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
 
 import crashhunt
 from crashhunt.recording import RECORD_TYPES, Tag
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 ROOT = Path(crashhunt.__file__).parent
+
+
+@functools.cache  # several rules read every file
+def nodes_of(file: Path) -> list[ast.AST]:
+    """All of what a file says."""
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget() -> Iterator[None]:
+    yield
+    nodes_of.cache_clear()
 
 
 def private_imports(file: Path) -> list[str]:
     """The private modules and names that a file imports from outside its own package."""
     package = file.relative_to(ROOT).parts[0]
     found = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if not isinstance(node, ast.ImportFrom) or node.module is None or not node.module.startswith("crashhunt."):
             continue
         _, *parts = node.module.split(".")
@@ -39,7 +58,7 @@ _OTHERS = ("recording/_schemas.py", "simulators/accelerator/", "simulators/highw
 def asked_by_name(file: Path) -> list[str]:
     """Where a file asks whether something has an attribute, by a name that no type checker sees."""
     found = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes_of(file):
         if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or len(node.args) < 2:
             continue
         name = node.args[1].value if isinstance(node.args[1], ast.Constant) else None
@@ -73,10 +92,10 @@ NAMED_ALL_THE_SAME = {
 
 def simulators_named(file: Path) -> list[str]:
     """The simulators that the code of a file names; what is there for people to read is not code."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    tree = nodes_of(file)
+    prose = {id(node.value) for node in tree if isinstance(node, ast.Expr)}
     found = []
-    for node in ast.walk(tree):
+    for node in tree:
         if id(node) in prose:
             continue
         said = [value for _, value in ast.iter_fields(node) if isinstance(value, str)]
@@ -115,7 +134,7 @@ def test_test_files_have_names_of_their_own():
 
 def uses_of_any(file: Path) -> int:
     """How often a file says `Any`: wherever it is imported, in annotations, and in those that are text."""
-    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    nodes = nodes_of(file)
     named = sum(isinstance(node, ast.Name) and node.id == "Any" for node in nodes)
     imported = sum(isinstance(node, ast.alias) and node.name == "Any" for node in nodes)
     texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
