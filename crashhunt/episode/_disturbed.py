@@ -16,7 +16,7 @@ import numpy as np
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.faculties import offers
 from crashhunt.simulators import Disturbs, HasMeanings, NamesObservations
-from crashhunt.trial import OF_AGENT, Disturbance, in_effect
+from crashhunt.trial import OF_AGENT, Disturbance, in_effect, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -131,7 +131,7 @@ class Disturbed:
                     going.errs.end()
 
     def _steps(self, seconds: float) -> int:
-        return max(1, round(seconds / self._dt))
+        return steps_of(seconds, self._dt)
 
     def _begin(self, planned: Disturbance) -> None:
         """Have a vehicle err from this step on, where there is one that can."""

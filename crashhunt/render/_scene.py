@@ -22,6 +22,7 @@ __all__ = ["SceneView"]
 
 _SKY, _ROAD, _MARK = (246, 247, 249), (228, 232, 237), (170, 180, 192)
 _EGO, _CRASH, _AGENT, _OTHER = (224, 138, 0), (198, 40, 40), (46, 158, 91), (125, 139, 156)
+_DISTURBED = (128, 62, 158)
 _TRAIL_S = 4.0  # of where the agent has been
 _PERSON_PIXELS = 4  # radius at least; a person is 20 cm long
 _FINE = 2  # drawn so many times larger, for smooth edges
@@ -152,6 +153,11 @@ class SceneView:
             top = 36 + _LEGEND_STEP * place
             draw.rectangle((13, top + 3, 25, top + 15), fill=color)
             draw.text((32, top), name, INK, font(13))
+        told = (one for one in self._recording.disturbances if one.vehicle)
+        going = [one.words for one in told if one.goes_on(step, self._recording.prologue.step_length_s)]
+        for place, words in enumerate(going):
+            top = 40 + _LEGEND_STEP * (len([name for name, _ in names if name]) + place)
+            draw.text((12, top), words.replace("²", "^2"), _DISTURBED, font(13))  # the font has no ²
         if step == self._crash_step:
             draw.text((self.width / 2, 14), "CRASH", _CRASH, font(26), anchor="ma")
         if not self._recording.actors:

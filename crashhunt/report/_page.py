@@ -22,7 +22,7 @@ from crashhunt.report._disturbances import by_likelihood
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
-from crashhunt.trial import Outcome
+from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ def report_data(
         "planned": settings.trials,
         "maxSteps": settings.max_steps,
         "scenarioArguments": list(settings.scenario_arguments),
+        "disturb": ",".join(settings.disturb),
         "units": {
             _shown_name(agent, name, settings): unit
             for (agent, name), unit in argument_units(directory, settings).items()
@@ -167,6 +168,10 @@ def _crash(bundle: Bundle) -> dict[str, object]:
         **_scenes(recording, story.agent),
         **({} if story.encounter is None else {"gap": _gap_to_other(story.encounter, recording)}),
         "lanes": _lanes(bundle, recording),
+        "disturbances": [
+            [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words]
+            for one in result.disturbances
+        ],
     }
 
 

@@ -11,6 +11,7 @@ from ._disturbance import (
     KINDS as KINDS,
     OF_AGENT as OF_AGENT,
     Disturbance as Disturbance,
+    steps_of as steps_of,
 )
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial._data import DisturbanceData
 
-__all__ = ["CELLS", "KINDS", "OF_AGENT", "Disturbance", "Kind"]
+__all__ = ["CELLS", "KINDS", "OF_AGENT", "Disturbance", "Kind", "steps_of"]
 
 
 _PLACES = {
@@ -62,6 +62,11 @@ KINDS: Mapping[str, Kind] = {
 
 OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 """Those of them that need nothing of the simulator."""
+
+
+def steps_of(seconds: float, step_length_s: float) -> int:
+    """Return in how many steps something of so many s goes on: in one at least."""
+    return max(1, round(seconds / step_length_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +119,10 @@ class Disturbance:
         agent = self.agent or "the agent"
         # A later version may know more places.
         return _PLACES[self.who].format(agent) if self.who in _PLACES else f"{self.who} of {agent}"
+
+    def goes_on(self, step: int, step_length_s: float) -> bool:
+        """Whether it goes on in a step, of a simulation with such steps."""
+        return self.step <= step < self.step + steps_of(self.how_long, step_length_s)
 
     def to_json(self) -> DisturbanceData:
         """Return plain text and numbers; who was meant only where that is known."""

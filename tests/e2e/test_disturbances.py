@@ -46,6 +46,11 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     without = toy.crashhunt("replay", "h", "--crash", crash, "--set", "disturbances=none", expect=None)
     assert "disturbances were" in without.out
 
+    toy.crashhunt("report", "h", "--out", "report.html")
+    page = (toy.folder / "report.html").read_text()
+    assert f"[{first['step']}, " in page
+    assert '"disturb": "brake=0.02,stop=0.05"' in page
+
     table = crashhunt.load(toy.folder / "h").trials()
     assert set(table["log_likelihood"] < 0) == {True}
     assert (table["disturbances"] > 0).sum() >= len(disturbed)

@@ -14,6 +14,7 @@ from PIL import Image
 from crashhunt.errors import CrashhuntError, UsageError
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.render import FilmOptions, Layout, Shot, check_places, frames, write_frames, write_gif, write_video
+from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Roster, Scene
 
 ROSTER = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("other", "truck", 12.0, 2.5)))
@@ -32,7 +33,7 @@ def shot(steps: int = 20, *, crash: bool = True, other: str = "other", panels=No
     ]
     recording = SimpleNamespace(
         all_steps=records, prologue=Prologue((), 0.1), steps=steps, agents=["ego"], actors=list(ROSTER.actors),
-        scenes=lambda: [record.scene for record in records], scene=lambda n: records[n].scene,
+        disturbances=(), scenes=lambda: [record.scene for record in records], scene=lambda n: records[n].scene,
     )  # fmt: skip
     x = np.linspace(-50, 150, 30)
     lanes = [(np.stack((x, np.full(30, -1.6)), 1), np.stack((x, np.full(30, 1.6)), 1))]
@@ -41,6 +42,17 @@ def shot(steps: int = 20, *, crash: bool = True, other: str = "other", panels=No
 
 def film(*shots: Shot, **options) -> list[np.ndarray]:
     return list(frames(shots, FilmOptions(**({"size": (320, 200)} | options))))
+
+
+def test_what_disturbs_is_told_while_it_goes_on():
+    plain, disturbed = shot(), shot()
+    disturbed.recording.disturbances = (
+        Disturbance(5, "ahead", "brake", 4.0, 0.5, "ego", "other"),
+        Disturbance(5, "behind", "speed", 4.0, 0.5, "ego"),  # nobody was there
+    )
+    pairs = zip(film(plain, panels=False), film(disturbed, panels=False), strict=True)
+    changed = [number for number, (was, now) in enumerate(pairs) if (was != now).any()]
+    assert changed == [5, 6, 7, 8, 9]
 
 
 def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:

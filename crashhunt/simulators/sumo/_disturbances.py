@@ -55,8 +55,9 @@ class SumoDisturbances:
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
         """Command a vehicle; None where it cannot do that."""
-        strong, decel = disturbance.how_strong, float(sumo.vehicle_getDecel(vehicle))
+        strong = disturbance.how_strong
         try:
+            decel = float(sumo.vehicle_getDecel(vehicle))
             if disturbance.what in ("brake", "stop"):
                 return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
             if disturbance.what == "dawdle":
