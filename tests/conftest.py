@@ -259,3 +259,8 @@ def add_toy(shell: Shell) -> Shell:
 def toy(shell: Shell) -> Shell:
     """The same with the scenario `toy`."""
     return add_toy(shell)
+
+
+def keeps_going(toy: Shell) -> None:
+    """Hunt 25 trials of it, of which some crash, in ``h``; for `made_once`."""
+    toy.crashhunt("run", "h", "2", "25", "99", "--scenario", "toy", "--seed", "4", "--keep-going")

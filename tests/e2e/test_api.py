@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import warnings
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from conftest import keeps_going
 
 import crashhunt
 from crashhunt.errors import CrashhuntError, HuntDirectoryError, UsageError
@@ -17,7 +19,6 @@ from crashhunt.hunts import HuntResults, SuiteResults, UnfinishedWarning
 if TYPE_CHECKING:
     from crashhunt.hunts import HuntState
 
-KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 SCRIPT = """
 import crashhunt
 print("top level")
@@ -38,14 +39,10 @@ def test_a_script_needs_no_guard(toy):
     assert done.stdout.split() == ["top", "level", "crash", "True", "done", "reproduced", "fixed"]
 
 
-def hunted(toy):
-    toy.crashhunt("run", "h", "2", "25", "99", *KEEP)
-
-
 @pytest.fixture
 def hunt(toy, made_once, monkeypatch):
     monkeypatch.chdir(toy.folder)
-    return made_once(hunted, toy)
+    return made_once(keeps_going, toy)
 
 
 def test_results_are_typed_objects_and_arrays(hunt):
@@ -98,7 +95,7 @@ def test_what_is_not_finished_says_so(hunt):
 
 
 def test_comparisons_are_printable(hunt):
-    hunt.crashhunt("run", "again", "2", "25", "99", *KEEP)
+    shutil.copytree(hunt.folder / "h", hunt.folder / "again")  # the same trials
     found = crashhunt.compare("h", "again")
     assert repr(found).startswith("<comparison h: ")
     assert found.pairs[0].both == found.hunts[0].crashes
