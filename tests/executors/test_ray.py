@@ -270,6 +270,17 @@ def test_an_address_that_leads_nowhere_is_one_line(settings, monkeypatch, tmp_pa
     assert [path.name for path in settings.scratch.iterdir()] == []
 
 
+def test_a_hunt_that_nobody_would_run_ends_at_once(toy):
+    began = time.monotonic()
+    words = ("run", "h", "0", "4", "20", "--scenario", "toy", "--executor", "ray:127.0.0.1:1")
+    said = toy.crashhunt(*words, expect=2).err.splitlines()
+    assert said[-1].startswith(
+        "crashhunt: --executor ray:127.0.0.1:1: nobody answers there (Connection refused); start"
+    )
+    assert time.monotonic() - began < 10
+    assert not (toy.folder / "h" / ".scratch").exists()
+
+
 def test_the_address_may_stand_in_the_environment(settings, monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: nobody answers there"):

@@ -240,12 +240,12 @@ class Bridge:
         count = len(node.running)
         culprits = self._roster.lose(node)
         self._cluster.kill(node.actor)
-        self._losses[node.id] = self._losses.get(node.id, 0) + 1
+        self._losses[node.id] = 0 if culprits else self._losses.get(node.id, 0) + 1
         if self._losses[node.id] >= _LOSSES:
             self._refused[node.id] = f"{node.name}: its process was ended {_LOSSES} times before a trial was done"
             self._say(note=f"node {self._refused[node.id]}; it takes no part any more")
         elif node.ready:
-            again = f", with {count} trials, which run again" if count else ""
+            again = f" with {count} trial{'s' * (count != 1)}, to be run again" if count and not culprits else ""
             self._say(note=f"node {node.name} was lost{again}")
         self._say(capacity=self._roster.capacity, node=node.id, where={})
         for trial in culprits:
