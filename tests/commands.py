@@ -102,7 +102,11 @@ class Commands:
         self._control.close()
         self._process.wait(10)
         self.warm.control.close()
-        self._kept.wait(10)
+        try:
+            self._kept.wait(10)
+        except subprocess.TimeoutExpired:  # a hunt that a test has left has a socket to it
+            self._kept.kill()
+            self._kept.wait()
 
 
 def _text(data: bytes) -> str:
