@@ -123,6 +123,7 @@ class Episodes:
             agents=(self.agent, *(other for other in self._simulator.actions if other != self.agent)),
             actors=scenes[-1].roster.actors,
             prologue=SimpleNamespace(step_length_s=self.step_length_s),
+            disturbances=(),
             # A trail that is longer than what is remembered ends there.
             scene=lambda step: scenes[max(0, step - first)],
         )
