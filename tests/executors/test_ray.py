@@ -194,6 +194,30 @@ def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_pa
     assert digests(found) == digests(on_one_machine(settings, specs, tmp_path))
 
 
+def test_where_all_nodes_are_lost_it_waits_and_says_so(begin, add):
+    """The machine goes with everything on it; CPUs that somebody else leaves then are as good as a new one."""
+    other = begin(2)
+    other.submit(spec(99))
+    collect(other, 1)
+    node = add(num_cpus=1)
+    executor = begin()
+    for number in range(8):
+        executor.submit(spec(number, step_wall_s=0.01))
+    found = collect(executor, 1)
+    for pid in [raylet(node), *below(raylet(node))]:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    deadline = time.monotonic() + DEADLINE_S
+    while not any(line.startswith("no node of the cluster is left; the hunt waits") for line in executor.notes()):
+        assert time.monotonic() < deadline
+        found |= {result.spec.number: result for result in executor.completed(0.1)}
+    assert executor.nodes() == []
+    assert executor.capacity == 1, "or the hunt would take it for done"
+    assert len(found) < 8
+    other.close()
+    collect_into(found, executor, 8)
+
+
 def test_a_node_that_differs_takes_no_part_and_the_others_go_on(begin, add, tmp_path):
     """What travels to it says so, whatever there is."""
     other = tmp_path / "other" / "libsumo-0.1.dist-info"

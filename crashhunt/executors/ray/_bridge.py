@@ -197,6 +197,7 @@ class Bridge:
         elif said == "ready":
             node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
             self._say(capacity=self._roster.capacity)
+            self._tell_figures(now=True)
             self._ask(node, "take", 0.0)
         elif said == "lacks":
             self._ask(node, "deliver", self._cluster.shared(self._parcel.packed))
@@ -239,6 +240,7 @@ class Bridge:
         """Go on without a node; what ran there runs again elsewhere."""
         count = len(node.running)
         culprits = self._roster.lose(node)
+        self._tell_figures(now=True)
         self._cluster.kill(node.actor)
         self._losses[node.id] = 0 if culprits else self._losses.get(node.id, 0) + 1
         if self._losses[node.id] >= _LOSSES:
@@ -261,6 +263,7 @@ class Bridge:
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame
         self._roster.lose(node)
+        self._tell_figures(now=True)
         self._cluster.order(node.actor, "close")
         self._cluster.kill(node.actor, after_s=_CLOSE_S)
         self._looked = 0.0
