@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import functools
 import gc
@@ -40,8 +41,19 @@ def _write_to_memory() -> None:
         return
     fits = found.f_bavail * found.f_frsize > _ROOM and os.access(place, os.W_OK)
     if "TMPDIR" not in os.environ and fits and not found.f_flag & os.ST_NOEXEC:  # some tests run what they write
-        os.environ["TMPDIR"] = place
+        os.environ["TMPDIR"] = folder = tempfile.mkdtemp(prefix="tests-", dir=place)
         tempfile.tempdir = None
+        atexit.register(_tidy, Path(folder), os.getpid())
+
+
+def _tidy(folder: Path, pid: int) -> None:
+    """Remove what hunts that were killed have left, and all of it where every test has passed."""
+    if os.getpid() != pid:
+        return
+    kept = [*folder.glob("pytest-of-*/pytest-[0-9]*")]
+    for path in folder.iterdir() if kept else [folder]:
+        if not path.name.startswith("pytest-of-"):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 _ROOM = 4 << 30  # bytes; a session needs a tenth of it
