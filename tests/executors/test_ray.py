@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 import sqlite3
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -34,10 +35,12 @@ DEADLINE_S = 90.0
 @pytest.fixture(scope="module")
 def cluster():
     """A head that runs nothing, and a node of two CPUs."""
-    found = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    found.add_node(num_cpus=2)
-    yield found
-    found.shutdown()
+    with tempfile.TemporaryDirectory(prefix="chr-", dir="/tmp") as short:  # Ray makes sockets there
+        head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": short}
+        found = Cluster(initialize_head=True, head_node_args=head)
+        found.add_node(num_cpus=2)
+        yield found
+        found.shutdown()
 
 
 @pytest.fixture
