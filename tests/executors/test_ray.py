@@ -35,7 +35,12 @@ DEADLINE_S = 90.0
 @pytest.fixture(scope="module")
 def cluster():
     """A head that runs nothing, and a node of two CPUs."""
-    with tempfile.TemporaryDirectory(prefix="chr-", dir="/tmp") as short:  # Ray makes sockets there
+    with (
+        tempfile.TemporaryDirectory(prefix="chr-", dir="/tmp") as short,  # Ray makes sockets there
+        pytest.MonkeyPatch.context() as patched,
+    ):
+        Path(short, "ray").mkdir()
+        patched.setenv("RAY_TMPDIR", short)  # where it says which cluster is the current one
         head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": short}
         found = Cluster(initialize_head=True, head_node_args=head)
         found.add_node(num_cpus=2)
