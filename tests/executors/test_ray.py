@@ -123,6 +123,14 @@ class TestRayExecutor(ExecutorContract):
     def test_it_says_how_much_it_runs_and_where_that_is(self, executor):
         super().test_it_says_how_much_it_runs_and_where_that_is(executor)
 
+    @pytest.mark.nightly
+    def test_cancelled_trials_do_not_come_back(self, executor):
+        super().test_cancelled_trials_do_not_come_back(executor)
+
+    @pytest.mark.nightly
+    def test_what_is_kept_has_its_black_box_here(self, executor, tmp_path):
+        super().test_what_is_kept_has_its_black_box_here(executor, tmp_path)
+
 
 def digests(results):
     return {number: (result.outcome, result.steps, result.digest) for number, result in results.items()}
@@ -180,6 +188,7 @@ def on_one_machine(settings, specs, tmp_path):
         pool.close()
 
 
+@pytest.mark.long
 def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_path):
     """A node that joins late, its actor, then the node: every trial comes back once, as it does on one machine."""
     specs = [spec(number, step_wall_s=0.02) for number in range(24)]
@@ -203,6 +212,7 @@ def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_pa
     assert digests(found) == digests(on_one_machine(settings, specs, tmp_path))
 
 
+@pytest.mark.nightly
 def test_where_all_nodes_are_lost_it_waits_and_says_so(begin, add):
     """The machine goes with everything on it; CPUs that somebody else leaves then are as good as a new one."""
     other = begin(2)
