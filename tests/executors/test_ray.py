@@ -188,7 +188,6 @@ def on_one_machine(settings, specs, tmp_path):
         pool.close()
 
 
-@pytest.mark.long
 def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_path):
     """A node that joins late, its actor, then the node: every trial comes back once, as it does on one machine."""
     specs = [spec(number, step_wall_s=0.02) for number in range(24)]
