@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 __all__ = ["Signature", "SignatureData", "signature_of"]
 
 _BEFORE_S = 3.0  # a lane change that began longer ago is over
-_CALLERS = ("_episode.py", "episode.py")  # of agents, simulators and oracles; the second one in earlier versions
+_CALLERS = (
+    ("crashhunt", "episode", "_episode.py"),
+    ("crashhunt", "episode.py"),
+)  # of agents, simulators and oracles; the second one in earlier versions
 _CHANGES = {
     "agent": "while the agent changes lanes",
     "other": "while the other changes lanes",
@@ -33,6 +36,7 @@ _CHANGES = {
 }
 _FRAMES = 3  # of a stack, the innermost ones
 _FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line \d+,? in (?P<function>\S+)', re.MULTILINE)
+_LIBRARIES = re.compile(r"(site|dist)-packages|python3\.\d+")
 _NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
 
 
@@ -163,7 +167,9 @@ def _kind(failure: Failure) -> str:
 def _where(failure: Failure) -> str:
     """The innermost functions that are the agent's own, or what was said, without its numbers."""
     frames = _frames(failure.traceback) or _frames(failure.last_output)
-    ours = [number for number, (file, _) in enumerate(frames) if file.name in _CALLERS]
+    ours = [
+        number for number, (file, _) in enumerate(frames) if any(file.parts[-len(one) :] == one for one in _CALLERS)
+    ]
     inner = frames[: min(ours)] if ours else frames  # what the episode has called
     own = [frame for frame in inner if not _is_of_a_library(frame[0])]
     chosen = own or inner
@@ -180,4 +186,4 @@ def _frames(text: str) -> list[tuple[PurePath, str]]:
 
 
 def _is_of_a_library(file: PurePath) -> bool:
-    return any(part in ("site-packages", "dist-packages") or part.startswith("python3") for part in file.parts)
+    return any(_LIBRARIES.fullmatch(part) for part in file.parts)

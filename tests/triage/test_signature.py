@@ -88,6 +88,12 @@ def test_code_of_libraries_is_left_out_where_there_is_other():
     assert signature_of(bundle(0, failure=Failure("ValueError", "x", text))).where == "decoder.py:decode"
 
 
+def test_files_of_ones_own_may_have_the_names_of_others():
+    own = '  File "/home/me/python3-agents/episode.py", line 5, in act\n'
+    text = f"Traceback (most recent call last):\n{own}ValueError: x"
+    assert signature_of(bundle(0, failure=Failure("ValueError", "x", text))).where == "episode.py:act"
+
+
 def test_events_and_disturbances_are_kinds_of_their_own():
     event = Event("not_moving", "ego", "ego has not moved for 60 s")
     found = signature_of(bundle(0, outcome=Outcome.NOT_MOVING, event=event))
