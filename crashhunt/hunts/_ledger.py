@@ -8,6 +8,7 @@ see a change too, and that a row that is gone is missed. While a hunt runs, and 
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 import time
 from contextlib import ExitStack, contextmanager, suppress
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Ledger", "Turn", "has_begun"]
 
+_TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded together
+
 
 def has_begun(path: Path) -> bool:
     """Whether there is a ledger; an empty file, which whoever looks with SQLite leaves behind, is none."""
@@ -48,6 +51,7 @@ class Ledger(LedgerReader):
 
     def __init__(self, path: Path, *, writable: bool = False) -> None:
         self._writable = False
+        self._together_since = math.inf
         if not writable and not path.exists():
             raise HuntDirectoryError(
                 f"{str(path.parent)!r} is not the directory of a hunt: it has no ledger.sqlite",
@@ -90,18 +94,21 @@ class Ledger(LedgerReader):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Write what is recorded meanwhile at once, at the end: thousands of trials a second can be recorded so.
+        """Write what is recorded meanwhile at once: thousands of trials a second can be recorded so.
 
-        Nobody else sees it before, and a kill loses it: those trials run again.
+        What was recorded is written half a second later at the latest, with the next trial: whoever records may wait
+        for trials in between. Nobody else sees it before, and a kill loses it: those trials run again.
 
         Raises:
             HuntDirectoryError: the disk is full.
         """
         try:
             self._database.execute("BEGIN")  # which locks nothing until the first of them
+            self._together_since = time.monotonic()
             try:
                 yield
             finally:  # what has been recorded has happened, whatever keeps the rest from it
+                self._together_since = math.inf
                 if self._database.in_transaction:  # which an error of the disk may have ended
                     self._database.execute("COMMIT")
         except sqlite3.Error as error:
@@ -206,6 +213,10 @@ class Ledger(LedgerReader):
         values = (*row, digest_of_row(row))
         try:
             self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+            if time.monotonic() - self._together_since > _TOGETHER_S:
+                self._database.execute("COMMIT")
+                self._database.execute("BEGIN")
+                self._together_since = time.monotonic()
         except sqlite3.Error as error:
             raise explained(self._path, error) from error
 

@@ -57,6 +57,22 @@ def test_what_is_recorded_together_is_there_at_once_and_whatever_happens(tmp_pat
         assert reader.facts()["heartbeat"] == 1.0
 
 
+def test_what_is_recorded_together_is_not_kept_back_while_trials_are_waited_for(tmp_path, monkeypatch):
+    path = tmp_path / "ledger.sqlite"
+    now = 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    with closing(Ledger(path, writable=True)) as writer, closing(Ledger(path)) as reader, writer.together():
+        writer.record(result(1), snapshot="")
+        now += 0.4
+        writer.record(result(2), snapshot="")
+        assert reader.finished() == set()
+        now += 0.2
+        writer.record(result(3), snapshot="")
+        assert reader.finished() == {1, 2, 3}
+        writer.record(result(4), snapshot="")
+        assert reader.finished() == {1, 2, 3}
+
+
 def test_what_is_replaced_is_kept(tmp_path):
     ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
     for number in range(4):
