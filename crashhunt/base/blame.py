@@ -7,14 +7,31 @@ import sysconfig
 import traceback
 from pathlib import Path
 
+from crashhunt.base.errors import PluginError
 from crashhunt.base.layout import PACKAGE
 
-__all__ = ["place_of", "shown_path"]
+__all__ = ["blamed", "in_words", "place_of", "shown_path"]
 
 _OURS = str(PACKAGE)
 _NOBODYS = ("<", importlib.__file__)  # of importing itself
 # Neither the standard library nor what is installed is where somebody looks for their own mistake.
 _OTHERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+
+
+def in_words(error: BaseException) -> str:
+    """Return type and message of an exception in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def blamed(what: str, error: Exception, *, fix: str = "mend it") -> PluginError:
+    """Return the error that says what somebody's own code cannot, why, and where.
+
+    Args:
+        what: as ``the sampler 'mine' cannot be made``.
+        error: which it has raised.
+        fix: what to do about it, as an imperative.
+    """
+    return PluginError(f"{what}: {in_words(error)}", fix=fix, where=place_of(error))
 
 
 def place_of(error: BaseException) -> str:

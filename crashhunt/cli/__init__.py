@@ -108,11 +108,12 @@ def _explained(error: Exception) -> CrashhuntError:
             _give_up_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
         return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
+    from crashhunt.base.blame import in_words
+
     frames = traceback.extract_tb(error.__traceback__)
     where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    said = " ".join(f"{type(error).__name__}: {error}".split())
     fix = "CRASHHUNT_TRACEBACK=1 shows how it came to it; if no module of yours is to blame, report it"
-    return CrashhuntError(f"this should not happen: {said}", fix=fix, where=where)
+    return CrashhuntError(f"this should not happen: {in_words(error)}", fix=fix, where=where)
 
 
 def _flush() -> None:

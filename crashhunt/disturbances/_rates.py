@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.blame import place_of
+from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate, registered
@@ -119,8 +119,7 @@ def locate_model(name: str) -> DisturbanceModel:
     except CrashhuntError:
         raise
     except Exception as error:  # somebody's own
-        message = f"the disturbance {name!r} cannot be made: {_said(error)}"
-        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+        raise blamed(f"the disturbance {name!r} cannot be made", error) from error
     for part in ("what", "draw", "log_likelihood"):
         if not hasattr(made, part):
             raise PluginError(f"{name!r} is no model of disturbances: it has no {part}", fix="see crashhunt.testing")
@@ -132,16 +131,11 @@ def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Draw
         drawn = model.draw(rng)
         fine = drawn.who in CELLS and math.isfinite(drawn.how_strong) and 0 < drawn.how_long < math.inf
     except Exception as error:  # somebody's own
-        message = f"the disturbance {name!r} cannot be drawn: {_said(error)}"
-        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+        raise blamed(f"the disturbance {name!r} cannot be drawn", error) from error
     if not fine:
         fix = f"draw one of {', '.join(CELLS)}, a finite strength, and a length above 0 s"
         raise PluginError(f"the disturbance {name!r} has drawn {drawn}, which is none", fix=fix)
     return drawn
-
-
-def _said(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from crashhunt.base.blame import place_of
-from crashhunt.base.errors import CrashhuntError, PluginError
+from crashhunt.base.blame import blamed
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.plans import executor_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,5 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     except CrashhuntError:
         raise
     except Exception as error:  # somebody's own
-        said = " ".join(f"{type(error).__name__}: {error}".split())
-        message = f"the executor {word!r} cannot be made: {said}"
-        raise PluginError(message, fix="mend it", where=place_of(error)) from error
+        raise blamed(f"the executor {word!r} cannot be made", error) from error
     return made

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from crashhunt.base.blame import place_of
-from crashhunt.base.errors import ArgumentError, CrashhuntError, PluginError, UsageError
+from crashhunt.base.blame import blamed
+from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
 from crashhunt.base.plugins import locate
 from crashhunt.oracles._protocol import BringsOutcomes
 from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
@@ -64,9 +64,8 @@ class OracleChoice:
         except CrashhuntError:
             raise
         except Exception as error:  # somebody's own
-            said = " ".join(f"{type(error).__name__}: {error}".split())
-            message = f"the oracle {self.name!r} cannot be made: {said}"
-            raise PluginError(message, fix="mend it, or what it is given", where=place_of(error)) from error
+            fix = "mend it, or what it is given"
+            raise blamed(f"the oracle {self.name!r} cannot be made", error, fix=fix) from error
         return made
 
     def outcomes(self) -> tuple[Outcome, ...]:

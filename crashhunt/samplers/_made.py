@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base.blame import place_of
+from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.plugins import locate
 from crashhunt.samplers._protocol import Independent, OnlyAsked, Proposal
@@ -117,8 +117,7 @@ class NamedSampler:
         return ""
 
     def _blame(self, what: str, error: Exception) -> NoReturn:
-        said = " ".join(f"{type(error).__name__}: {error}".split())
-        raise PluginError(f"the sampler {self._name!r} {what}: {said}", fix="mend it", where=place_of(error)) from error
+        raise blamed(f"the sampler {self._name!r} {what}", error) from error
 
 
 def varies_only_asked(name: str) -> bool:

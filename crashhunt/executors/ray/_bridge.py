@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from crashhunt.base import layout
+from crashhunt.base.blame import in_words
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._remains import died
@@ -179,7 +180,7 @@ class Bridge:
             self._lose(node)
             return
         except Exception as error:  # of ours, over there
-            self._refuse(node, " ".join(f"{type(error).__name__}: {error}".split()))
+            self._refuse(node, in_words(error))
             return
         if node.doing == "take":
             self._take(node, said)
