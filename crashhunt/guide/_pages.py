@@ -23,8 +23,8 @@ SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference
 
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "look-into-a-crash", "kinds-of-crashes", "film", "hand-over", "suites", "cluster", "compare",
-    "train",
+    "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "film", "hand-over", "suites",
+    "cluster", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "contributing", "changelog",
 ]  # fmt: skip

@@ -25,9 +25,8 @@ from crashhunt.hunts._preflight import Preflight
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
-from crashhunt.plans import disturber, with_settings
+from crashhunt.plans import disturber, sampler_of, with_settings
 from crashhunt.replays import confirm
-from crashhunt.samplers import NamedSampler
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -128,7 +127,7 @@ class Hunt:
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         settings = self.settings
         snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
-        sampler = NamedSampler(settings.sampler, settings.space, points=settings.points)
+        sampler = sampler_of(settings)
         self._disturber = disturber(self.scenario, settings)
         progress = Progress()
         finished = ledger.finished()

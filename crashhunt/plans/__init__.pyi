@@ -12,6 +12,7 @@ from ._plan import (
     disturber as disturber,
     parse_crash_on as parse_crash_on,
     plan as plan,
+    sampler_of as sampler_of,
     with_settings as with_settings,
 )
 from ._request import (

@@ -16,7 +16,7 @@ from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
 from crashhunt.plans._scope import Owners, Takes, agent_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
-from crashhunt.samplers import NamedSampler, varies_only_asked
+from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
 from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_spec, signature_of
 from crashhunt.world import LIMITS
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.plans._request import Request
     from crashhunt.trial import Signature
 
-__all__ = ["disturber", "parse_crash_on", "plan", "with_settings"]
+__all__ = ["disturber", "parse_crash_on", "plan", "sampler_of", "with_settings"]
 
 
 def plan(request: Request) -> tuple[Scenario, HuntSettings]:
@@ -72,7 +72,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
     disturber(scenario, settings)  # it refuses what cannot be meant
-    NamedSampler(settings.sampler, settings.space, points=settings.points)  # it refuses what it cannot sample
+    sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
     return scenario, replace(settings, run=sized(settings.run))
 
@@ -129,6 +129,17 @@ def disturber(scenario: Scenario, settings: HuntSettings) -> Disturber | None:
         known=backend.disturbances,
         simulator=backend.title or "the simulator",
     )
+
+
+def sampler_of(settings: HuntSettings) -> NamedSampler:
+    """Return a new sampler for a hunt.
+
+    Raises:
+        PluginError: there is no such sampler, it cannot be made, or it is none.
+        CrashhuntError: it refuses the space.
+    """
+    hunt = HuntFacts(settings.seed, settings.crash_on)
+    return NamedSampler(settings.sampler, settings.space, points=settings.points, hunt=hunt)
 
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.plugins import locate
-from crashhunt.samplers._protocol import Independent, OnlyAsked, Proposal
+from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, Proposal, WantsHunt
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,18 +29,20 @@ class NamedSampler:
         name: a registered name, or ``module:attribute``.
         space: what to sample.
         points: how many values to try of a range without a step.
+        hunt: what one that wants it may know of the hunt.
 
     Raises:
         PluginError: there is no such sampler, it cannot be made, or it is none.
         CrashhuntError: it refuses the space.
     """
 
-    def __init__(self, name: str, space: Space, *, points: int) -> None:
+    def __init__(self, name: str, space: Space, *, points: int, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
         self._name = name
         self._keys = space.keys()
         make = locate("samplers", name)
+        more = {"hunt": hunt} if isinstance(make, WantsHunt) and make.wants_hunt else {}
         try:
-            self._sampler: Sampler = make(space, points=points)
+            self._sampler: Sampler = make(space, points=points, **more)
         except CrashhuntError:
             raise
         except Exception as error:  # somebody's own

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from crashhunt.trial import Distribution, Value
+from crashhunt.trial import CRASHES, Distribution, Outcome, Value
 
 if TYPE_CHECKING:
     import numpy as np
 
     from crashhunt.trial import TrialResult
 
-__all__ = ["Independent", "Key", "OnlyAsked", "Proposal", "Sampler", "Space"]
+__all__ = ["HuntFacts", "Independent", "Key", "OnlyAsked", "Proposal", "Sampler", "Space", "WantsHunt"]
 
 Key = tuple[str, str]
 """(agent id, argument name); the agent id is empty for an argument of the scenario."""
@@ -38,15 +38,28 @@ class Proposal:
     origin: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class HuntFacts:
+    """What a sampler may know of the hunt that it is made for.
+
+    Args:
+        seed: of the hunt.
+        crash_on: the outcomes that count as a crash.
+    """
+
+    seed: int = 0
+    crash_on: tuple[Outcome, ...] = CRASHES
+
+
 class Sampler(Protocol):
     """Proposes trials, and may learn from their results.
 
     It is made with the space and, as a keyword, ``points``: how many values to try of a range that has no step of its
-    own.
+    own; and with ``hunt``, where it says that it wants that (`WantsHunt`).
 
-    Contract: a proposal depends on the trial's number, its generator and the results told so far, in their order, never
-    on time, on what was asked before or on anything else. So one that is made anew and told the same results proposes
-    the same, which is how a hunt goes on after it was interrupted.
+    Contract: a proposal depends on what it was made with, the trial's number, its generator and the results told so
+    far, in their order, never on time, on what was asked before or on anything else. So one that is made anew and told
+    the same results proposes the same, which is how a hunt goes on after it was interrupted.
 
     One whose ``learns`` is false is told nothing, and its proposals for a number are the same however many trials run
     at once.
@@ -84,6 +97,16 @@ class OnlyAsked(Protocol):
     """
 
     only_asked: bool
+
+
+@runtime_checkable
+class WantsHunt(Protocol):
+    """A sampler that may be made with one keyword more: ``hunt``, the `HuntFacts`.
+
+    Where ``wants_hunt`` is true, it is. The class says so, for it is asked before a sampler is made.
+    """
+
+    wants_hunt: bool
 
 
 @runtime_checkable

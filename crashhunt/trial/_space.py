@@ -57,6 +57,14 @@ class Constant:
         """Return the one value."""
         return (self.value,)
 
+    def quantile(self, share: float) -> Value:
+        """Return the value."""
+        return self.value
+
+    def share_of(self, value: Value) -> float:
+        """Return 0.5."""
+        return 0.5
+
     def contains(self, value: Value) -> bool:
         """Whether ``value`` is the value."""
         return bool(value == self.value)
@@ -78,6 +86,18 @@ class Choice:
     def grid(self, points: int) -> tuple[Value, ...]:
         """Return the options."""
         return self.options
+
+    def quantile(self, share: float) -> Value:
+        """Return the option below which such a share of them lies, from 0 to 1."""
+        return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
+
+    def share_of(self, value: Value) -> float:
+        """Return the middle of the shares whose quantile is this option.
+
+        Raises:
+            ValueError: it is none of them.
+        """
+        return (self.options.index(value) + 0.5) / len(self.options)
 
     def contains(self, value: Value) -> bool:
         """Whether ``value`` is among the options."""
@@ -131,16 +151,49 @@ class Range:
         value = min(self.low + index * (self.step if self.step is not None else 1.0), self.high)
         return round(value) if self.integer else float(value)
 
+    @property
+    def _logarithms(self) -> tuple[float, float]:
+        """Of the ends, so that of whole numbers each has the same room around it."""
+        room = 0.5 if self.integer else 0.0
+        return math.log(self.low - room), math.log(self.high + room)
+
     def sample(self, rng: np.random.Generator) -> Value:
         """Draw a value."""
         if self.log:
-            low, high = (self.low - 0.5, self.high + 0.5) if self.integer else (self.low, self.high)
-            drawn = math.exp(rng.uniform(math.log(low), math.log(high)))
-            drawn = min(max(drawn, self.low), self.high)
-            return round(drawn) if self.integer else drawn
+            return self._exp(rng.uniform(*self._logarithms))
         if self.step is not None or self.integer:
             return self._at(int(rng.integers(self.steps)))
         return min(float(rng.uniform(self.low, self.high)), float(self.high))
+
+    def _exp(self, logarithm: float) -> Value:
+        value = min(max(math.exp(logarithm), self.low), self.high)
+        return round(value) if self.integer else value
+
+    def quantile(self, share: float) -> Value:
+        """Return the value below which such a share of all draws lies, from 0 to 1."""
+        if self.log:
+            low, high = self._logarithms
+            return self._exp(low + (high - low) * share)
+        if self.step is not None or self.integer:
+            return self._at(min(int(share * self.steps), self.steps - 1))
+        return min(float(self.low + (self.high - self.low) * share), float(self.high))
+
+    def share_of(self, value: Value) -> float:
+        """Return a share whose quantile is this value: 0 to 1, in the middle of those of a stepped range.
+
+        Raises:
+            ValueError: it is no number.
+        """
+        value = float(value)
+        if self.low == self.high:
+            return 0.5
+        if self.log:
+            low, high = self._logarithms
+            return min(max((math.log(value) - low) / (high - low), 0.0), 1.0)
+        if self.step is not None or self.integer:
+            index = round((value - self.low) / (self.step if self.step is not None else 1.0))
+            return min(max((index + 0.5) / self.steps, 0.0), 1.0)
+        return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
     def grid(self, points: int) -> tuple[Value, ...]:
         """Return all values of a stepped range, else at most ``points`` evenly spaced ones, ends included."""

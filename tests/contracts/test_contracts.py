@@ -17,7 +17,7 @@ from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed,
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose, TrafficEvents
-from crashhunt.samplers import GridSampler, RandomSampler, SweepSampler
+from crashhunt.samplers import GridSampler, HaltonSampler, RandomSampler, SobolSampler, SweepSampler
 from crashhunt.scenario import AgentSetup, Scenario, with_action
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
@@ -108,6 +108,18 @@ class TestGridSampler(TestRandomSampler):
         one_round = [tuple(sampler.ask(number, rng).arguments.values()) for number in range(sampler.size)]
         assert len(set(one_round)) == sampler.size
         assert tuple(sampler.ask(sampler.size, rng).arguments.values()) == one_round[0]
+
+
+class TestHaltonSampler(TestRandomSampler):
+    @pytest.fixture
+    def make(self):
+        return HaltonSampler
+
+
+class TestSobolSampler(TestRandomSampler):
+    @pytest.fixture
+    def make(self):
+        return SobolSampler
 
 
 class TestSweepSampler(SamplerContract):

@@ -41,7 +41,7 @@ def press(toy):
         ("crashhunt run out 1 1 9 --scenario merge", ["merge", "merge-highway-env"]),
         ("crashhunt run out 1 1 9 --scenario to", ["toy/"]),
         ("crashhunt run out 1 1 9 --agent id", ["idm"]),
-        ("crashhunt run out 1 1 9 --sampler s", ["sweep"]),
+        ("crashhunt run out 1 1 9 --sampler s", ["sobol", "sweep"]),
         ("crashhunt run out 1 1 9 --crash-on hang,col", ["hang,collision"]),
         ("crashhunt run out 1 1 9 --crash-on red", ["red_light"]),
         ("crashhunt run out 1 1 9 --scenario toy --set g", ["gap_m="]),
