@@ -96,7 +96,7 @@ def states_table(states: list[HuntState]) -> Table:
             f"{state.trials_run}/{state.trials_planned}",
             f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
-            str(state.crashes) + (f" ({state.disturbed} disturbed)" if state.disturbed is not None else ""),
+            _crashes(state),
             str(state.errors),
             Text(said),
         )
@@ -106,6 +106,18 @@ def states_table(states: list[HuntState]) -> Table:
         if len(state.nodes or []) > _NODES:
             table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
     return table
+
+
+def _crashes(state: HuntState) -> str:
+    """How many, of how many kinds, and of a hunt that runs how long ago the last new one came."""
+    from crashhunt.report import format_seconds
+
+    said = [] if state.disturbed is None else [f"{state.disturbed} disturbed"]
+    if state.kinds:
+        said.append(f"{len(state.kinds)} {'kind' if len(state.kinds) == 1 else 'kinds'}")
+        if state.state == "running" and state.newest_kind_s is not None:
+            said.append(f"last new {format_seconds(state.newest_kind_s)} ago")
+    return str(state.crashes) + (f" ({', '.join(said)})" if said else "")
 
 
 def show_states(states: list[HuntState], console: Console) -> None:

@@ -222,6 +222,8 @@ def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
         return f"the sampler {settings.sampler} does not draw trials independently"
     if crashes and not settings.run.keep_going:
         return "it stopped at its first crash, and the rate of such a hunt is too high; use --keep-going"
+    if settings.run.distinct and hunt.state.trials_run < settings.trials:
+        return f"it stopped at {settings.run.distinct} kinds of crashes, and the rate of such a hunt is too high"
     if hunt.state.state not in ("finished", "crashed"):
         return f"it is {hunt.state.state}, and quick trials are over-represented"
     return ""

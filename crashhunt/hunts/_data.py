@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from crashhunt.hunts._kinds import KindData
+
 __all__ = ["Facts", "Noted", "Owner", "Row", "Seal"]
 
 Row: TypeAlias = tuple[Any, ...]
@@ -36,6 +38,8 @@ class Noted(TypedDict, total=False):
         origins: whether its sampler says where trials come from.
         disturb: how often what disturbs its trials; None where nothing does.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
+        kinds: of crashes, the most frequent first, where it collects them all.
+        newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
     """
 
     owner: Owner | None
@@ -49,6 +53,8 @@ class Noted(TypedDict, total=False):
     origins: bool
     disturb: list[str] | None
     nodes: list[dict[str, Any]]
+    kinds: list[KindData]
+    newest_kind: float | None
 
 
 class Facts(Noted, total=False):

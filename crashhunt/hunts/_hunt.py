@@ -21,7 +21,7 @@ from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._next_trials import LAG, Trials
-from crashhunt.hunts._preflight import Preflight
+from crashhunt.hunts._preflight import Preflight, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
@@ -140,8 +140,8 @@ class Hunt:
             finished.add(spec.number)
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
-        progress.crashes = list_bundles(self.directory)
         before = ledger.facts()
+        progress.resume(list_bundles(self.directory), settings.run, before)
         lag = self._lag(before)
         trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber)
         ledger.enter(
@@ -156,10 +156,12 @@ class Hunt:
             disturb=list(settings.disturb) or None,
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        stopped: StoppedBecause | None = None
+        stopped: StoppedBecause
         if progress.crashes and not settings.run.keep_going:
             stopped = "crash"
-        if stopped is None:
+        elif progress.last_wanted is not None:
+            stopped = "distinct"
+        else:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
@@ -167,7 +169,7 @@ class Hunt:
         self._see_to(ledger, progress)
         reason = ""
         if stopped == "no_valid_trial" and progress.last_invalid is not None:
-            reason = _why_invalid(progress.last_invalid, self.scenario)
+            reason = why_invalid(progress.last_invalid, self.scenario)
         ledger.enter(stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
@@ -182,6 +184,7 @@ class Hunt:
             tuple(progress.notes),
             ledger.traffic_events(),
             progress.audit,
+            progress.about_kinds()[0],
         )
 
     def _hunt(
@@ -217,7 +220,7 @@ class Hunt:
         heartbeat = 0.0
         try:
             while True:
-                stopping = bool(progress.found)
+                stopping = progress.last_wanted is not None
                 for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
                     in_flight.add(spec.number)
@@ -228,8 +231,9 @@ class Hunt:
                         in_flight.discard(result.spec.number)
                         for known in preflight.sift(audit.add(result)):
                             self._take(known, ledger, snapshot, trials, progress)
-                        if result.outcome in settings.crash_on and not run.keep_going:
-                            above = min(progress.found) if run.deterministic else -1
+                        wanted = progress.last_wanted
+                        if wanted is not None:
+                            above = wanted if run.deterministic else -1
                             executor.cancel(above=above)
                             in_flight = {number for number in in_flight if number <= above}
                             if not run.deterministic:
@@ -254,8 +258,8 @@ class Hunt:
             while audit.waiting and not bool(self._stops):
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
-            if progress.found:
-                return "crash"
+            if progress.last_wanted is not None:
+                return "crash" if progress.found else "distinct"
         except CrashhuntError as error:  # of which file is for somebody who wants to mend it
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
@@ -336,7 +340,7 @@ class Hunt:
             snapshot=snapshot.digest,
             lanes=read_map(self._place.scratch, trial),
         )
-        progress.crashes.append(bundle)
+        progress.save(bundle)
         ledger.record(result, snapshot=snapshot.digest)
 
     def _confirm(self, progress: Progress) -> None:
@@ -351,7 +355,7 @@ class Hunt:
             return bundle
 
         with ThreadPoolExecutor(self._parallel_here) as threads:  # which only wait for their process
-            progress.crashes = list(threads.map(confirmed, progress.crashes))
+            progress.replace(list(threads.map(confirmed, progress.crashes)))
 
     @property
     def _parallel_here(self) -> int:
@@ -378,21 +382,10 @@ class Hunt:
             dict(workers or {}),
             len(progress.crashes) + (1 if progress.found else 0),
             progress.nodes,
+            *progress.about_kinds(),
         )
 
 
 def _under_way(parallel: int) -> int:
     """How many trials are handed over, of which so many run."""
     return parallel * (1 + _QUEUED_PER_WORKER)
-
-
-def _why_invalid(result: TrialResult, scenario: Scenario) -> str:
-    """Why a trial could not be set up, with what the simulator said about it last."""
-    explained = scenario.backend.explained
-    if explained is not None and result.failure is not None:
-        error = explained(result.summary, result.failure.last_output, scenario)
-        if error is not None:
-            return str(error)
-    said = result.failure.last_output.strip().splitlines() if result.failure else []
-    last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
-    return f"{result.summary}\n  last output: {last}" if last else result.summary

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.plans import HuntSettings
+    from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["Preflight"]
+__all__ = ["Preflight", "why_invalid"]
 
 _ENOUGH = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
@@ -94,3 +95,15 @@ class Preflight:
         for there, here in self._names.items():
             text = text.replace(there, here)
         return text
+
+
+def why_invalid(result: TrialResult, scenario: Scenario) -> str:
+    """Return why a trial could not be set up, with what the simulator said about it last."""
+    explained = scenario.backend.explained
+    if explained is not None and result.failure is not None:
+        error = explained(result.summary, result.failure.last_output, scenario)
+        if error is not None:
+            return str(error)
+    said = result.failure.last_output.strip().splitlines() if result.failure else []
+    last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
+    return f"{result.summary}\n  last output: {last}" if last else result.summary

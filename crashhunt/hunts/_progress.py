@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.faculties import offers
 from crashhunt.executors import HasNodes
+from crashhunt.hunts._kinds import Kinds, kind_data
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor, NodeFigures
     from crashhunt.hunts._audit import AuditReport
-    from crashhunt.hunts._data import Noted
+    from crashhunt.hunts._data import Facts, Noted
+    from crashhunt.plans import RunSettings
     from crashhunt.recording import BlackBoxHeader
+    from crashhunt.triage import Group
     from crashhunt.trial import TrialResult
 
 __all__ = ["HuntStatus", "Progress"]
@@ -36,6 +39,9 @@ class HuntStatus:
         workers: trial number to where it is.
         crashes: saved so far.
         nodes: the machines that take part now; None where there is this one only.
+        kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
+        newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
+        newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
     """
 
     phase: str
@@ -48,6 +54,9 @@ class HuntStatus:
     workers: dict[int, BlackBoxHeader]
     crashes: int
     nodes: tuple[NodeFigures, ...] | None = None
+    kinds: tuple[Group, ...] | None = None
+    newest_kind_s: float | None = None
+    newest_kind_trials: int | None = None
 
 
 @dataclass(slots=True)
@@ -65,6 +74,30 @@ class Progress:
     notes: list[str] = field(default_factory=list)
     audit: AuditReport | None = None
     nodes: tuple[NodeFigures, ...] | None = None
+    kinds: Kinds | None = None
+
+    def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
+        """Take in what was saved before."""
+        self.crashes = crashes
+        if run.keep_going:
+            self.kinds = Kinds(run.distinct, crashes, before.get("newest_kind"))
+
+    def save(self, bundle: Bundle) -> None:
+        """Take in a crash that has been saved."""
+        self.crashes.append(bundle)
+        if self.kinds is not None:
+            self.kinds.add(bundle, self.ended_here)
+
+    def replace(self, crashes: list[Bundle]) -> None:
+        """Take the crashes as they are now: they have been confirmed."""
+        self.crashes = crashes
+        if self.kinds is not None:
+            self.kinds.refresh(crashes)
+
+    @property
+    def last_wanted(self) -> int | None:
+        """The number of the trial with which the hunt has found what it is after; None where it goes on."""
+        return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
 
     def look_at(self, executor: Executor) -> None:
         """Take note of where trials run."""
@@ -73,4 +106,15 @@ class Progress:
     def noted(self) -> Noted:
         """Return what the ledger is to say about now."""
         nodes: Noted = {} if self.nodes is None else {"nodes": [asdict(node) for node in self.nodes]}
-        return {"heartbeat": time.time(), **nodes}
+        kinds: Noted = {}
+        if self.kinds is not None:
+            kinds = {"kinds": list(map(kind_data, self.kinds.groups())), "newest_kind": self.kinds.newest}
+        return {"heartbeat": time.time(), **nodes, **kinds}
+
+    def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
+        """Return the last three of `HuntStatus`."""
+        if self.kinds is None:
+            return None, None, None
+        newest, trial = self.kinds.newest, self.kinds.newest_trial
+        since = None if newest is None else max(0.0, time.time() - newest)
+        return self.kinds.groups(), since, None if trial is None else self.ended_here - trial

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypedDict
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
+
+from crashhunt.hunts._kinds import KindData, kind_data
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -11,10 +13,11 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._audit import AuditData, AuditReport
     from crashhunt.plans import HuntSettings
+    from crashhunt.triage import Group
 
 __all__ = ["EventCount", "HuntReport", "HuntReportData", "StoppedBecause"]
 
-StoppedBecause = Literal["crash", "all_trials", "interrupted", "no_valid_trial"]
+StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial"]
 
 
 class EventCount(TypedDict):
@@ -39,6 +42,7 @@ class HuntReportData(TypedDict):
     crashes: list[CrashSummary]
     notes: list[str]
     audit: AuditData | None
+    kinds: NotRequired[list[KindData]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +61,7 @@ class HuntReport:
         notes: what people should know about how it went, such as trials that were run again.
         events: traffic events of all trials: kind to how many, and in how many trials.
         audit: what came of running trials without a crash again; None where nobody asked for it.
+        kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
     """
 
     directory: Path
@@ -70,10 +75,11 @@ class HuntReport:
     notes: tuple[str, ...] = ()
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
     audit: AuditReport | None = None
+    kinds: tuple[Group, ...] | None = None
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
-        return {
+        found: HuntReportData = {
             "dir": str(self.directory),
             "hunt_seed": self.settings.seed,
             "trials_planned": self.settings.trials,
@@ -87,3 +93,6 @@ class HuntReport:
             "notes": list(self.notes),
             "audit": self.audit.to_json() if self.audit is not None else None,
         }
+        if self.kinds is not None:
+            found["kinds"] = list(map(kind_data, self.kinds))
+        return found

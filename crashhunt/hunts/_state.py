@@ -21,6 +21,7 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from crashhunt.hunts._data import Facts, Owner
+    from crashhunt.hunts._kinds import KindData
     from crashhunt.plans import HuntSettings
 
 __all__ = [
@@ -41,8 +42,8 @@ _DEPTH = 2  # of hunts below the directory of a suite
 HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
-    "crash": "crashed", "all_trials": "finished", "no_valid_trial": "error", "interrupted": "interrupted",
-    "error": "error", "queued": "queued",
+    "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
+    "interrupted": "interrupted", "error": "error", "queued": "queued",
 }  # fmt: skip
 
 
@@ -66,6 +67,8 @@ class HuntState:
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
         nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
+        kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
+        newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
     """
 
     dir: str
@@ -82,6 +85,8 @@ class HuntState:
     damaged: bool = False
     disturbed: int | None = None
     nodes: list[dict[str, Any]] | None = None
+    kinds: list[KindData] | None = None
+    newest_kind_s: float | None = None
 
     @property
     def failed(self) -> bool:
@@ -95,6 +100,8 @@ class HuntState:
             del data["disturbed"]
         if self.nodes is None:
             del data["nodes"]
+        if self.kinds is None:
+            del data["kinds"], data["newest_kind_s"]
         return data
 
 
@@ -183,6 +190,8 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         alive,
         disturbed=_disturbed(directory) if facts.get("disturb") else None,
         nodes=facts.get("nodes"),
+        kinds=facts.get("kinds"),
+        newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
     )
 
 

@@ -130,6 +130,12 @@ class RunOptions(_Options):
     keep_going: bool = option(
         False, "collect all crashes instead of stopping at the first", flag="--keep-going",
     )  # fmt: skip
+    distinct: int = option(
+        0, "end once so many kinds of crashes have been found, collecting all until then; 0: never",
+        help="collect all crashes until so many different kinds have been found, as crashhunt crashes tells them "
+        "apart; 0: never stop for that",
+        flag="--distinct", metavar="N", check=at_least(0, zero="never"),
+    )  # fmt: skip
     deterministic: bool = option(
         False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
         flag="--deterministic",
@@ -163,6 +169,15 @@ class RunOptions(_Options):
         "ray[:HOST:PORT] (all machines of a Ray cluster) or module:attribute; ARG is for one that takes an argument",
         flag="--executor", metavar="NAME[:ARG]", anywhere=True,
     )  # fmt: skip
+
+    def checked(self) -> Self:
+        """Return the same with every option in order; whoever wants several kinds goes on after the first crash.
+
+        Raises:
+            UsageError: one is none.
+        """
+        found = super().checked()
+        return replace(found, keep_going=True) if found.distinct else found
 
 
 @dataclass(frozen=True, kw_only=True)

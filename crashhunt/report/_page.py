@@ -22,6 +22,7 @@ from crashhunt.report._disturbances import by_likelihood
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
+from crashhunt.triage import groups_of, signature_of
 from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
 
@@ -91,8 +92,28 @@ def report_data(
             for (agent, name), unit in argument_units(directory, settings).items()
         },
         **_trials(directory),
-        "crashes": [_crash(bundle) for bundle in watched(by_likelihood(bundles), len(bundles), watch)],
+        **_crashes(bundles, watch),
     }
+
+
+def _crashes(bundles: Sequence[Bundle], watch: Watch | None) -> dict[str, object]:
+    """The crashes in the order of the page, and their kinds, each with where its crashes are in it."""
+    crashes, signed, place = [], [], {}
+    for number, bundle in enumerate(watched(by_likelihood(bundles), len(bundles), watch)):
+        story = Story(bundle)
+        crashes.append(_crash(bundle, story))
+        signed.append((signature_of(bundle, story.recording), bundle))
+        place[bundle.path] = number
+    kinds = [
+        {
+            "words": str(group.signature),
+            "category": group.first.result.outcome.category,
+            "shortest": place[group.shortest.path],
+            "members": [place[bundle.path] for bundle in group.bundles],
+        }
+        for group in groups_of(signed)
+    ]
+    return {"kinds": kinds, "crashes": crashes}
 
 
 def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
@@ -140,8 +161,7 @@ def _trials(directory: Path) -> dict[str, object]:
         ledger.close()
 
 
-def _crash(bundle: Bundle) -> dict[str, object]:
-    story = Story(bundle)
+def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
     recording, result = story.recording, bundle.result
     return {
         "id": bundle.id,

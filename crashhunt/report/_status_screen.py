@@ -78,6 +78,10 @@ class Watcher:
             for name, count in sorted(status.outcomes.items())
         )
         rows.append(outcomes or Text("no trial has ended yet", style="dim"))
+        if status.kinds:
+            kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
+            each = "; ".join(f"{len(kind.bundles)} {kind.signature}" for kind in status.kinds)
+            rows.append(kinds + Text(one_line(each), "dim"))
         # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
         if status.nearest is not None:
@@ -171,11 +175,25 @@ def format_seconds(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def describe_kinds(status: HuntStatus) -> str:
+    """Return how many kinds of crashes there are, and how long ago the last new one came."""
+    count = len(status.kinds or ())
+    words = f"{count} {'kind' if count == 1 else 'kinds'} of crashes"
+    if status.newest_kind_s is None:
+        return words
+    words += f", the last new one {format_seconds(status.newest_kind_s)} ago"
+    if status.newest_kind_trials is None:
+        return words
+    return f"{words} ({status.newest_kind_trials} {'trial' if status.newest_kind_trials == 1 else 'trials'})"
+
+
 def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
     line = f"{status.phase}: {status.done}/{status.planned} trials ({outcomes})"
     if status.phase == "hunting" and status.done:
         line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
+    if status.phase == "hunting" and status.kinds:
+        line += f"; {describe_kinds(status)}"
     if status.phase == "hunting" and status.nodes is not None:
         line += f"; nodes that take part: {len(status.nodes)}" if status.nodes else "; no node takes part now"
     return line

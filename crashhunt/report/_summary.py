@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
 from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
+from crashhunt.report._groups import describe_groups
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
@@ -38,12 +39,17 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         lines.append(f"Not one trial was valid: {report.reason}")
     lines += [f"Note: {note}" for note in report.notes]
     lines += _describe_audit(report)
+    if report.stopped_because == "distinct":
+        found, wanted = len(report.kinds or ()), report.settings.run.distinct
+        lines.append(f"{found} kinds of crashes were found, and {wanted} were wanted.")
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because == "all_trials":
         lines.append("No crash was found.")
     lines += _describe_events(report)
     lines += describe_disturbances(report.crashes)
+    if report.kinds and len(report.crashes) > 1:
+        lines += ["", *describe_groups(report.kinds).splitlines()]
     crashes = by_likelihood(report.crashes)
     for bundle in crashes[:_SHOWN]:
         lines += ["", *_describe_crash(bundle)]

@@ -186,7 +186,9 @@ class _Names:
 def _replace_invalid(hunt: Path, state: HuntState) -> int:
     """Have the trials that could not be set up run again, unless the hunt has found what it was after."""
     settings = read_settings(hunt / layout.HUNT)
-    if not state.outcomes.get(Outcome.INVALID) or (state.crashes and not settings.run.keep_going):
+    done = state.crashes and not settings.run.keep_going
+    done = done or 0 < settings.run.distinct <= len(state.kinds or ())
+    if not state.outcomes.get(Outcome.INVALID) or done:
         return 0
     with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])

@@ -1,2 +1,8 @@
-from ._groups import Group as Group, GroupData as GroupData, Groups as Groups, group_crashes as group_crashes
+from ._groups import (
+    Group as Group,
+    GroupData as GroupData,
+    Groups as Groups,
+    group_crashes as group_crashes,
+    groups_of as groups_of,
+)
 from ._signature import Signature as Signature, signature_of as signature_of

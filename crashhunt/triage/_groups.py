@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.triage._signature import SignatureData
 
-__all__ = ["Group", "GroupData", "Groups", "group_crashes"]
+__all__ = ["Group", "GroupData", "Groups", "group_crashes", "groups_of"]
 
 
 class GroupData(TypedDict):
@@ -85,12 +85,19 @@ def group_crashes(bundles: Iterable[Bundle]) -> Groups:
     Args:
         bundles: of one hunt or several; the log of each is read.
     """
-    found: dict[Signature, list[Bundle]] = {}
-    left_out = []
+    signed, left_out = [], []
     for bundle in bundles:
         try:
-            found.setdefault(signature_of(bundle), []).append(bundle)
+            signed.append((signature_of(bundle), bundle))
         except BundleError as error:
             left_out.append(str(error))
+    return Groups(groups_of(signed), tuple(left_out))
+
+
+def groups_of(signed: Iterable[tuple[Signature, Bundle]]) -> tuple[Group, ...]:
+    """Return the groups of crashes whose signatures are known, the largest first."""
+    found: dict[Signature, list[Bundle]] = {}
+    for signature, bundle in signed:
+        found.setdefault(signature, []).append(bundle)
     groups = [Group(signature, tuple(members)) for signature, members in found.items()]
-    return Groups(tuple(sorted(groups, key=lambda group: (-len(group.bundles), group.signature))), tuple(left_out))
+    return tuple(sorted(groups, key=lambda group: (-len(group.bundles), group.signature)))

@@ -98,8 +98,12 @@ class Signature:
         return f"{words}, disturbed" if self.disturbed else words
 
 
-def signature_of(bundle: Bundle) -> Signature:
+def signature_of(bundle: Bundle, recording: Recording | None = None) -> Signature:
     """Return the signature of a crash; no code of the bundle is run.
+
+    Args:
+        bundle: the crash.
+        recording: of it, where it has been read already.
 
     Raises:
         BundleError: its log is missing or damaged.
@@ -111,7 +115,7 @@ def signature_of(bundle: Bundle) -> Signature:
     else:
         from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
 
-        found = _of_a_collision(result, hit, bundle.recording(), read_lanes(bundle.path / layout.LOG))
+        found = _of_a_collision(result, hit, recording or bundle.recording(), read_lanes(bundle.path / layout.LOG))
     return replace(found, disturbed=result.disturbed)
 
 

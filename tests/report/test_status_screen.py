@@ -6,6 +6,7 @@ import os
 import pty
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -14,6 +15,7 @@ from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
+from crashhunt.report._status_screen import describe_kinds
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -49,6 +51,20 @@ def test_every_worker_is_on_the_screen(width, height, workers):
     for number in range(120, 120 + workers):
         shown = "setting up" if number == 120 else f"step {number - 20}"
         assert any(str(number) in line and shown in line for line in lines), number
+
+
+def test_kinds_of_crashes_and_when_the_last_new_one_came():
+    kind = SimpleNamespace(signature="rear end, the agent into the other", bundles=(1, 2))
+    found = replace(status(2), kinds=(kind, kind), newest_kind_s=192.0, newest_kind_trials=1)
+    for width in (40, 100):
+        console = Console(width=width, height=12, force_terminal=True, color_system=None)
+        with console.capture() as shown:
+            console.print(Watcher(console, TITLE)._screen(found))
+        lines = [line.rstrip() for line in shown.get().splitlines()]
+        assert len(lines) < 12
+        assert any(line.startswith("2 kinds of crashes, the last new one 3") for line in lines)
+    assert any("3:12 ago (1 trial): 2 rear end, the" in line for line in lines)
+    assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("one 3:12 ago")
 
 
 def test_where_not_all_fit_it_says_how_many_more():

@@ -13,7 +13,20 @@ PLANTED = Path(__file__).with_name("planted.py")
 def test_each_defect_is_a_kind(shell):
     shutil.copy(PLANTED, shell.folder)
     arguments = ("--agent", "planted:Planted", "--arg", "defect=asleep|blind|reads")
-    shell.crashhunt("run", "h", "2", "9", "150", "--scenario", "loop", *arguments, "--seed", "5", "--keep-going")
+    words = ("run", "h", "2", "9", "150", "--scenario", "loop", *arguments, "--seed", "5", "--json")
+    first = shell.crashhunt(*words, "--distinct", "2").json
+    assert first["stopped_because"] == "distinct"
+    assert first["trials_run"] < 9
+    assert len(first["kinds"]) >= 2  # two may end at once
+    again = shell.crashhunt(*words, "--distinct", "2").json
+    assert (again["stopped_because"], again["trials_run"]) == ("distinct", first["trials_run"])
+    rest = shell.crashhunt(*words, "--keep-going").json
+    assert (rest["stopped_because"], rest["trials_run"]) == ("all_trials", 9)
+    (state,) = shell.crashhunt("status", "h", "--json").json["hunts"]
+    assert state["kinds"] == rest["kinds"]
+    assert state["newest_kind_s"] >= 0
+    assert "3 kinds" in shell.crashhunt("status", "h").out
+
     found = shell.crashhunt("crashes", "h", "--json").json
     bundles = {str(bundle.path.relative_to(shell.folder)): bundle for bundle in list_bundles(shell.folder / "h")}
     kinds = [
@@ -22,6 +35,12 @@ def test_each_defect_is_a_kind(shell):
     assert all(len(defects) == 1 for defects in kinds)
     assert sorted(kinds, key=str) == [{"asleep"}, {"blind"}, {"reads"}]
     assert sorted(name for group in found["groups"] for name in group["members"]) == sorted(bundles)
+    same = [
+        {"words": group["words"], "count": group["count"]}
+        | {name: Path(group[name]).name for name in ("first", "shortest")}
+        for group in found["groups"]
+    ]
+    assert rest["kinds"] == same  # the hunt tells them as the command does
     asleep, blind = (
         next(group for group, of in zip(found["groups"], kinds, strict=True) if of == {name})
         for name in ("asleep", "blind")

@@ -1,0 +1,102 @@
+"""Which kinds of crashes a hunt has found, while it runs."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.base.errors import BundleError
+from crashhunt.triage import Group, groups_of, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.triage import Signature
+
+__all__ = ["KindData", "Kinds", "kind_data"]
+
+
+class KindData(TypedDict):
+    """A kind of crashes in few words, as the ledger and ``--json`` have it."""
+
+    words: str
+    count: int
+    first: str
+    shortest: str
+
+
+def kind_data(group: Group) -> KindData:
+    """Return a group in few words, with the ids of its crashes."""
+    return {
+        "words": str(group.signature),
+        "count": len(group.bundles),
+        "first": group.first.id,
+        "shortest": group.shortest.id,
+    }
+
+
+class Kinds:
+    """The kinds of the crashes that a hunt has saved.
+
+    Args:
+        wanted: how many kinds are enough; 0 for never.
+        crashes: that were saved before.
+        newest: when the last new kind came, in s since the epoch; None where nobody knows.
+    """
+
+    def __init__(self, wanted: int, crashes: Sequence[Bundle] = (), newest: float | None = None) -> None:
+        self._wanted = wanted
+        self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
+        self._groups: tuple[Group, ...] | None = None
+        self._until: int | None = None
+        self.newest = newest
+        self.newest_trial: int | None = None
+        for bundle in crashes:
+            self._sign(bundle)
+
+    def add(self, bundle: Bundle, ended: int) -> None:
+        """Take in a crash that has been saved.
+
+        Args:
+            bundle: the crash.
+            ended: how many trials have ended by now.
+        """
+        before = {signature for signature, _ in self._signed.values()}
+        signature = self._sign(bundle)
+        if signature is not None and signature not in before:
+            self.newest, self.newest_trial = time.time(), ended
+
+    def groups(self) -> tuple[Group, ...]:
+        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials."""
+        if self._groups is None:  # a screen asks ten times a second
+            self._groups = groups_of(self._signed[number] for number in sorted(self._signed))
+        return self._groups
+
+    @property
+    def until(self) -> int | None:
+        """The least number of a trial up to which there are enough kinds; None where there are not."""
+        return self._until
+
+    def refresh(self, crashes: Sequence[Bundle]) -> None:
+        """Take the crashes as they are now: they have been confirmed."""
+        for bundle in crashes:
+            number = bundle.result.spec.number
+            if number in self._signed:
+                self._signed[number] = self._signed[number][0], bundle
+        self._groups = None
+
+    def _sign(self, bundle: Bundle) -> Signature | None:
+        try:
+            signature = signature_of(bundle)
+        except BundleError:
+            return None  # which is of no kind, and which crashhunt check tells of
+        self._signed[bundle.result.spec.number] = signature, bundle
+        self._groups = None
+        seen: set[Signature] = set()
+        for number in sorted(self._signed) if self._wanted else ():
+            seen.add(self._signed[number][0])
+            if len(seen) >= self._wanted:
+                self._until = number
+                break
+        return signature

@@ -1,0 +1,56 @@
+"""Which kinds of crashes a hunt has found: when there are enough, and how long ago the last new one came."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base.errors import UsageError
+from crashhunt.hunts._kinds import Kinds, kind_data
+from crashhunt.plans import RunSettings
+from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
+
+
+def crash(number, kind, steps=5):
+    spec = TrialSpec(number, 1, {"ego": {}}, {}, max_steps=10)
+    result = TrialResult(spec, Outcome.AGENT_ERROR, steps=steps, failure=Failure(kind, "said"))
+    return SimpleNamespace(result=result, path=f"c{number}", id=f"c{number}")
+
+
+def test_enough_is_up_to_the_least_trial_with_which_there_are_so_many():
+    kinds = Kinds(2)
+    kinds.add(crash(7, "KeyError"), 1)
+    assert kinds.until is None
+    kinds.add(crash(9, "IndexError"), 2)
+    assert kinds.until == 9
+    kinds.add(crash(3, "KeyError"), 3)
+    assert kinds.until == 9
+    kinds.add(crash(8, "IndexError"), 4)  # lower numbers were still running
+    assert kinds.until == 8
+    kinds.add(crash(5, "TypeError"), 5)
+    assert kinds.until == 5
+    assert Kinds(0, [crash(1, "KeyError")]).until is None
+
+
+def test_the_last_new_kind_is_not_the_last_crash(monkeypatch):
+    kinds = Kinds(0, [crash(1, "KeyError")], newest=50.0)
+    monkeypatch.setattr(time, "time", lambda: 100.0)
+    kinds.add(crash(2, "KeyError"), 4)
+    assert (kinds.newest, kinds.newest_trial) == (50.0, None)
+    kinds.add(crash(3, "IndexError"), 6)
+    assert (kinds.newest, kinds.newest_trial) == (100.0, 6)
+    kinds.add(crash(0, "IndexError", steps=2), 8)
+    assert kinds.newest_trial == 6
+    assert [kind_data(group) for group in kinds.groups()] == [
+        {"words": "IndexError in said", "count": 2, "first": "c0", "shortest": "c0"},
+        {"words": "KeyError in said", "count": 2, "first": "c1", "shortest": "c1"},
+    ]
+
+
+def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
+    assert RunSettings(distinct=3).checked().keep_going
+    assert not RunSettings().checked().keep_going
+    with pytest.raises(UsageError, match="--distinct is -1"):
+        RunSettings(distinct=-1).checked()
