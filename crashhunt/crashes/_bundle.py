@@ -65,7 +65,7 @@ _TYPES: Plain = {
     "confirmed": bool | None,
     "divergence": dict | None,
     "disturbed": bool,
-    "log_likelihood": float | None,
+    **dict.fromkeys(("log_likelihood", "danger"), float | None),
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
@@ -197,6 +197,8 @@ class Bundle:
             "divergence": self.divergence,
             "files": dict(self.files) or _files_beside(folder),
         }
+        if result.danger is not None:
+            data["danger"] = plain.get("danger")
         if result.log_likelihood is not None or result.spec.disturbances:
             data["disturbed"] = result.disturbed
             data["log_likelihood"] = plain.get("log_likelihood")
@@ -283,6 +285,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         events=data.get("events"),
         disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
         log_likelihood=data.get("log_likelihood"),
+        danger=data.get("danger"),
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(

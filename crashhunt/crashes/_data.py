@@ -54,6 +54,7 @@ class CrashData(Protected):
     divergence: DivergenceData | None
     disturbed: NotRequired[bool]
     log_likelihood: NotRequired[float | None]
+    danger: NotRequired[float | None]
     disturbances: NotRequired[list[DisturbanceData]]
     planned_disturbances: NotRequired[list[DisturbanceData]]
 

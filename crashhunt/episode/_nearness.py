@@ -6,7 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.episode._observer import Observer
-from crashhunt.world import ApproachMeter
+from crashhunt.trial import Outcome
+from crashhunt.world import ApproachMeter, danger_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -53,4 +54,6 @@ class Nearness(Observer):
         closest = self.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
-        return replace(result, closest=closest)
+        if result.outcome is Outcome.INVALID:
+            return replace(result, closest=closest)
+        return replace(result, closest=closest, danger=1.0 if result.outcome.is_traffic_crash else danger_of(closest))

@@ -13,7 +13,7 @@ from crashhunt.episode import scratch_of
 from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
 from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, closest_approach
+from crashhunt.world import ClosestApproach, closest_approach, danger_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -135,6 +135,7 @@ def _result(
         sim_time_s=sim_time_s,
         digest=digest,
         closest=closest,
+        danger=None if outcome is Outcome.INVALID else danger_of(closest),
         failure=failure,
         wall_s=wall_s,
         worker=header.pid if header is not None else 0,

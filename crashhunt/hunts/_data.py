@@ -75,6 +75,7 @@ class Seal(TypedDict):
     outcomes: Mapping[str, int]
     steps: int
     table: str
+    dangers: NotRequired[str]
     events: int
     replaced: int
     proposals: NotRequired[int]

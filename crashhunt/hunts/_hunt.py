@@ -322,9 +322,7 @@ class Hunt:
         if result.outcome is Outcome.INVALID:
             progress.last_invalid = result
         elif result.collision is None and result.failure is None:
-            nearest = progress.nearest
-            if nearest is None or result.closest.time_to_collision_s < nearest.closest.time_to_collision_s:
-                progress.nearest = result
+            progress.nearest = max(progress.nearest or result, result, key=lambda one: one.nearness)
         if result.kept:
             write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)

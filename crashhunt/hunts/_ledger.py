@@ -18,7 +18,7 @@ from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.hunts._ledger_file import damaged, explained, opened, removed, rewrite
 from crashhunt.hunts._ledger_reader import LedgerReader, Turn
-from crashhunt.hunts._ledger_schema import SEAL, VERSION, create, shape_of
+from crashhunt.hunts._ledger_schema import SEAL, VERSION, columns_of_trials, create, shape_of
 from crashhunt.hunts._migrations import migrate
 
 if TYPE_CHECKING:
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Ledger", "Turn", "has_begun"]
 
+_COLUMNS = columns_of_trials()
+_MARKS = ", ".join("?" * (len(_COLUMNS) + 1))
+_INSERT = f"INSERT OR REPLACE INTO trials ({', '.join(_COLUMNS)}, digest) VALUES ({_MARKS})"
 _TOGETHER_S = 0.5  # a kill loses no more than this of what was recorded together
 
 
@@ -89,6 +92,7 @@ class Ledger(LedgerReader):
             time.time(),
             snapshot,
             json.dumps(result.to_json()),
+            _real(result.danger),
         )
         self._insert(row)
 
@@ -115,8 +119,9 @@ class Ledger(LedgerReader):
             raise explained(self._path, error) from error
 
     def copy(self, row: Row) -> None:
-        """Add a row that `intact_rows` of another ledger has yielded."""
-        self._insert(row)
+        """Add a row that `intact_rows` of another ledger has yielded, of any version."""
+        count = len(_COLUMNS)
+        self._insert((*row, *(None,) * count)[:count])
 
     def propose(self, turns: Sequence[Turn]) -> None:
         """Add what a sampler that learns has proposed, all or nothing, and what it was told before.
@@ -212,7 +217,7 @@ class Ledger(LedgerReader):
     def _insert(self, row: Row) -> None:
         values = (*row, digest_of_row(row))
         try:
-            self._database.execute("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+            self._database.execute(_INSERT, values)
             if time.monotonic() - self._together_since > _TOGETHER_S:
                 self._database.execute("COMMIT")
                 self._database.execute("BEGIN")

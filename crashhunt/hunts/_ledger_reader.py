@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["LedgerReader", "Turn"]
 
 _CHUNK = 4096
+_BY_TIME = (
+    "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
+    "ORDER BY outcome, time_to_collision_s, number"
+)
+_BY_DANGER = "SELECT outcome, danger, number FROM trials INDEXED BY trials_by_danger ORDER BY outcome, danger, number"
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +175,7 @@ class LedgerReader:
                 row = self._row(number)
                 if row is not None:
                     self._plain(row)
-                    yield number, row[:11]
+                    yield number, row[:-1] if self.protected else row
             except HuntDirectoryError:
                 yield number, None
 
@@ -203,7 +208,23 @@ class LedgerReader:
         return str(self._plain(row) and row[9]) if row else ""
 
     def nearest_miss(self) -> TrialResult | None:
-        """Return the trial that did not crash and came nearest to it, by time to collision."""
+        """Return the trial that did not crash and came nearest to it: the most dangerous one.
+
+        In a ledger of before danger was measured, that with the least time to collision.
+        """
+        if "danger" in self._shape.columns["trials"]:
+            # Of two that are equal, the first.
+            most = [
+                row
+                for outcome in ("survived", "finished")
+                for row in self._select(
+                    "SELECT -danger, min(number) FROM trials WHERE outcome = ?1 AND danger = "
+                    "(SELECT max(danger) FROM trials WHERE outcome = ?1) GROUP BY danger",
+                    (outcome,),
+                )
+            ]
+            if most:
+                return self.result(min(most)[1])
         least = [
             row
             for outcome in ("survived", "finished")
@@ -284,7 +305,7 @@ class LedgerReader:
         said = hashlib.blake2b(digest_size=16)
         for rows in self._chunks():
             said.update(_as_text(rows))
-        return {
+        seal: Seal = {
             "outcomes": self._outcomes(),
             "steps": self._steps(),
             "table": said.hexdigest(),
@@ -293,6 +314,12 @@ class LedgerReader:
             "proposals": self._count("proposals") if self._proposing else 0,
             "facts": self._count(f"hunt WHERE key <> '{SEAL}'"),
         }
+        if "danger" in self._shape.columns["trials"]:
+            ranked = hashlib.blake2b(digest_size=16)
+            for rows in self._chunks(_BY_DANGER):
+                ranked.update(_as_text(rows))
+            seal["dangers"] = ranked.hexdigest()
+        return seal
 
     def _fits(self, seal: Seal) -> bool:
         """Whether what is there is what was sealed, by a version that knew less or more, too."""
@@ -314,12 +341,9 @@ class LedgerReader:
     def _steps(self) -> int:
         return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
 
-    def _chunks(self) -> Iterator[list[Row]]:
+    def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:
         try:
-            cursor = self._database.execute(
-                "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
-                "ORDER BY outcome, time_to_collision_s, number"
-            )
+            cursor = self._database.execute(query)
             while rows := cursor.fetchmany(_CHUNK):
                 yield rows
         except sqlite3.Error as error:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = [
+    "DANGER_INDEX",
     "EVENTS_INDEX",
     "FIRST",
     "OWN_FACTS",
@@ -26,12 +27,13 @@ __all__ = [
     "VERSION",
     "WITH_EVENTS",
     "Shape",
+    "columns_of_trials",
     "create",
     "note_reader",
     "shape_of",
 ]
 
-VERSION = 3  # of the tables, as PRAGMA user_version
+VERSION = 4  # of the tables, as PRAGMA user_version
 _READER = 3  # the least version of a crashhunt that reads what this one writes
 _PROTECTED = 2  # the first version in which every row has a digest of its content
 _PROPOSING = 3  # the first version that has proposals
@@ -47,6 +49,7 @@ CREATE TABLE IF NOT EXISTS proposals (
 # Most trials have no traffic event, so that those that have some are counted without reading all the others.
 WITH_EVENTS = """instr(result, '"events": {"') > 0"""
 EVENTS_INDEX = f"CREATE INDEX IF NOT EXISTS trials_with_events ON trials (number) WHERE {WITH_EVENTS};"
+DANGER_INDEX = "CREATE INDEX IF NOT EXISTS trials_by_danger ON trials (outcome, danger, number);"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS trials (
     number INTEGER PRIMARY KEY,
@@ -60,11 +63,13 @@ CREATE TABLE IF NOT EXISTS trials (
     ended_at REAL NOT NULL,
     snapshot TEXT NOT NULL,
     result TEXT NOT NULL,
-    digest INTEGER NOT NULL
+    digest INTEGER NOT NULL,
+    danger REAL
 ) STRICT;
 -- What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
 CREATE INDEX IF NOT EXISTS trials_by_outcome ON trials (outcome, time_to_collision_s, number, steps, seed);
 {EVENTS_INDEX}
+{DANGER_INDEX}
 CREATE TABLE IF NOT EXISTS replaced (
     number INTEGER, replaced_at REAL, result TEXT NOT NULL, digest INTEGER NOT NULL
 ) STRICT;
@@ -86,6 +91,8 @@ FIRST = {
     "events": ("at", "state", "detail"),
     "hunt": ("key", "value"),
 }  # fmt: skip
+# Columns that came later stand after the digest, where a migration puts them.
+_ADDED = {"trials": {"danger": 4}}  # table to column to the first version that has it
 _LATER = {"proposals": ("turn", "number", "told", "spec")}
 
 
@@ -110,6 +117,11 @@ class Shape:
     def select(self, table: str) -> str:
         """Return the beginning of a query for whole rows, the digest last."""
         return f"SELECT {', '.join((*self.columns[table], *(('digest',) if self.protected else ())))} FROM {table}"
+
+
+def columns_of_trials() -> tuple[str, ...]:
+    """Return the columns of a trial's row in this version, without its digest, in the order of which that is made."""
+    return (*FIRST["trials"], *_ADDED["trials"])
 
 
 def create(path: Path) -> None:
@@ -154,7 +166,9 @@ def _columns(
     database: sqlite3.Connection, path: Path, version: int, table: str, known: tuple[str, ...]
 ) -> tuple[str, ...]:
     there = tuple(name for _, name, *_ in database.execute(f"PRAGMA table_info({table})"))
-    expected = known if version < _PROTECTED else (*known, "digest")
+    added = tuple(name for name, since in _ADDED.get(table, {}).items() if version >= since)
+    expected = known if version < _PROTECTED else (*known, "digest", *added)
+    known = (*known, *added)
     if version > VERSION and "digest" in there:
         columns = tuple(name for name in there if name != "digest")
         if columns[: len(known)] == known:

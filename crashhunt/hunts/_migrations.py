@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.hunts._ledger_schema import EVENTS_INDEX, FIRST, PROPOSALS, VERSION, note_reader
+from crashhunt.hunts._ledger_schema import DANGER_INDEX, EVENTS_INDEX, FIRST, PROPOSALS, VERSION, note_reader
 
 if TYPE_CHECKING:
     import sqlite3
@@ -28,7 +28,20 @@ def _add_proposals(database: sqlite3.Connection) -> None:
     note_reader(database)
 
 
-MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_digests, 2: _add_proposals}
+def _add_danger(database: sqlite3.Connection) -> None:
+    """Nobody measured the danger of what is there; a row that is not as it was written keeps a digest that says so."""
+    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
+    database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
+    was = ", ".join(FIRST["trials"])
+    database.execute(f"UPDATE trials SET digest = digest_of_row({was}, danger) WHERE digest = digest_of_row({was})")
+    database.execute(DANGER_INDEX)
+
+
+MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {
+    1: _add_digests,
+    2: _add_proposals,
+    3: _add_danger,
+}
 """Version to what makes of a ledger of it one of the next.
 
 A version may add tables, and columns at the end of a table, each with a value for the rows that are there. The digest

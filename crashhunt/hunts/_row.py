@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 __all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "Cell", "TrialRow"]
 
 FACTS = (
-    "number", "seed", "outcome", "steps", "sim_time_s", "time_to_collision_s", "gap_m", "required_deceleration",
-    "wall_s", "digest", *map(str, EVENTS),
+    "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
+    "required_deceleration", "wall_s", "digest", *map(str, EVENTS),
 )  # fmt: skip
 """The columns that every table of trials begins with."""
 
@@ -60,6 +60,11 @@ class TrialRow:
         return _closest(self.data).get("time_to_collision_s")
 
     @property
+    def danger(self) -> float | None:
+        """How near to a crash it came, 0 to 1; None where nobody measured it."""
+        return self.data.get("danger")
+
+    @property
     def arguments(self) -> Mapping[str, Mapping[str, Value]]:
         """What its agents were given, by agent and name."""
         return self.data["spec"].get("arguments", {})
@@ -83,6 +88,7 @@ class TrialRow:
             "outcome": data["outcome"],
             "steps": data["steps"],
             "sim_time_s": data.get("sim_time_s"),
+            "danger": data.get("danger"),
             "time_to_collision_s": closest.get("time_to_collision_s"),
             "gap_m": closest.get("gap_m"),
             "required_deceleration": closest.get("required_deceleration"),

@@ -209,4 +209,5 @@ def _near(result: TrialResult) -> str:
         how = f"{closest.time_to_collision_s:.2f} s from a collision"
     else:
         how = "never on a collision course"
-    return f"trial {result.spec.number}, {how}, {format_arguments(result)}"
+    danger = "" if result.danger is None else f"danger {result.danger:.2f}, "
+    return f"trial {result.spec.number}, {danger}{how}, {format_arguments(result)}"

@@ -124,4 +124,6 @@ def _result(number: int, proposal: Proposal) -> TrialResult:
     seed = number if proposal.seed is None else proposal.seed
     spec = TrialSpec(number, seed, arguments, scenario, max_steps=50, parent=proposal.parent, origin=proposal.origin)
     near = ClosestApproach(((7 * number) % 10) / 2, 1.0 + number, 3.0) if number % 4 else ClosestApproach()
-    return TrialResult(spec, _OUTCOMES[number % len(_OUTCOMES)], steps=number + 1, wall_s=0.1, closest=near)
+    outcome = _OUTCOMES[number % len(_OUTCOMES)]
+    danger = {Outcome.INVALID: None, Outcome.COLLISION: 1.0}.get(outcome, ((7 * number) % 10) / 10)
+    return TrialResult(spec, outcome, steps=number + 1, wall_s=0.1, closest=near, danger=danger)

@@ -122,3 +122,4 @@ class ResultData(TypedDict):
     events: NotRequired[dict[str, int] | None]
     disturbances: NotRequired[list[DisturbanceData]]
     log_likelihood: NotRequired[float | None]
+    danger: NotRequired[float | None]

@@ -74,7 +74,7 @@ def check_plain(data: ResultData) -> None:
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
     for planned in (data.get("disturbances"), spec.get("disturbances")):
         check_disturbances(planned)
-    typed_where_there(data, {"log_likelihood": float | None})
+    typed_where_there(data, dict.fromkeys(("log_likelihood", "danger"), float | None))
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
     if min(data["steps"], spec["number"], spec["seed"], spec["max_steps"]) < 0:

@@ -43,6 +43,7 @@ class TrialResult:
         disturbances: those that took place, with who turned out to be meant.
         log_likelihood: that just these disturbances begin in these steps, and no others: the natural logarithm of the
             probability, as the hunt's models have it; None where the hunt has none.
+        danger: how near to a crash it came, from 0 (nothing near) to 1 (touched); None where nobody measured it.
     """
 
     spec: TrialSpec
@@ -62,6 +63,7 @@ class TrialResult:
     events: Mapping[str, int] | None = None
     disturbances: tuple[Disturbance, ...] = ()
     log_likelihood: float | None = None
+    danger: float | None = None
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -89,6 +91,8 @@ class TrialResult:
             data["disturbances"] = [one.to_json() for one in self.disturbances]
         if self.log_likelihood is not None:
             data["log_likelihood"] = finite(self.log_likelihood)
+        if self.danger is not None:
+            data["danger"] = finite(self.danger)
         return data
 
     @classmethod
@@ -114,12 +118,21 @@ class TrialResult:
             kept=data.get("kept", False),
             disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
             log_likelihood=data.get("log_likelihood"),
+            danger=data.get("danger"),
         )
 
     @property
     def steps_begun(self) -> int:
         """How many steps were begun: one more than were completed, where something failed in the next."""
         return self.steps + (self.failure is not None)
+
+    @property
+    def nearness(self) -> tuple[float, float]:
+        """What ranks trials by how near to a crash they came, the greater the nearer.
+
+        By danger; those of which nobody measured it come last, by time to collision.
+        """
+        return -1.0 if self.danger is None else self.danger, -self.closest.time_to_collision_s
 
     @property
     def disturbed(self) -> bool:

@@ -188,7 +188,7 @@ def test_without_a_seal_whole_rows_say_it(path):
         assert [number for number, row in reader.intact_rows(range(5)) if row is not None] == [0, 2]
         assert [number for number, row in reader.intact_rows(range(5)) if row is None] == [1]
         (row,) = [row for _, row in reader.intact_rows([2])]
-        assert len(row) == 11
+        assert len(row) == 12
         reader.check_pages()
     with closing(Ledger(path.with_name("other.sqlite"), writable=True)) as other:
         other.copy(row)
@@ -229,6 +229,8 @@ def test_in_a_ledger_without_digests_two_places_may_not_contradict_each_other(pa
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("DELETE FROM hunt")
         database.execute("DROP TABLE proposals")
+        database.execute("DROP INDEX trials_by_danger")
+        database.execute("ALTER TABLE trials DROP COLUMN danger")
         for table in ("trials", "replaced", "events", "hunt"):
             database.execute(f"ALTER TABLE {table} DROP COLUMN digest")
         database.execute("PRAGMA user_version = 1")

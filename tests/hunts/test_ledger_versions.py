@@ -24,10 +24,12 @@ OUTCOMES = (Outcome.SURVIVED, Outcome.COLLISION, Outcome.FINISHED, Outcome.INVAL
 EVENTS = {2: {"running_a_red_light": 2, "emergency_braking": 1}, 6: {"running_a_red_light": 6, "emergency_braking": 1}}
 
 
-def result(number, *, events=True):
+def result(number, *, events=True, danger=True):
     spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5 + number}}, {"vehicles": number}, max_steps=20)
     closest = ClosestApproach(number / 3, 1.0, 2.0) if number % 3 else ClosestApproach()
     some = {"events": EVENTS[number]} if events and number in EVENTS else {}
+    if danger and number % 5:
+        some["danger"] = 1 / number
     digest = f"{number:032x}"
     return TrialResult(spec, OUTCOMES[number % 4], steps=number, wall_s=0.125, closest=closest, digest=digest, **some)
 
@@ -55,7 +57,7 @@ def version(path):
 
 def check(ledger, frozen):
     """See that a ledger says what was written."""
-    trials = [result(number, events=frozen > 1) for number in range(10)]
+    trials = [result(number, events=frozen > 1, danger=frozen > 3) for number in range(10)]
     gone = trials.pop(3)
     assert list(ledger.results()) == trials
     assert ledger.replaced() == [gone]
@@ -63,6 +65,7 @@ def check(ledger, frozen):
     assert [event[1:] for event in ledger.events()] == [("running", ""), ("interrupted", "by somebody")]
     assert ledger.outcomes() == {"collision": 3, "finished": 2, "invalid": 1, "survived": 3}
     assert ledger.steps_total() == 42
+    assert ledger.nearest_miss().spec.number == 2
     assert ledger.snapshot_of(4) == "0123456789abcdef"
     assert ledger.traffic_events() == (
         {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)} if frozen > 1 else {}
@@ -131,12 +134,12 @@ def newer(path, *, reader):
         seal = ledger._seal()
     with closing(sqlite3.connect(path)) as database, database:
         database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
-        database.execute("CREATE TABLE dangers (number INTEGER, danger REAL)")
-        database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
+        database.execute("CREATE TABLE moods (number INTEGER, mood REAL)")
+        database.execute("ALTER TABLE trials ADD COLUMN mood REAL")
         names = [name for _, name, *_ in database.execute("PRAGMA table_info(trials)") if name != "digest"]
-        database.execute("UPDATE trials SET danger = 0.5")
+        database.execute("UPDATE trials SET mood = 0.5")
         database.execute(f"UPDATE trials SET digest = digest_of_row({', '.join(names)})")
-        facts = {"seal": {**seal, "dangers": 3, "facts": seal["facts"] + 1}, "reader": reader, "climate": "warm"}
+        facts = {"seal": {**seal, "moods": 3, "facts": seal["facts"] + 1}, "reader": reader, "climate": "warm"}
         for key, value in facts.items():
             row = (key, json.dumps(value))
             database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
@@ -157,7 +160,7 @@ def test_a_ledger_of_later_is_read_where_it_says_so_and_never_written(tmp_path):
     with pytest.raises(HuntDirectoryError, match=f"a ledger of version 99, and this crashhunt writes version {today}"):
         Ledger(path, writable=True)
     with closing(sqlite3.connect(path)) as database, database:
-        database.execute("UPDATE trials SET danger = 0.4 WHERE number = 4")
+        database.execute("UPDATE trials SET mood = 0.4 WHERE number = 4")
     with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
         list(ledger.results())
 
@@ -180,3 +183,34 @@ def test_a_proposal_that_is_gone_is_missed(tmp_path):
         list(ledger.turns())
     with pytest.raises(HuntDirectoryError, match="missing or have changed"):
         Ledger(path, writable=True)
+
+
+def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    shutil.copy(Path(__file__).parent / "ledgers" / "version-3.sqlite", path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE trials SET result = replace(result, '2.0', '2.5') WHERE number = 4")
+    Ledger(path, writable=True).close()
+    with closing(Ledger(path)) as ledger:
+        assert ledger.result(2) == result(2, danger=False)
+        with pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
+            ledger.result(4)
+
+
+def test_what_ranks_trials_is_sealed(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    write(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE trials SET danger = 0.4 WHERE number = 4")
+    with pytest.raises(HuntDirectoryError, match="missing or have changed"):
+        Ledger(path, writable=True)
+
+
+def test_of_trials_as_dangerous_the_first_is_the_nearest_miss(tmp_path):
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        for number, danger, ttc in ((0, None, 0.1), (2, 0.5, 9.0), (4, 0.75, 8.0), (6, 0.75, 2.0), (1, 1.0, 0.0)):
+            closest = ClosestApproach(ttc, 1.0, 2.0)
+            ledger.record(replace(result(number), danger=danger, closest=closest), snapshot="")
+        assert ledger.nearest_miss().spec.number == 4
+        ledger.replace([2, 4, 6])
+        assert ledger.nearest_miss().spec.number == 0  # nobody measured it: by time to collision

@@ -27,6 +27,7 @@ RESULT = TrialResult(
     escape=Escape(4, 5, 7.5, "by braking"),
     event=Event("teleport", "ego", "car was moved", ("car",), "b_0", 3.5, 4.5, 14.5),
     events={"teleport": 2},
+    danger=0.875,
 )
 
 
@@ -41,7 +42,8 @@ def test_a_row_has_every_column():
     columns = (*FACTS, "parent", "origin", "ego.speed", "scenario.gap_m", "ego.other")
     row = TrialRow(RESULT.to_json()).cells(columns)
     assert row == {
-        "number": 3, "seed": 7, "outcome": "collision", "steps": 9, "sim_time_s": 0.9, "time_to_collision_s": 0.25,
+        "number": 3, "seed": 7, "outcome": "collision", "steps": 9, "sim_time_s": 0.9, "danger": 0.875,
+        "time_to_collision_s": 0.25,
         "gap_m": 0.5, "required_deceleration": 6.5, "wall_s": 2.25, "digest": "ab",
         **dict.fromkeys(EVENTS, 0), "teleport": 2,
         "parent": 1, "origin": "climb", "ego.speed": 11.5, "scenario.gap_m": 4, "ego.other": None,
@@ -53,13 +55,13 @@ def test_where_nobody_looked_for_events_a_row_does_not_say_that_there_were_none(
     unseen = dataclasses.replace(RESULT, events=None, closest=ClosestApproach())
     row = TrialRow(unseen.to_json())
     assert set(row.cells([str(kind) for kind in EVENTS]).values()) == {None}
-    assert (row.number, row.outcome, row.time_to_collision_s) == (3, Outcome.COLLISION, None)
+    assert (row.number, row.outcome, row.danger, row.time_to_collision_s) == (3, Outcome.COLLISION, 0.875, None)
     assert (row.arguments, row.scenario_arguments) == ({"ego": {"speed": 11.5}}, {"gap_m": 4})
 
 
 def test_a_row_of_an_earlier_version_has_what_that_wrote():
     row = TrialRow({"spec": {"number": 3, "seed": 7, "max_steps": 9}, "outcome": "survived", "steps": 9})
-    assert (row.time_to_collision_s, row.arguments, row.scenario_arguments) == (None, {}, {})
+    assert (row.danger, row.time_to_collision_s, row.arguments, row.scenario_arguments) == (None, None, {}, {})
     assert row.cells(("seed", "gap_m", "wall_s", "digest")) == {
         "seed": 7,
         "gap_m": None,
