@@ -1,4 +1,4 @@
-"""Names that are not known: what somebody may have meant, and what there is."""
+"""What is proposed for a name that is not known: "did you mean …", or what there is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a command is that takes its time: a line on a terminal, nothing for programs and files."""
+"""The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`."""
 
 from __future__ import annotations
 

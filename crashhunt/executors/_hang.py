@@ -1,4 +1,4 @@
-"""Which trials hang: over their wall-clock limit, and past the time to write down where they are stuck."""
+"""Which trials hang, over their time limit; and how long they may write down where, before they are killed."""
 
 from __future__ import annotations
 

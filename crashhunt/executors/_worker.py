@@ -1,4 +1,4 @@
-"""What runs in a worker process: one simulator, kept warm, and one trial after another."""
+"""What runs in a worker: one simulator, kept warm, and trial after trial; what they print is caught and cut here."""
 
 from __future__ import annotations
 

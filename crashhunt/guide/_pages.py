@@ -12,6 +12,7 @@ from crashhunt.base.names import one_of
 from crashhunt.guide._api import describe_api
 from crashhunt.guide._commands import describe_commands
 from crashhunt.guide._keys import describe_keys
+from crashhunt.guide._modules import describe_modules
 
 if TYPE_CHECKING:
     import argparse
@@ -26,7 +27,7 @@ _ORDER = [
     "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "film", "hand-over", "suites",
     "cluster", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
-    "troubleshooting", "glossary", "architecture", "contributing", "changelog",
+    "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
 """What somebody needs first; what is not named here comes after it."""
 
@@ -92,10 +93,16 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
     """Return the text of a page with what is made from the code in its place.
 
     Args:
-        text: Markdown, in which ``<!-- made from the code: commands -->``, ``api`` or ``keys`` stands for it.
+        text: Markdown, in which ``<!-- made from the code: commands -->``, ``api``, ``keys`` or ``modules`` stands for
+            it.
         parser: of the command line.
     """
-    makers = {"commands": lambda: describe_commands(parser), "api": describe_api, "keys": describe_keys}
+    makers = {
+        "commands": lambda: describe_commands(parser),
+        "api": describe_api,
+        "keys": describe_keys,
+        "modules": describe_modules,
+    }
     # What stands there for whoever reads the file as it is, up to the next blank line, goes.
     return re.sub(_MADE.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
 

@@ -1,4 +1,4 @@
-"""What hunts and trials have printed, wherever it is."""
+"""``crashhunt logs``: finds and reads what hunts and trials have printed, wherever it was kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a hunt is going."""
+"""How a hunt is going: the figures of the status screen, of ``status`` and of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``log.mcap``: what is kept of an episode, in a file that other tools open too.
+"""``log.mcap``: what is kept of an episode and how it is compressed, in a file that other tools open too.
 
 Evidence channels hold our records, one message each, in their order; the message's sequence number is the record's.
 Reading them gives back the very same records, hence the same digest. View channels (see ``_foxglove``) are for people.

@@ -1,4 +1,4 @@
-"""Protobuf messages into an MCAP file, at simulation time."""
+"""Topics and protobuf messages of an MCAP file, at simulation time; the file itself is written in `_log`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A replay to look into: up to a step, with the terminal free for a debugger inside the agent."""
+"""A replay to look into: pdb inside the agent, the window (``--gui``), panels; up to a step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replay: run a saved crash again, in a fresh process, and say whether it is the same to the bit."""
+"""Replay and confirmation: run a crash again, in a fresh process, and say whether it is the same to the bit."""
 
 from __future__ import annotations
 

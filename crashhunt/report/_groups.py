@@ -1,4 +1,4 @@
-"""The kinds of crashes, for people."""
+"""The table of the kinds of crashes, for people; which are of one kind, and their order, is in `triage`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report: one HTML file that shows a hunt and animates its crashes, with no network and no other file."""
+"""The report's data: one HTML file that shows a hunt and animates its crashes; its looks are in `page.html`."""
 
 from __future__ import annotations
 

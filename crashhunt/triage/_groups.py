@@ -1,4 +1,4 @@
-"""Crashes that are the same one, over one hunt or many."""
+"""Crashes that are the same one, over one hunt or many, and their order."""
 
 from __future__ import annotations
 

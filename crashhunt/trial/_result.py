@@ -1,4 +1,4 @@
-"""What came of a trial: frozen, small, expressible as JSON."""
+"""What came of a trial, which is what is kept of every trial: frozen, small, expressible as JSON."""
 
 from __future__ import annotations
 

@@ -7,14 +7,24 @@ import os
 import pty
 import re
 import subprocess
+from pathlib import Path
 
 import pytest
 from conftest import CRASHHUNT
 from pages import GUIDE
 
+import crashhunt
 from crashhunt.cli import make_parser
 from crashhunt.errors import UsageError
-from crashhunt.guide import describe_api, describe_commands, describe_keys, find_page, for_terminal, list_pages
+from crashhunt.guide import (
+    describe_api,
+    describe_commands,
+    describe_keys,
+    describe_modules,
+    find_page,
+    for_terminal,
+    list_pages,
+)
 
 TOPICS = [page.topic for page in list_pages()]
 
@@ -129,13 +139,30 @@ def test_the_keys_are_those_of_the_files():
         assert suite.count(f"- `{key}`: ") == 1
 
 
+def test_every_module_is_listed_with_what_it_is_about():
+    text = describe_modules()
+    package = Path(crashhunt.__file__).parent
+    modules = [file for file in package.rglob("*.py") if file.name != "__init__.py"]
+    assert sum(line.startswith("- `") for line in text.splitlines()) == len(modules)
+    assert "## crashhunt/base\n" in text
+    assert "\n- `files.py`: Files that are there as a whole or not at all, also after the power went.\n" in text
+
+
+def test_every_file_that_the_architecture_names_is_there():
+    text = find_page("architecture").file.read_text()
+    top = Path(crashhunt.__file__).parent
+    for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|html))`", text):
+        if "NAME" not in name:
+            assert (top / name).is_file() or (top.parent / name).is_file(), name
+
+
 def test_a_topic_that_is_none_is_refused_from_python_too():
     with pytest.raises(UsageError, match="no topic 'x'"):
         find_page("x")
 
 
 def test_what_stands_for_the_reference_in_the_file_is_not_shown():
-    for topic in ("commands", "api", "toml"):
+    for topic in ("commands", "api", "toml", "modules"):
         page = find_page(topic)
         assert "shows them" in page.file.read_text()
         assert "shows them" not in page.text(make_parser())

@@ -1,4 +1,4 @@
-"""What SUMO is told: options, and files staged in a folder of the worker's own."""
+"""The command line that SUMO is started with, and the files staged for it in a folder of the worker's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options of SUMO: what they are called, and which of them read, write or listen."""
+"""SUMO's options: those that it always gets, what they are called, and which of them read, write or listen."""
 
 from __future__ import annotations
 
