@@ -15,7 +15,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "is_alive", "kill"]
+__all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill"]
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _PATIENCE_S = 2.0  # for processes that do not die at once; those of another user never do
@@ -62,7 +62,7 @@ def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
     found = False
     deadline = time.monotonic() + _PATIENCE_S
     while time.monotonic() < deadline:
-        if not spared and not _has_child():
+        if not spared and not has_child():
             return found
         doomed = [pid for pid in children_of(os.getpid()) if pid not in spared]
         if not doomed:
@@ -101,7 +101,8 @@ def _kill_below(pid: int) -> None:
         _kill_below(child)
 
 
-def _has_child() -> bool:
+def has_child() -> bool:
+    """Whether this process has a child; one that has ended and was not reaped counts."""
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:

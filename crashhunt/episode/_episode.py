@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import random
-import sys
 import time
-import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -14,14 +11,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from crashhunt.agents import Closes
 from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
+from crashhunt.base.forks import Copy, Held, held, shared_memory
 from crashhunt.episode._disturbed import Disturbed
-from crashhunt.episode._failures import failure_of, is_emptied
-from crashhunt.episode._nearness import Nearness
+from crashhunt.episode._failures import close_agent, failure_of, is_emptied
 from crashhunt.episode._observer import Observer
-from crashhunt.episode._recorder import Recorder
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
@@ -34,12 +29,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.recording import BlackBox
+    from crashhunt.base.plain import Plain
     from crashhunt.simulators import Observations, Options, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
-__all__ = ["Episode", "MakeAgent", "run_episode", "seed_everything"]
+__all__ = ["Episode", "MakeAgent"]
 
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
@@ -60,6 +55,7 @@ class Episode:
         oracles: what decides whether a step is a crash.
         crash_on: what ends the episode; a traffic crash or event of another kind is passed over, and it goes on.
         observers: told of everything that happens, in this order.
+        forks: whether copies of it may be made: then it notes what is open before the agents are made, as not theirs.
 
     Attributes:
         spec: which trial.
@@ -86,6 +82,7 @@ class Episode:
         oracles: Sequence[Oracle] = (),
         crash_on: Sequence[Outcome] = CRASHES,
         observers: Sequence[Observer] = (),
+        forks: bool = False,
     ) -> None:
         self.spec = spec
         self.simulator = simulator
@@ -112,16 +109,16 @@ class Episode:
         self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
         # Only those that want to be told are called: this is done several times a step.
-        self._on_begin = [one.begin for one in observers if type(one).begin is not Observer.begin]
-        self._on_observation = [
-            one.observation for one in observers if type(one).observation is not Observer.observation
-        ]
-        self._on_action = [one.action for one in observers if type(one).action is not Observer.action]
-        self._on_scene = [one.scene for one in observers if type(one).scene is not Observer.scene]
-        self._on_disturbance: list[Callable[[Disturbance], None]] = [
-            one.disturbance for one in observers if type(one).disturbance is not Observer.disturbance
-        ]
-        self._on_end = [one.end for one in reversed(observers) if type(one).end is not Observer.end]
+        self._on_begin: list[Callable[[Episode], None]] = _told(observers, "begin")
+        self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = _told(observers, "observation")
+        self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = _told(observers, "action")
+        self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = _told(observers, "scene")
+        self._on_disturbance: list[Callable[[Disturbance], None]] = _told(observers, "disturbance")
+        self._on_copied: list[Callable[[], None]] = _told(observers, "copied")
+        self._on_end: list[Callable[[TrialResult], TrialResult]] = _told(observers[::-1], "end")
+        self._disturbed: Disturbed | None = None
+        self._forks = forks
+        self._held = Held()
 
     def start(self) -> TrialResult | None:
         """Reset the simulator and make the agents.
@@ -214,10 +211,41 @@ class Episode:
         self.error = None
         agents, self.agents = self.agents, {}
         for agent in agents.values():
-            _quietly(agent)
+            close_agent(agent)
+        self._disturbed = None
+        self._look_away()  # observers may hold the episode
+
+    def fork(self, work: Callable[[Episode], Plain], *, observed: bool = True) -> Copy:
+        """Copy this process with the episode in it, between two steps; the copy goes on exactly as this one does.
+
+        Args:
+            work: what is done in the copy, which then is over; it may fork again. What it returns is its answer.
+            observed: whether its observers go on being told. What they record goes elsewhere.
+
+        Raises:
+            CannotForkError: the agents, or whoever has begun before them, have something that has no copy.
+        """
+        if self.scene is None or self.result is not None:
+            raise RuntimeError("an episode has copies only while it goes on")
+
+        def go_on() -> Plain:
+            for tell in self._on_copied if observed else ():
+                tell()
+            if not observed:
+                self._look_away()
+            return work(self)
+
+        copy = Copy(go_on, self._held)
+        self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
+        return copy
+
+    def _look_away(self) -> None:
+        """Tell nobody of anything from now on."""
         tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
-        for told in (*tells, self._on_end):
-            told.clear()  # observers may hold the episode
+        for told in (*tells, self._on_copied, self._on_end):
+            told.clear()
+        if self._disturbed is not None:
+            self._on_end.append(self._disturbed.end)
 
     def __enter__(self) -> Self:
         return self
@@ -237,10 +265,10 @@ class Episode:
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:
                 tell(self)
+            if self._forks:
+                self._held = held(shared_memory())
             if spec.disturbances:
-                disturbed = Disturbed(spec, simulator, self._on_disturbance)
-                self._advance, self.observations = disturbed.step, disturbed.first(self.observations)
-                self._on_end.insert(0, disturbed.end)
+                self._disturb(Disturbed(spec, simulator, self._on_disturbance))
             for number, agent in enumerate(self.names):
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
                 self.agents[agent].reset(_agent_seed(spec.seed, number))
@@ -267,6 +295,11 @@ class Episode:
         if offers(simulator, FlattensObservations):
             self._unflatten = {name: _unflattener(space) for name, space in simulator.shown_spaces.items()}
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
+
+    def _disturb(self, disturbed: Disturbed) -> None:
+        self._disturbed = disturbed
+        self._advance, self.observations = disturbed.step, disturbed.first(self.observations)
+        self._on_end.insert(0, disturbed.end)
 
     def _judge(
         self, finding: Finding | None, actions: Mapping[str, object], truncations: Mapping[str, bool]
@@ -321,54 +354,6 @@ class Episode:
         return self.result
 
 
-def run_episode(
-    spec: TrialSpec,
-    *,
-    simulator: Simulator,
-    make_agent: MakeAgent,
-    box: BlackBox,
-    oracles: Sequence[Oracle],
-    crash_on: Sequence[Outcome] = CRASHES,
-    observers: Sequence[Observer] = (),
-) -> TrialResult:
-    """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
-
-    Args:
-        spec: which trial.
-        simulator: where.
-        make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
-        box: what records it; `BlackBox.begin` has been called.
-        oracles: what decides whether a step is a crash.
-        crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
-        observers: who else is told; after the recorder.
-
-    Returns:
-        The result. Whatever agent or simulator raise is in it.
-
-    Raises:
-        RecorderError: the disk is full.
-    """
-    began = time.monotonic()
-    seed_everything(spec.seed)
-    everybody = (Recorder(box, simulator), Nearness(box.take_frames), *observers)
-    with Episode(
-        spec, simulator=simulator, make_agent=make_agent, oracles=oracles, crash_on=crash_on, observers=everybody
-    ) as episode:
-        result = episode.start()
-        while result is None:
-            result = episode.step()
-    return replace(result, setup_s=episode.setup_s, wall_s=time.monotonic() - began)
-
-
-def seed_everything(seed: int) -> None:
-    """Seed the generators of the process: `random`, `numpy.random`, and torch where it has been imported."""
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - agents may use the global generator
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        torch.manual_seed(seed)
-
-
 def _agent_seed(seed: int, number: int) -> int:
     """A seed of each agent's own, which differs from the simulator's."""
     return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
@@ -381,11 +366,6 @@ def _unflattener(space: Space[object]) -> Callable[[NDArray[np.generic]], object
     return partial(unflatten, space)
 
 
-def _quietly(agent: Agent) -> None:
-    """Close an agent; whatever comes of that, the episode is over."""
-    try:
-        if offers(agent, Closes):
-            agent.close()
-    except BaseException:
-        with suppress(BaseException):
-            traceback.print_exc()
+def _told(observers: Sequence[Observer], name: str) -> Any:
+    """What is called to tell observers of something; those that do not want to be told are left out."""
+    return [getattr(one, name) for one in observers if getattr(type(one), name) is not getattr(Observer, name)]

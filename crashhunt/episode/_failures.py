@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import sys
 import traceback
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from crashhunt.agents import Closes
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
+from crashhunt.base.faculties import offers
 from crashhunt.trial import Failure
 
 if TYPE_CHECKING:
     from typing import Final
 
-__all__ = ["failure_of", "is_emptied", "words_of"]
+    from crashhunt.agents import Agent
+
+__all__ = ["close_agent", "failure_of", "is_emptied", "words_of"]
 
 # Whatever is longer nobody reads, and everybody would have to carry: from the worker to the hunt, into the ledger, into
 # every bundle and page. Fifty megabytes of it take longer than a trial may.
@@ -67,3 +72,13 @@ def _shortened(text: str) -> str:
         return text
     half = _TRACEBACK // 2
     return f"{text[:half]}\n… ({len(text) - 2 * half} characters are left out) …\n{text[-half:]}"
+
+
+def close_agent(agent: Agent) -> None:
+    """Close an agent; whatever comes of that, the episode is over."""
+    try:
+        if offers(agent, Closes):
+            agent.close()
+    except BaseException:
+        with suppress(BaseException):
+            traceback.print_exc()

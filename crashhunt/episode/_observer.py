@@ -57,6 +57,9 @@ class Observer:
             rewards: of every agent, in the order of `Episode.names`; 0 of those that did not act.
         """
 
+    def copied(self) -> None:
+        """This process has become a copy of the one in which the episode runs, which is not to notice it."""
+
     def end(self, result: TrialResult) -> TrialResult:
         """The episode is over; return its result, with what this observer has found out about it.
 

@@ -14,7 +14,7 @@ from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
 from crashhunt.base.faculties import offers
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
-from crashhunt.episode._episode import seed_everything
+from crashhunt.episode._run import seed_everything
 from crashhunt.oracles import parse_oracle
 from crashhunt.simulators import BrakesFully, FlattensObservations
 from crashhunt.trial import signature_of

@@ -108,6 +108,10 @@ class Recorder(Observer):
                 self._events.update([event.kind for event in scene.events])
         self._box.step(step, scene, rewards)
 
+    def copied(self) -> None:
+        """Record elsewhere from now on, after a copy of what there is."""
+        self._box.copy()
+
     def end(self, result: TrialResult) -> TrialResult:
         """Say so, and add the digest of what has been recorded."""
         self._box.mark(Phase.DONE)

@@ -22,6 +22,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import DISK, RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.files import whole_file
+from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors._baseline import Baseline
@@ -113,7 +114,7 @@ class Worker:
         box, folder = self._prepare(spec)
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act. It
         # counts, as the hunt does, from here on, with what the first trial of a worker has to make.
-        faulthandler.dump_traceback_later(self._settings.timeout_s, file=self._stack)
+        watchdog.arm(self._settings.timeout_s, self._stack)
         began = time.monotonic()
         simulator = self._simulator
         if simulator is None:
@@ -140,7 +141,7 @@ class Worker:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
                 os._exit(0)
         with _undisturbed(self):
-            faulthandler.cancel_dump_traceback_later()
+            watchdog.cancel()
             self.change = self._changed(simulator)
             self._tell(simulator)
             result = self._kept(result, simulator, folder)
@@ -157,7 +158,7 @@ class Worker:
 
     def _stand_aside(self) -> None:
         """Keep the copy of this process that an agent forks from writing into the recording."""
-        if self._box is not None:
+        if self._box is not None and not copying():
             self._box.detach()
 
     def _kept(self, result: TrialResult, simulator: Simulator, folder: Path) -> TrialResult:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.base.errors import DISK, BundleError, RecorderError
+from crashhunt.base.forks import MEMORY
 from crashhunt.recording._digest import is_evidence
 from crashhunt.recording.records import action, notes, observation, prologue, step as steps
 from crashhunt.world import joined_frame
@@ -225,6 +226,14 @@ class BlackBox:
         """Write to nowhere from now on: this process is a copy of the one that records."""
         self._map = mmap.mmap(-1, self._mapped)
         self._file = os.open(os.devnull, os.O_RDWR)
+
+    def copy(self) -> None:
+        """Go on in memory of this process's own: it is a copy of the one that records, and goes on recording."""
+        data = bytes(memoryview(self._map)[: self._offset])
+        self._file = os.memfd_create(MEMORY)
+        self._reserved = self._mapped = 0
+        self._reserve(len(data))
+        self._map[: len(data)] = data
 
     def close(self) -> None:
         """Unmap and close the file."""

@@ -1,0 +1,76 @@
+"""A trial from its specification: an episode, recorded and measured, with the generators of the process seeded."""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.episode._episode import Episode
+from crashhunt.episode._nearness import Nearness
+from crashhunt.episode._recorder import Recorder
+from crashhunt.trial import CRASHES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.episode._episode import MakeAgent
+    from crashhunt.episode._observer import Observer
+    from crashhunt.oracles import Oracle
+    from crashhunt.recording import BlackBox
+    from crashhunt.simulators import Simulator
+    from crashhunt.trial import Outcome, TrialResult, TrialSpec
+
+__all__ = ["run_episode", "seed_everything"]
+
+
+def run_episode(
+    spec: TrialSpec,
+    *,
+    simulator: Simulator,
+    make_agent: MakeAgent,
+    box: BlackBox,
+    oracles: Sequence[Oracle],
+    crash_on: Sequence[Outcome] = CRASHES,
+    observers: Sequence[Observer] = (),
+) -> TrialResult:
+    """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
+
+    Args:
+        spec: which trial.
+        simulator: where.
+        make_agent: called with agent id, simulator and arguments; returns the agent at the wheel.
+        box: what records it; `BlackBox.begin` has been called.
+        oracles: what decides whether a step is a crash.
+        crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
+        observers: who else is told; after the recorder.
+
+    Returns:
+        The result. Whatever agent or simulator raise is in it.
+
+    Raises:
+        RecorderError: the disk is full.
+    """
+    began = time.monotonic()
+    seed_everything(spec.seed)
+    everybody = (Recorder(box, simulator), Nearness(box.take_frames), *observers)
+    with Episode(
+        spec, simulator=simulator, make_agent=make_agent, oracles=oracles, crash_on=crash_on, observers=everybody
+    ) as episode:
+        result = episode.start()
+        while result is None:
+            result = episode.step()
+    return replace(result, setup_s=episode.setup_s, wall_s=time.monotonic() - began)
+
+
+def seed_everything(seed: int) -> None:
+    """Seed the generators of the process: `random`, `numpy.random`, and torch where it has been imported."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - agents may use the global generator
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.manual_seed(seed)

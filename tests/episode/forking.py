@@ -1,0 +1,195 @@
+"""Run by test_fork.py in a process that has one thread: copies of episodes, and what becomes of them. Prints JSON."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import random
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryFile
+
+import numpy as np
+from gymnasium.spaces import Discrete
+
+from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import locate
+from crashhunt.base.processes import children_of
+from crashhunt.episode import Episode, Nearness, Recorder, seed_everything
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+from crashhunt.recording import BlackBox
+from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
+from crashhunt.trial import Disturbance, TrialSpec
+
+STEPS, FIRST, SECOND = 60, 20, 35
+
+
+class Wanders:
+    """Draws from the generators of the process, and from a file that it reads and one that it writes, as it goes."""
+
+    def __init__(self, simulator):
+        self.chooses = isinstance(simulator.actions["ego"].space, Discrete)
+
+    def reset(self, seed):
+        self.rng = np.random.default_rng(seed)
+        self.read = Path(__file__).open("rb", buffering=0)  # noqa: SIM115 - for as long as it drives
+        self.notes = TemporaryFile(buffering=0)  # noqa: SIM115
+
+    def act(self, observation):
+        self.notes.write(self.read.read(7))
+        self.notes.seek(-3, os.SEEK_CUR)
+        drawn = sum(self.notes.read(3)) / 1000 + random.random() + np.random.random() + self.rng.random()  # noqa: NPY002
+        return int(5 * drawn) % 5 if self.chooses else (6.0 + drawn, 0)
+
+    def close(self):
+        self.read.close()
+        self.notes.close()
+
+
+@contextmanager
+def begun(simulator, scenario, stage, agent=None, **more):
+    box = BlackBox(stage / "blackbox.bin")
+    box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
+    spec = TrialSpec(0, 5, {}, argument_values(scenario) if scenario.arguments else {}, STEPS, **more)
+    seed_everything(spec.seed)
+    episode = Episode(
+        spec, simulator=simulator, make_agent=lambda name, made, _: agent or Wanders(made),
+        oracles=[ReportedCollision(), Overlap(), OffRoad()], forks=True,
+        observers=(Recorder(box, simulator), Nearness(box.take_frames)),
+    )  # fmt: skip
+    with episode:
+        assert episode.start() is None
+        yield episode, box
+    box.close()
+
+
+def to_end(episode):
+    while episode.step() is None:
+        pass
+    return told(episode)
+
+
+def told(episode):
+    result = replace(episode.result, wall_s=0.0)
+    return {"digest": result.digest, "steps": result.steps, "closest": result.closest.to_json(), "said": str(result)}
+
+
+def same(name):
+    """The end of a trial, of its copy, and of a copy of that; and the trial again, after its copies."""
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()}) if name == "toy" else load_scenario(name)
+    stage = Path(sys.argv[2])
+    simulator = locate("simulators", scenario.simulator)(scenario, stage)
+    disturbed = Disturbance(25, "ahead", "brake", 4.0, 2.0, "ego")
+    found = []
+    for forks in (False, True):
+        with begun(simulator, scenario, stage, disturbances=(disturbed,)) as (episode, box):
+            for step in range(STEPS):
+                if forks and step == FIRST:
+                    before = bytes(box.committed())
+                    first = episode.fork(lambda copy: once_more(copy))
+                    answer = first.answer(60.0)
+                    assert answer is not None, first.raised
+                    found += answer["found"]
+                    assert bytes(box.committed()) == before
+                if episode.step() is not None:
+                    break
+            found.append(told(episode))
+    return {"ends": found}
+
+
+def once_more(copy):
+    print("nobody is to see this")
+    while copy.steps < SECOND:
+        copy.step()
+    copies = copy.fork(lambda again: to_end(again))
+    second = copies.answer(60.0)
+    assert second is not None, copies.raised
+    return {"found": [second, to_end(copy)]}
+
+
+def refused(stage):
+    """What each of these has a process say that is to be copied."""
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()})
+    simulator = locate("simulators", "toy")(scenario, stage)
+    found = {}
+
+    def thread():
+        event = threading.Event()
+        thread = threading.Thread(target=event.wait)
+        thread.start()
+        return event.set, thread.join
+
+    def process():
+        running = subprocess.Popen(["sleep", "60"])
+        return running.kill, running.wait
+
+    cases = {
+        "nothing": lambda: (),
+        "thread": thread,
+        "process": process,
+        "socket": lambda: (one := socket.socket()) and (one.close,),
+        "pipe": lambda: [(lambda end=end: os.close(end)) for end in os.pipe()],
+        "memory": lambda: (mmap.mmap(-1, 4096).close,),
+    }
+    for name, make in cases.items():
+        with begun(simulator, scenario, stage, agent=KeepLaneWithSpeed(10.0)) as (episode, _):
+            kept = make()
+            try:
+                episode.fork(lambda copy: {}).answer(10.0)
+                found[name] = ""
+            except CrashhuntError as error:
+                found[name] = str(error)
+            for end in kept:
+                end()
+    return found
+
+
+def ends(stage):
+    """What becomes of copies that hang, die, or are left alone."""
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()})
+    simulator = locate("simulators", "toy")(scenario, stage)
+    with begun(simulator, scenario, stage) as (episode, _):
+        hung = episode.fork(lambda copy: time.sleep(60)).answer(0.2)
+        died = episode.fork(lambda copy: os.kill(os.getpid(), 9)).answer(10.0)
+        divides = episode.fork(lambda copy: 1 / 0)
+        raised = divides.answer(10.0)
+        copies = [episode.fork(lambda copy: time.sleep(60)) for _ in range(2)]
+        copies[0].end()
+        copies[0].end()
+    return {"answers": [hung, died, raised], "raised": divides.raised, "left": copies[1].pid}
+
+
+def soak(stage, forks=10_000):
+    """What so many copies leave behind in the process of which they are made."""
+    scenario = load_scenario("loop")
+    simulator = locate("simulators", "sumo")(scenario, stage)
+    found = {}
+    with begun(simulator, scenario, stage) as (episode, _):
+        for number in range(forks):
+            if number in (100, forks - 1):
+                found[number] = {
+                    "files": len([*Path("/proc/self/fd").iterdir()]),
+                    "threads": len([*Path("/proc/self/task").iterdir()]),
+                    "children": len(children_of(os.getpid())),
+                    "resident_mib": int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 2**20,
+                }
+            answer = episode.fork(lambda copy: {"steps": copy.steps + (copy.step() is None)}, observed=False).answer(
+                10.0
+            )
+            assert answer == {"steps": 1}
+    return found
+
+
+if __name__ == "__main__":
+    what, place = sys.argv[1], Path(sys.argv[2])
+    print(json.dumps({"refused": refused, "ends": ends, "soak": soak}.get(what, lambda _: same(what))(place)))
+    sys.stdout.flush()
+    os._exit(0)

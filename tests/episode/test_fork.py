@@ -1,0 +1,90 @@
+"""Copies of running episodes: that they go on to the same bits, leave nothing behind, and what has no copy."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from crashhunt.executors import worker_environment
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+
+
+class Words(str):
+    """What a text begins with."""
+
+    __slots__ = ()
+    __hash__ = str.__hash__
+
+    def __eq__(self, other):
+        return other.startswith(str(self))
+
+
+def goes_on(pid):
+    """Whether a process has not ended; it may not have been reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """Asks a process of one thread."""
+
+    def ask_it(what):
+        done = subprocess.run(
+            [sys.executable, Path(__file__).with_name("forking.py"), what, tmp_path],
+            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=1000,
+        )  # fmt: skip
+        assert done.stderr == ""
+        (line,) = done.stdout.splitlines()
+        return json.loads(line)
+
+    return ask_it
+
+
+@pytest.mark.parametrize("scenario", ["toy", "loop", pytest.param("highway", marks=pytest.mark.nightly)])
+def test_a_copy_and_a_copy_of_it_go_on_to_the_same_bits(ask, scenario):
+    unforked, *others = ask(scenario)["ends"]
+    assert len(others) == 3
+    assert unforked["steps"] >= 50  # on highway-env it drives off then
+    assert "main" in unforked["said"] or "brake" in unforked["said"]  # it was disturbed
+    for other in others:
+        assert other == unforked
+
+
+def test_what_has_no_copy_is_named(ask):
+    assert ask("refused") == {
+        "nothing": "",
+        "thread": "threads have no copy, and 1 run besides the first",
+        "process": "a process that was started has no copy",
+        "socket": Words("a connection to others has no copy: socket:"),
+        "pipe": Words("a connection to others has no copy: pipe:"),
+        "memory": "memory that is shared with others has no copy: /dev/zero (deleted)",
+    }
+
+
+def test_copies_end_with_their_process_and_before_it_when_they_hang(ask):
+    found = ask("ends")
+    assert found["answers"] == [None, None, None]
+    assert found["raised"] == "ZeroDivisionError: division by zero"
+    deadline = time.monotonic() + 10.0
+    while goes_on(found["left"]):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1000)
+def test_ten_thousand_copies_leave_nothing(ask):
+    begin, end = ask("soak").values()
+    assert {**begin, "resident_mib": 0} == {**end, "resident_mib": 0}
+    assert end["children"] == 0
+    assert end["resident_mib"] < begin["resident_mib"] + 8
