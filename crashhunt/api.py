@@ -27,7 +27,7 @@ class HuntCall(HuntOptions):
     Args:
         directory: where everything is kept; made where it does not exist. The same hunt there goes on.
         parallel: trials at a time; 0 for one per core.
-        trials: how many at most.
+        trials: how many at most; 0 for no limit, where there is a ``duration``.
         max_steps: the bound on each, in steps.
         snapshot: the ``snapshot_…`` options in one, which is instead of them.
         overwrite: begin anew, whatever hunt is there.
@@ -51,7 +51,7 @@ class RunCall(HuntCall):
     Args:
         directory: where everything is kept; made where it does not exist. The same hunt there goes on.
         parallel: trials at a time; 0 for one per core.
-        trials: how many at most.
+        trials: how many at most; 0 for no limit, where there is a ``duration``.
         max_steps: the bound on each, in steps.
         watch: called about ten times a second.
         snapshot: the ``snapshot_…`` options in one, which is instead of them.

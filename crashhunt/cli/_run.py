@@ -32,7 +32,7 @@ def add_run(commands: Commands) -> None:
     )
     run.add_argument("directory", metavar="DIR", type=Path, help="where everything is kept; made if it is not there")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
-    run.add_argument("trials", metavar="TRIALS", type=integer, help="how many trials at most")
+    run.add_argument("trials", metavar="TRIALS", type=integer, help="how many trials at most; 0: no limit, with --for")
     run.add_argument("max_steps", metavar="MAX_STEPS", type=integer, help="the bound on each trial, in steps")
     what = run.add_argument_group("what is hunted")
     how = run.add_argument_group("how it is hunted")

@@ -93,7 +93,7 @@ def states_table(states: list[HuntState]) -> Table:
         table.add_row(
             Text(one_line(state.dir)),
             Text(state.state, style=_COLORS.get(state.state, "")),
-            f"{state.trials_run}/{state.trials_planned}",
+            f"{state.trials_run}/{state.trials_planned}" if state.trials_planned else str(state.trials_run),
             f"{state.rate_per_s:.1f}" if state.rate_per_s else "-",
             format_seconds(state.seconds_left) if state.seconds_left is not None else "-",
             _crashes(state),

@@ -31,7 +31,8 @@ class Noted(TypedDict, total=False):
         began: when it was begun or resumed, in s since the epoch.
         heartbeat: when it was there last, likewise.
         done_before: how many trials had ended when it began.
-        planned: how many trials it has.
+        planned: how many trials it has; 0 where only the time is limited.
+        until: when its time is up, in s since the epoch; None where it has all the time.
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
         lag: by how many trials a sampler that learns is told late.
@@ -47,6 +48,7 @@ class Noted(TypedDict, total=False):
     heartbeat: float
     done_before: int
     planned: int
+    until: float | None
     hunt_seed: int
     independent: bool
     lag: int | None

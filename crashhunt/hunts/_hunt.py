@@ -151,6 +151,7 @@ class Hunt:
             done_before=len(finished),
             heartbeat=time.time(),
             planned=settings.trials,
+            until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
             independent=sampler.independent and (not finished or draws_independently(before, settings)),
             disturb=list(settings.disturb) or None,
@@ -210,17 +211,18 @@ class Hunt:
             audit=run.audit,
             hunt_seed=settings.seed,
         )
-        parallel = min(run.parallel, max(1, settings.trials - len(finished)))
+        parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         preflight = Preflight(
-            settings, settings.trials - len(finished), files=snapshot.argument_files, code=snapshot.code
+            settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code
         )
         audit = Audit(worker_settings)
         in_flight: set[int] = set()
         heartbeat = 0.0
+        progress.until = time.monotonic() + run.duration_s
         try:
             while True:
-                stopping = progress.last_wanted is not None
+                stopping = progress.last_wanted is not None or progress.time_left_s <= 0
                 for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
                     in_flight.add(spec.number)
@@ -272,7 +274,7 @@ class Hunt:
             return "interrupted"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
-        return "all_trials"
+        return "all_trials" if trials.exhausted else "time"
 
     def _lag(self, before: Facts) -> int:
         """By how many trials a sampler that learns is told late."""
@@ -361,7 +363,7 @@ class Hunt:
         return self.settings.run.parallel or len(os.sched_getaffinity(0))
 
     def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
-        enough = min(self.settings.trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
+        enough = min(self.settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
         invalid = progress.outcomes[str(Outcome.INVALID)]
         return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
 
@@ -381,6 +383,7 @@ class Hunt:
             len(progress.crashes) + (1 if progress.found else 0),
             progress.nodes,
             *progress.about_kinds(),
+            progress.time_left_s,
         )
 
 

@@ -57,7 +57,7 @@ class Trials:
         self._ledger = ledger
         self._lag = lag
         self._disturber = disturber
-        self._waiting = iter(number for number in range(settings.trials) if number not in finished)
+        self._waiting = iter(number for number in range(settings.most_trials) if number not in finished)
         self._next = next(self._waiting, None)
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
@@ -66,6 +66,11 @@ class Trials:
         self._results: dict[int, TrialResult] = {}  # of those, what has ended in this run
         if sampler.learns:
             self._resume(finished)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether there are no more."""
+        return self._next is None
 
     def take(self, room: int) -> list[TrialSpec]:
         """Return the next trials, at most so many; fewer where there are no more, or a result is waited for first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
@@ -30,7 +31,7 @@ class HuntStatus:
 
     Args:
         phase: ``hunting``, ``saving``, ``auditing``, ``confirming`` or ``done``.
-        planned: trials in all.
+        planned: trials in all; 0 where only the time is limited.
         done: trials that have ended, in earlier runs of the hunt too.
         outcomes: how they ended.
         rate_per_s: trials a second in this run.
@@ -42,6 +43,7 @@ class HuntStatus:
         kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
+        time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
     """
 
     phase: str
@@ -57,6 +59,7 @@ class HuntStatus:
     kinds: tuple[Group, ...] | None = None
     newest_kind_s: float | None = None
     newest_kind_trials: int | None = None
+    time_left_s: float = math.inf
 
 
 @dataclass(slots=True)
@@ -64,6 +67,7 @@ class Progress:
     """What this run of the hunt has seen."""
 
     began: float = field(default_factory=time.monotonic)
+    until: float = math.inf  # no trial begins
     ended_here: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     steps_total: int = 0
@@ -98,6 +102,11 @@ class Progress:
     def last_wanted(self) -> int | None:
         """The number of the trial with which the hunt has found what it is after; None where it goes on."""
         return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
+
+    @property
+    def time_left_s(self) -> float:
+        """Until no more trials begin; infinite where nobody has limited it."""
+        return max(0.0, self.until - time.monotonic())
 
     def look_at(self, executor: Executor) -> None:
         """Take note of where trials run."""

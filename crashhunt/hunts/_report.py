@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["EventCount", "HuntReport", "HuntReportData", "StoppedBecause"]
 
-StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial"]
+StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time"]
 
 
 class EventCount(TypedDict):

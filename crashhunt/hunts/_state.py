@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import time
@@ -43,7 +44,7 @@ HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "interrupted": "interrupted", "error": "error", "queued": "queued",
+    "interrupted": "interrupted", "time": "finished", "error": "error", "queued": "queued",
 }  # fmt: skip
 
 
@@ -56,13 +57,13 @@ class HuntState:
         state: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (found one), ``error``, ``interrupted``
             or ``killed`` (its process is gone and did not say why).
         detail: why, where it is an error.
-        trials_planned: how many were asked for.
+        trials_planned: how many were asked for; 0 where only the time is limited.
         trials_run: how many have ended.
         outcomes: how.
         crashes: how many were saved.
         errors: how many trials could not be set up, or ended in a software fault.
         rate_per_s: trials a second, in its last run.
-        seconds_left: to the last trial, at that rate; None where it does not run.
+        seconds_left: to the last trial, at that rate, or until its time is up; None where it does not run.
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
@@ -186,13 +187,22 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         crashes,
         sum(n for name, n in outcomes.items() if name == Outcome.INVALID or Outcome(name).is_software_fault),
         rate,
-        (planned - run) / rate if state == "running" and rate > 0 else None,
+        _seconds_left(facts, planned - run, rate) if state == "running" else None,
         alive,
         disturbed=_disturbed(directory) if facts.get("disturb") else None,
         nodes=facts.get("nodes"),
         kinds=facts.get("kinds"),
         newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,
     )
+
+
+def _seconds_left(facts: Facts, trials: int, rate: float) -> float | None:
+    """Until the last trial, at that rate, or until the time is up, whichever is first."""
+    until = facts.get("until")
+    by_clock = math.inf if until is None else max(0.0, until - time.time())
+    by_count = trials / rate if rate > 0 and facts.get("planned") else math.inf
+    left = min(by_clock, by_count)
+    return left if left < math.inf else None
 
 
 def _disturbed(directory: Path) -> int:

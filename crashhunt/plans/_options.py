@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
+from crashhunt.plans._duration import check_duration
 from crashhunt.trial import CRASHES
 
 __all__ = [
@@ -127,6 +128,11 @@ class TrialOptions(_Options):
 class RunOptions(_Options):
     """How trials are run; `RunSettings` has them too."""
 
+    duration: str = option(
+        "", "how long it goes on at most: ``90s``, ``30m``, ``1h30m``; TRIALS may be 0 then",
+        help="begin no trial after this time, such as 90s, 30m or 1h30m; TRIALS may be 0 then, for no limit",
+        unset="as long as it takes", flag="--for", metavar="TIME", check=check_duration,
+    )  # fmt: skip
     keep_going: bool = option(
         False, "collect all crashes instead of stopping at the first", flag="--keep-going",
     )  # fmt: skip

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Request", "fields_of", "request_of", "sized", "spec_words"]
 
 _BOUNDS = {  # the numbers of a hunt that are no options: everybody has to give them
-    "TRIALS": at_least(1),
+    "TRIALS": at_least(0),
     "MAX_STEPS": at_least(1),
     "PARALLEL": at_least(0, zero="one per core"),
 }
@@ -66,6 +66,8 @@ class Request(TrialOptions, Subject):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
+        if not self.trials and not self.run.duration:
+            raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
         checked = super().checked()
         return replace(checked, run=self.run.checked())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import tomllib
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from pathlib import Path
@@ -14,6 +15,7 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.names import near_path
 from crashhunt.base.tolerance import known_part, merged, slip
 from crashhunt.oracles import DEFAULT_ORACLES
+from crashhunt.plans._duration import seconds_of
 from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
@@ -72,6 +74,11 @@ class RunSettings(RunOptions):
 
     parallel: int = 1
 
+    @property
+    def duration_s(self) -> float:
+        """How long it goes on at most, in s of wall time."""
+        return seconds_of(self.duration)
+
 
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +88,7 @@ class HuntSettings(TrialOptions):
     Args:
         scenario: the name or path that was given.
         scenario_digest: of the scenario's files and settings.
-        trials: how many to run.
+        trials: how many to run; 0 where only the time is limited.
         max_steps: the bound on each, in steps.
         seed: of the hunt; with a trial's number it determines the trial.
         crash_on: the outcomes that count as a crash.
@@ -105,6 +112,11 @@ class HuntSettings(TrialOptions):
     events: dict[str, float] = field(default_factory=dict)
     run: RunSettings = field(default_factory=RunSettings)
     schema: Literal[1] = 1
+
+    @property
+    def most_trials(self) -> int:
+        """How many trials it may have; where there is no limit, more than anybody runs."""
+        return self.trials or sys.maxsize
 
     @property
     def crash_on_words(self) -> tuple[str, ...]:

@@ -101,12 +101,12 @@ class Watcher:
 
 
 def _bar(status: HuntStatus, width: int) -> RenderableType:
-    said = (f"{status.done}/{status.planned} trials", f"{status.rate_per_s:.1f}/s", f"{_time_left(status)} left")
+    said = (f"{_count(status)} trials", f"{status.rate_per_s:.1f}/s", f"{_time_left(status)} left")
     if width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
         said = (said[0].removesuffix(" trials"), *said[1:])
     table = Table.grid(padding=(0, 2))
     room = width - sum(len(part) + 2 for part in said)
-    bar = ProgressBar(total=max(1, status.planned), completed=status.done, width=max(1, min(30, room)))
+    bar = ProgressBar(total=1.0, completed=_done(status), width=max(1, min(30, room)))
     table.add_row(bar, *said)
     return table
 
@@ -189,7 +189,7 @@ def describe_kinds(status: HuntStatus) -> str:
 
 def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
-    line = f"{status.phase}: {status.done}/{status.planned} trials ({outcomes})"
+    line = f"{status.phase}: {_count(status)} trials ({outcomes})"
     if status.phase == "hunting" and status.done:
         line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
     if status.phase == "hunting" and status.kinds:
@@ -200,7 +200,19 @@ def _line(status: HuntStatus) -> str:
 
 
 def _time_left(status: HuntStatus) -> str:
-    return format_seconds((status.planned - status.done) / status.rate_per_s if status.rate_per_s > 0 else math.inf)
+    by_count = (status.planned - status.done) / status.rate_per_s if status.planned and status.rate_per_s else math.inf
+    return format_seconds(min(by_count, status.time_left_s))
+
+
+def _count(status: HuntStatus) -> str:
+    return f"{status.done}/{status.planned}" if status.planned else str(status.done)
+
+
+def _done(status: HuntStatus) -> float:
+    """Which share of the hunt is done, by trials or by the clock, whichever is nearer to its end."""
+    by_count = status.done / status.planned if status.planned else 0.0
+    whole_s = status.elapsed_s + status.time_left_s
+    return max(by_count, status.elapsed_s / whole_s if whole_s > 0 else 1.0)
 
 
 def _near(result: TrialResult) -> str:

@@ -33,7 +33,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     """Return what came of a hunt: what crashed, how, where it is, and how to replay it."""
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
-    count = f"{ran} of {report.settings.trials} trials, {report.steps_total} steps"
+    planned = report.settings.trials
+    count = f"{ran}{f' of {planned}' if planned else ''} trials, {report.steps_total} steps"
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"Not one trial was valid: {report.reason}")
@@ -44,8 +45,12 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         lines.append(f"{found} kinds of crashes were found, and {wanted} were wanted.")
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
-    if not report.crashes and report.stopped_because == "all_trials":
-        lines.append("No crash was found.")
+    if not report.crashes and report.stopped_because in ("all_trials", "time"):
+        lines.append(
+            "No crash was found."
+            if report.stopped_because == "all_trials"
+            else "No crash was found before the time was up."
+        )
     lines += _describe_events(report)
     lines += describe_disturbances(report.crashes)
     if report.kinds and len(report.crashes) > 1:

@@ -136,3 +136,14 @@ def test_reports_exports_and_films_say_how_far_they_are(toy):
     assert "writing" not in shown
     assert "\x1b" not in shown
     assert toy.crashhunt("export", "h", "h.zip").err == ""
+
+
+def test_a_hunt_without_a_last_trial_goes_by_the_clock():
+    by_clock = replace(status(2), planned=0, time_left_s=195.0)
+    console = Console(width=80, height=24, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, TITLE)._screen(by_clock))
+    line = shown.get().splitlines()[1]
+    assert "123 trials" in line
+    assert "3:15 left" in line
+    assert line.count("━") == 7 + 23 or "╸" in line  # a quarter of the time is over
