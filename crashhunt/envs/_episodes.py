@@ -14,6 +14,7 @@ from crashhunt.base.errors import SimulatorError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
+from crashhunt.plans import disturber
 from crashhunt.scenario import argument_values, load_scenario, with_action
 from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.trial import TrialSpec
@@ -25,8 +26,10 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
+    from crashhunt.disturbances import Disturber
+    from crashhunt.scenario import Scenario
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Value
+    from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
 __all__ = ["Episodes"]
@@ -43,6 +46,8 @@ class Episodes:
         scenario: a shipped name, or a path.
         agent: the controlled vehicle; the scenario's first where empty.
         action: ``continuous``, ``meta``, or empty for the scenario's own choice.
+        disturb: how often what happens, as ``brake=0.02``.
+        max_steps: how long an episode is at most; 0 for no bound, and then nothing may disturb.
 
     Attributes:
         observation_space: of the vehicle.
@@ -51,10 +56,12 @@ class Episodes:
         agent: the controlled vehicle.
 
     Raises:
-        CrashhuntError: the scenario or the agent does not exist.
+        CrashhuntError: the scenario, the agent or a disturbance does not exist, or a bound is missing that is needed.
     """
 
-    def __init__(self, scenario: str | Path, agent: str, action: str) -> None:
+    def __init__(
+        self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
+    ) -> None:
         chosen = load_scenario(scenario)
         if agent and agent not in chosen.agents:
             raise UsageError(f"there is no controlled vehicle {agent!r}", fix=one_of(agent, chosen.agents))
@@ -65,6 +72,8 @@ class Episodes:
         self._stage = tempfile.TemporaryDirectory(prefix="crashhunt-")
         self._simulator = SumoSimulator(chosen, Path(self._stage.name))
         self._form = self._simulator.actions[self.agent]
+        self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
+        self._max_steps = max_steps
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
         self._episode: Episode | None = None
         self.observation_space: Space[object] = self._simulator.observation_spaces[self.agent]
@@ -79,8 +88,9 @@ class Episodes:
         if self._episode is not None:
             self._episode.close()
         given = {**self._arguments, **arguments}
+        disturbances = self._disturber.draw(seed, self._max_steps) if self._disturber is not None else ()
         # Whoever steps the environment decides how long an episode is.
-        spec = TrialSpec(0, seed, {}, given, max_steps=sys.maxsize)
+        spec = TrialSpec(0, seed, {}, given, max_steps=sys.maxsize, disturbances=disturbances)
         self._episode = Episode(spec, simulator=self._simulator, make_agent=_make_agent, observers=(self._trail,))
         self._episode.start()
         _raise_error(self._episode)
@@ -96,6 +106,7 @@ class Episodes:
         _raise_error(episode)
         if episode.result is not None or self.agent not in self._simulator.agents:
             raise SimulatorError("the episode has ended", fix="call reset")
+        before = len(self._trail.disturbances)
         episode.step({self.agent: encoded})
         _raise_error(episode)
         scene = self._trail.scenes[-1]
@@ -106,6 +117,8 @@ class Episodes:
         info: dict[str, object] = {"sim_time_s": scene.time_s}
         if scene.events:
             info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
+        if len(self._trail.disturbances) > before:
+            info["disturbances"] = [one.words for one in self._trail.disturbances[before:]]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
@@ -123,7 +136,7 @@ class Episodes:
             agents=(self.agent, *(other for other in self._simulator.actions if other != self.agent)),
             actors=scenes[-1].roster.actors,
             prologue=SimpleNamespace(step_length_s=self.step_length_s),
-            disturbances=(),
+            disturbances=tuple(self._trail.disturbances),
             # A trail that is longer than what is remembered ends there.
             scene=lambda step: scenes[max(0, step - first)],
         )
@@ -143,7 +156,7 @@ class Episodes:
 
 
 class _Trail(Observer):
-    """Remembers the last scenes, for the picture.
+    """Remembers the last scenes, for the picture, and what has disturbed the episode.
 
     Args:
         length: how many.
@@ -151,11 +164,26 @@ class _Trail(Observer):
 
     def __init__(self, length: int) -> None:
         self.scenes: deque[Scene] = deque(maxlen=length)
+        self.disturbances: list[Disturbance] = []
+
+    def begin(self, episode: Episode) -> None:
+        self.disturbances.clear()
+
+    def disturbance(self, disturbance: Disturbance) -> None:
+        if disturbance.vehicle:  # somebody was there
+            self.disturbances.append(disturbance)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         if step == 0:
             self.scenes.clear()
         self.scenes.append(scene)
+
+
+def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> Disturber | None:
+    made = disturber(scenario, disturb, (agent,))
+    if made is not None and max_steps < 1:
+        raise UsageError("disturb needs to know how long an episode is", fix="give max_steps")
+    return made
 
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:

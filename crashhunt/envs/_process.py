@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from crashhunt.base.errors import SimulatorError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -37,7 +37,9 @@ class RemoteEpisodes:
     What it raises comes through. The arguments are those of `Episodes`.
     """
 
-    def __init__(self, scenario: str | Path, agent: str, action: str) -> None:
+    def __init__(
+        self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
+    ) -> None:
         here, there = Pipe()
         # A program of its own rather than a child of multiprocessing's: those of an AsyncVectorEnv may not have one.
         self._process = subprocess.Popen(
@@ -50,7 +52,7 @@ class RemoteEpisodes:
         there.close()
         self._pipe = here
         self._end = weakref.finalize(self, _end, self._process, here, os.getpid())
-        found = self._ask("made", str(scenario), agent, action)
+        found = self._ask("made", str(scenario), agent, action, tuple(disturb), max_steps)
         self.observation_space: Space[object] = found["observation_space"]
         self.action_space: Space[object] = found["action_space"]
         self.step_length_s: float = found["step_length_s"]

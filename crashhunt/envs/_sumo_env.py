@@ -45,9 +45,12 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         process: whether it runs in a process of its own, which costs up to a millisecond a step. libsumo is one
             simulation per process, so that by default the first environment of a process runs in it, and the others in
             one of their own each.
+        disturb: how often a second which mistake of others begins, as ``--disturb`` has it: ``brake=0.02,cut_in=0.01``.
+            They follow from the seed of the episode, and need ``max_steps``; ``info["disturbances"]`` says in words
+            what begins in a step.
 
     Raises:
-        CrashhuntError: the scenario or the agent does not exist.
+        CrashhuntError: the scenario, the agent or a disturbance does not exist, or SUMO cannot do it.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's base class declares it so
@@ -61,19 +64,21 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         max_steps: int | None = None,
         render_mode: str | None = None,
         process: bool | None = None,
+        disturb: str = "",
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UsageError(f"render_mode is {render_mode!r}", fix=one_of(str(render_mode), ("rgb_array",)))
         if render_mode is not None and importlib.util.find_spec("PIL") is None:
             raise UsageError("render_mode needs Pillow", fix="pip install 'crashhunt[video]'")
+        words = tuple(filter(None, (word.strip() for word in disturb.split(","))))
         self._max_steps = max_steps
         self._episodes: Episodes | RemoteEpisodes
         if process is None:
             process = _process == [os.getpid()] and len(_here) > 0
         if process:
-            self._episodes = RemoteEpisodes(scenario, agent, action)
+            self._episodes = RemoteEpisodes(scenario, agent, action, words, max_steps or 0)
         else:
-            self._episodes = Episodes(scenario, agent, action)
+            self._episodes = Episodes(scenario, agent, action, words, max_steps or 0)
             if _process != [os.getpid()]:
                 _here.clear()
                 _process[:] = [os.getpid()]

@@ -128,7 +128,7 @@ class Hunt:
         settings = self.settings
         snapshot = take_snapshot(self.directory / layout.SNAPSHOTS, self.scenario, settings, self._snapshot_options)
         sampler = sampler_of(settings)
-        self._disturber = disturber(self.scenario, settings)
+        self._disturber = disturber(self.scenario, settings.disturb, tuple(settings.agents))
         progress = Progress()
         finished = ledger.finished()
         # It was killed between saving the one and the other. Where the trial is from, only its proposal says.

@@ -71,7 +71,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
-    disturber(scenario, settings)  # it refuses what cannot be meant
+    disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
     return scenario, replace(settings, run=sized(settings.run))
@@ -112,19 +112,24 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     return scenario
 
 
-def disturber(scenario: Scenario, settings: HuntSettings) -> Disturber | None:
-    """Return what draws the disturbances of a hunt's trials; None where there are none.
+def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str]) -> Disturber | None:
+    """Return what draws the disturbances of trials; None where there are none.
+
+    Args:
+        scenario: in which they take place.
+        disturb: how often what happens: ``NAME=RATE`` each.
+        agents: around whom.
 
     Raises:
         CrashhuntError: there is no such disturbance, or the simulator cannot do it.
     """
-    rates = parse_rates(settings.disturb)
+    rates = parse_rates(disturb)
     if not rates:
         return None
     backend = scenario.backend
     return disturber_of(
         rates,
-        agents=tuple(settings.agents),
+        agents=tuple(agents),
         step_length_s=backend.step_length_s(scenario),
         known=backend.disturbances,
         simulator=backend.title or "the simulator",

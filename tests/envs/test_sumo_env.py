@@ -92,6 +92,40 @@ def test_errors_come_through(own):
         SumoEnv(render_mode="human")
 
 
+def test_others_err_where_it_is_asked_for():
+    env = SumoEnv("loop", process=True, disturb="brake=2, stop=0.5", max_steps=40)
+    found = []
+    for _ in range(2):
+        observations, said = [env.reset(seed=4)[0]], []
+        for step in range(1, 41):
+            observation, _, terminated, truncated, info = env.step((12.0, 0))
+            observations.append(observation)
+            said += [(step, *info.get("disturbances", ()))] if "disturbances" in info else []
+            if terminated or truncated:
+                break
+        found.append((np.array(observations), said))
+    env.close()
+    (first, said), (second, again) = found
+    assert said == again
+    assert np.array_equal(first, second)
+    assert any("brakes with" in words for _, *told in said for words in told)
+    plain = SumoEnv("loop", process=True)
+    plain.reset(seed=4)
+    undisturbed = [plain.step((12.0, 0)) for _ in range(len(first) - 1)]
+    plain.close()
+    assert not any("disturbances" in info for *_, info in undisturbed)
+    last = said[0][0]  # until somebody errs, it is the same episode
+    assert all(np.array_equal(first[step], undisturbed[step - 1][0]) for step in range(1, last))
+    assert not np.array_equal(first[-1], undisturbed[-1][0])
+
+
+def test_what_cannot_disturb_is_refused():
+    with pytest.raises(UsageError, match="disturb needs to know how long"):
+        SumoEnv("loop", process=True, disturb="brake=1")
+    with pytest.raises(UsageError, match="there is no disturbance 'brakes'"):
+        SumoEnv("loop", process=True, disturb="brakes=1", max_steps=5)
+
+
 def ended(pid):
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
