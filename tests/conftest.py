@@ -67,6 +67,7 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("crashhunt")
 
 _TIMEOUT_S = 150.0
+collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
 
 

@@ -11,6 +11,7 @@ __all__ = [
     "ARCHIVE_KEY",
     "BLACK_BOX",
     "BUILDING",
+    "CASE",
     "CODE",
     "CRASH",
     "CRASHES",
@@ -60,6 +61,9 @@ LOG: Final = "log.mcap"
 RUN_LOG: Final = "run.log"
 ERROR_LOG: Final = "error.log"
 FOXGLOVE_LAYOUT: Final = "foxglove-layout.json"
+
+# Of a case of a corpus, which is a hunt's directory besides.
+CASE: Final = "crashhunt-case.toml"
 
 # Of a snapshot.
 MANIFEST: Final = "manifest.json"

@@ -19,6 +19,7 @@ from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
+from crashhunt.cli._corpus import add_corpus
 from crashhunt.cli._crashes import add_crashes
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._export import add_export
@@ -144,7 +145,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_check, add_compare, add_lists, add_guide, add_completion,
+        add_crashes, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

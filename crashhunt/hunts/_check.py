@@ -200,7 +200,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
     """The crashes in the ledger, where it can be read at all."""
     path = _ledger(hunt)
     if not has_begun(path):
-        if (hunt / layout.CRASHES).is_dir():
+        if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
             found.findings.append(Finding(str(path), "is missing", "all trials but the crashes", _GO_ON))
         return None
     try:

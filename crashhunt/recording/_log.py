@@ -49,6 +49,7 @@ def write_log(
     lanes: Sequence[Lane] = (),
     metadata: Mapping[str, str] | None = None,
     crash: TrialResult | None = None,
+    views: bool = True,
 ) -> None:
     """Write a log; all of it or nothing.
 
@@ -58,6 +59,7 @@ def write_log(
         lanes: of the map, for whoever looks at it.
         metadata: further facts.
         crash: how it ended, for the crash marker and the log line.
+        views: whether other tools have something to see; without, it is half as large.
 
     Raises:
         HuntDirectoryError: the disk is full, or the folder is not writable.
@@ -68,7 +70,8 @@ def write_log(
         writer.add_metadata("crashhunt", {**(metadata or {}), "crashhunt_log_schema": SCHEMA})
         log = LogWriter(writer)
         _write_evidence(log, recording)
-        write_views(log, recording, lanes, crash)
+        if views:
+            write_views(log, recording, lanes, crash)
         writer.finish()
 
 

@@ -5,5 +5,6 @@ from ._environment import (
     processor as processor,
     versions as versions,
 )
+from ._reduce import without_code as without_code
 from ._snapshot import Snapshot as Snapshot, latest_snapshot as latest_snapshot
 from ._take import SnapshotOptions as SnapshotOptions, take_snapshot as take_snapshot

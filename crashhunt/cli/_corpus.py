@@ -1,0 +1,161 @@
+"""``crashhunt corpus add|run|list``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import in_lines
+from crashhunt.cli._common import add_json, integer, opened_crash, say
+from crashhunt.cli._exit_codes import INTERRUPTED
+from crashhunt.cli._progress import shown_progress
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.corpus import CaseReport
+
+__all__ = ["add_corpus"]
+
+
+def add_corpus(commands: Commands) -> None:
+    """Add the command."""
+    corpus = commands.add_parser(
+        "corpus",
+        help="keep crashes in a repository, and see that they stay mended",
+        description="Keep crashes in a repository of yours, each with what is expected of today's code.",
+    )
+    inner = corpus.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_add(inner)
+    _add_run(inner)
+    listing = inner.add_parser("list", help="list the cases", description="List the cases of a corpus.")
+    _add_places(listing)
+    add_json(listing)
+    listing.set_defaults(command=_list)
+
+
+def _add_add(commands: Commands) -> None:
+    add = commands.add_parser(
+        "add",
+        help="put crashes into a corpus",
+        description="Put crashes into a corpus: seed, arguments, scenario, and the log where it is small. The code of "
+        "crashhunt and of the agent is left out, for it is today's that is tested.",
+    )
+    add.add_argument(
+        "bundles", metavar="BUNDLE", type=Path, nargs="+",
+        help="the folder of a crash, or a file that crashhunt export wrote",
+    )  # fmt: skip
+    add.add_argument("--to", metavar="CORPUS", type=Path, required=True, help="the folder of the corpus")
+    add.add_argument(
+        "--expect", choices=("still", "fixed"),
+        help="what is expected from now on: still, while it is known to crash (the default), or fixed",
+    )  # fmt: skip
+    add.add_argument("--note", metavar="TEXT", help="what people should know of it")
+    add.add_argument("--trust", action="store_true", help="add an exported crash that a stranger made")
+    add_json(add)
+    add.set_defaults(command=_add)
+
+
+def _add_run(commands: Commands) -> None:
+    run = commands.add_parser(
+        "run",
+        help="run every case again with today's code",
+        description="Run every case again with today's code: crashes it still, is it fixed, or has it changed into "
+        "another crash? Exits with 1 where an expectation is not met.",
+    )
+    _add_places(run)
+    run.add_argument(
+        "--keep", metavar="DIR", type=Path,
+        help="keep what crashes there, each as the directory of a hunt, for crashhunt show, replay and report",
+    )  # fmt: skip
+    run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
+    add_json(run)
+    run.set_defaults(command=_run)
+
+
+def _add_places(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("places", metavar="CORPUS", type=Path, nargs="+", help="the folder of a corpus, or of a case")
+
+
+def _add(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.corpus import add_case
+
+    answers = []
+    for path in options.bundles:
+        with opened_crash(path, "") as (bundle, archive):
+            if archive is not None and not archive.made_here and not options.trust:
+                raise UsageError(
+                    f"it says that {archive.made_by} made it, and whoever runs the corpus runs what it names",
+                    fix="look at its hunt.toml and scenario, and give --trust if you trust whoever gave it to you",
+                    where=str(path),
+                )
+            added = add_case(bundle, options.to, expect=options.expect, note=options.note)
+            told = added.case.to_json()
+            answers.append({**told, "new": added.new})
+            say(_added(told["path"], told["bytes"], log=told["log"], new=added.new), as_json=options.json)
+            if bundle.confirmed is False:
+                say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
+    if options.json:
+        print(json.dumps({"cases": answers}))
+    return 0
+
+
+def _added(path: str, size: int, *, log: bool, new: bool) -> str:
+    said = f"{size / 1024:.0f} KiB" + ("" if log else ", without its log, which would make it large")
+    return in_lines([f"{path} {'is new' if new else 'was there already'} ({said})"])
+
+
+def _run(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.base.signals import stop_requests
+    from crashhunt.corpus import find_cases, run_cases
+
+    if options.parallel < 0:
+        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 1, or 0 for one per core")
+    cases = find_cases(options.places)
+    with stop_requests() as asked, shown_progress("running the corpus", as_json=options.json) as watch:
+        reports = run_cases(
+            cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked)
+        )
+    say(_told(reports, len(cases)), as_json=options.json)
+    if options.json:
+        print(json.dumps({"cases": [report.to_json() for report in reports]}))
+    if len(reports) < len(cases):
+        return INTERRUPTED
+    return 0 if all(report.ok for report in reports) else 1
+
+
+def _told(reports: list[CaseReport], count: int) -> str:
+    lines = [report.describe() for report in reports if not report.ok]
+    lines += [f"{report.path.name}: {report.line}" for report in reports if report.ok and report.got == "still"]
+    tighter = [report for report in reports if report.may_be_tightened]
+    lines += [
+        f"{report.path.name}: fixed, and may be tightened: {report.path / layout.CASE} may say fixed"
+        for report in tighter
+    ]
+    counts = ", ".join(
+        f"{number} {got.replace('_', ' ')}"
+        for got in ("still", "fixed", "changed", "cannot_run")
+        if (number := sum(report.got == got for report in reports))
+    )
+    wrong = sum(not report.ok for report in reports)
+    ended = "" if len(reports) == count else f"; interrupted after {len(reports)}"
+    lines.append(
+        f"{count} cases: {counts or 'none has ended'}{ended}" + (f"; {wrong} not as expected" if wrong else "")
+    )
+    return "\n".join(lines)
+
+
+def _list(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.corpus import find_cases, read_case
+
+    cases = [read_case(path) for path in find_cases(options.places)]
+    for case in cases:
+        note = f"  ({case.note})" if case.note else ""
+        say(in_lines([f"{case.path}  {case.expect}  {case.crash}{note}"]), as_json=options.json)
+    if options.json:
+        print(json.dumps({"cases": [case.to_json() for case in cases]}))
+    return 0

@@ -1,0 +1,9 @@
+from ._case import (
+    Case as Case,
+    CaseData as CaseData,
+    Expectation as Expectation,
+    find_cases as find_cases,
+    read_case as read_case,
+)
+from ._run import CaseReport as CaseReport, ReportData as ReportData, run_cases as run_cases
+from ._store import Added as Added, add_case as add_case

@@ -1,0 +1,264 @@
+"""Running the cases of a corpus with today's code, several at a time."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections import deque
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.text import in_lines, one_line
+from crashhunt.corpus._case import Case, Expectation, read_case
+from crashhunt.crashes import Bundle, write_bundle
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.plans import read_settings, with_settings, write_settings
+from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
+from crashhunt.triage import signature_of
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import TrialResult
+
+__all__ = ["CaseReport", "Got", "ReportData", "run_cases"]
+
+Got = Literal["still", "fixed", "changed", "cannot_run"]
+_LOOK_EVERY_S = 0.01  # at each of those that run
+_NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
+
+
+class ReportData(TypedDict):
+    """A case as ``corpus run --json`` prints it."""
+
+    path: str
+    expected: Expectation
+    got: Got
+    ok: bool
+    may_be_tightened: bool
+    was: str
+    now: str
+    warnings: list[str]
+    kept: NotRequired[str]
+
+
+@dataclass(frozen=True, slots=True)
+class CaseReport:
+    """What came of a case.
+
+    Args:
+        path: of its folder.
+        expected: what was expected of it.
+        got: whether it crashes ``still``, in the same manner; is ``fixed``; has ``changed`` into another crash; or
+            ``cannot_run``.
+        was: what happened, in words.
+        now: what happens today, or why it cannot run.
+        note: of whoever keeps it.
+        warnings: what may make a difference besides the code.
+        kept: where today's crash has been kept.
+    """
+
+    path: Path
+    expected: Expectation
+    got: Got
+    was: str = ""
+    now: str = ""
+    note: str = ""
+    warnings: tuple[str, ...] = ()
+    kept: Path | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether it is as expected, or better."""
+        return self.got == self.expected or self.got == "fixed"
+
+    @property
+    def may_be_tightened(self) -> bool:
+        """Whether it is fixed and nobody has said so yet. In the traffic of another simulator, nobody knows."""
+        return self.expected == "still" and self.got == "fixed" and not self.warnings
+
+    @property
+    def line(self) -> str:
+        """What happens today and the note, in one line."""
+        return one_line(f"{self.now} ({self.note})" if self.note else self.now)
+
+    def describe(self) -> str:
+        """Return what happened and how to look at it, in lines."""
+        lines = [f"{self.path.name}: {_WORDS[self.got]}" + ("" if self.ok else f", and {self.expected} was expected")]
+        if self.was:
+            lines.append(f"  it was: {self.was}")
+        if self.now:
+            lines.append(f"  now:    {self.now}")
+        if self.note:
+            lines.append(f"  note: {self.note}")
+        lines += [f"  warning: {warning}" for warning in self.warnings]
+        if self.kept is not None:
+            lines.append(f"  look at it: crashhunt show {self.kept}")
+        return in_lines(lines)
+
+    def to_json(self) -> ReportData:
+        """Return the shape that ``corpus run --json`` prints."""
+        data: ReportData = {
+            "path": str(self.path),
+            "expected": self.expected,
+            "got": self.got,
+            "ok": self.ok,
+            "may_be_tightened": self.may_be_tightened,
+            "was": self.was,
+            "now": self.now,
+            "warnings": list(self.warnings),
+        }
+        if self.kept is not None:
+            data["kept"] = str(self.kept)
+        return data
+
+
+_WORDS = {
+    "still": "crashes still",
+    "fixed": "fixed",
+    "changed": "crashes in another way",
+    "cannot_run": "cannot run",
+}
+
+
+def run_cases(
+    cases: Sequence[Path],
+    *,
+    parallel: int = 0,
+    keep: Path | None = None,
+    watch: Watch | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[CaseReport]:
+    """Run cases with today's code, each in a fresh process.
+
+    Args:
+        cases: their folders.
+        parallel: how many at a time; 0 for one per core.
+        keep: where to keep what crashes, as the directory of a hunt with everything in it, by the name of the case.
+        watch: called after each with how many are done, and how many there are.
+        stopped: asked now and then whether to give up.
+
+    Returns:
+        What came of each, in their order; of those that had not ended when it was given up, nothing.
+
+    Raises:
+        CrashhuntError: the scratch folder, or the one to keep crashes in, cannot be written.
+    """
+    reports: dict[Path, CaseReport] = {}
+    waiting, running = deque(cases), dict[Path, _Running]()
+    with ExitStack() as stack:
+        while (waiting or running) and not stopped():
+            while waiting and len(running) < (parallel or os.cpu_count() or 1):
+                path = waiting.popleft()
+                began = _begin(path, stack)
+                if isinstance(began, CaseReport):
+                    reports[path] = began
+                else:
+                    running[path] = began
+            for path, one in list(running.items()):
+                report = one.look(keep)
+                if report is not None:
+                    reports[path] = report
+                    del running[path]
+                    one.close()
+            if watch is not None:
+                watch(len(reports), len(cases))
+    return [reports[path] for path in cases if path in reports]
+
+
+class _Running:
+    """A case that runs."""
+
+    def __init__(self, case: Case, bundle: Bundle, settings: HuntSettings, snapshot: Snapshot) -> None:
+        self._case, self._bundle, self._settings = case, bundle, settings
+        self._warnings = _warnings(snapshot)
+        self._folder = tempfile.TemporaryDirectory(prefix="crashhunt-corpus-")
+        self._scratch = Path(self._folder.name)
+        self._scenario = with_settings(snapshot.scenario(), settings)
+        self._executor = FreshProcessExecutor(
+            WorkerSettings(
+                scenario=self._scenario,
+                oracles=settings.oracles,
+                crash_on=settings.crash_on,
+                scratch=self._scratch,
+                timeout_s=settings.run.timeout_s,
+                keep_trials=True,
+            )
+        )
+        self._executor.submit(bundle.result.spec)
+
+    def look(self, keep: Path | None) -> CaseReport | None:
+        """Return what came of it; None where it goes on."""
+        case = self._case
+        try:
+            result = next(iter(self._executor.completed(_LOOK_EVERY_S)), None)
+            return None if result is None else self._report(result, keep)
+        except BundleError as error:  # a process that died before it had recorded anything
+            return CaseReport(case.path, case.expect, "cannot_run", case.crash, str(error), case.note, self._warnings)
+        except CrashhuntError as error:
+            why = f"{error.message} ({error.fix})" if error.fix else error.message
+            return CaseReport(case.path, case.expect, "cannot_run", case.crash, why, case.note, self._warnings)
+
+    def close(self) -> None:
+        """End it, and leave nothing behind; may be called twice."""
+        self._executor.close()
+        self._folder.cleanup()
+
+    def _report(self, result: TrialResult, keep: Path | None) -> CaseReport:
+        case = self._case
+        got: Got = "fixed" if result.outcome in _NO_CRASH else "cannot_run"
+        kept = None
+        if result.outcome not in (*_NO_CRASH, Outcome.INVALID):
+            kept = self._keep(
+                result, keep / case.name if keep is not None else self._scratch / "kept", whole=bool(keep)
+            )
+            now = signature_of(kept).to_json()
+            got = "still" if all(now.get(name, value) == value for name, value in case.signature.items()) else "changed"
+        found = CaseReport(case.path, case.expect, got, case.crash, result.summary, case.note, self._warnings)
+        return replace(found, kept=kept.path if kept is not None and keep is not None else None)
+
+    def _keep(self, result: TrialResult, directory: Path, *, whole: bool) -> Bundle:
+        """Make a bundle of today's crash, and what else a hunt's directory has."""
+        digest = self._bundle.snapshot
+        if whole:
+            directory.mkdir(parents=True, exist_ok=True)
+            write_settings(
+                directory / layout.HUNT, self._settings, ["crashhunt", "corpus", "run", str(self._case.path)]
+            )
+            digest = take_snapshot(directory / layout.SNAPSHOTS, self._scenario, self._settings).digest
+        trial = scratch_of(self._scratch, result.spec.number)
+        return write_bundle(
+            directory, result, trial, hunt_seed=self._bundle.hunt_seed, snapshot=digest,
+            lanes=read_map(self._scratch, trial),
+        )  # fmt: skip
+
+
+def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
+    expected: Expectation = "fixed"  # whatever it is, a case that cannot be read does not meet it
+    was = note = ""
+    try:
+        case = read_case(path)
+        expected, was, note = case.expect, case.crash, case.note
+        bundle = case.bundle()
+        snapshot = Snapshot(path / layout.SNAPSHOTS / bundle.snapshot)
+        snapshot.verify()
+        running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
+    except CrashhuntError as error:
+        return CaseReport(path, expected, "cannot_run", was, str(error), note)
+    stack.callback(running.close)
+    return running
+
+
+def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
+    """What else than the code is another: the same seed then draws other traffic."""
+    changed = environment_changes(snapshot.environment())
+    names = (name for name in snapshot.scenario().backend.versions if name in changed)
+    return tuple(f"{name} was {changed[name][0]} and is {changed[name][1]}, which may be why" for name in names)

@@ -1,0 +1,69 @@
+"""``pytest crashes/``: every case of a corpus is a test.
+
+pytest imports this module whenever it starts, so nothing else is imported before a case is run.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+__all__ = ["pytest_collect_file"]
+
+_CASE = "crashhunt-case.toml"  # as in crashhunt.base.layout
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Collect a case."""
+    return _CaseFile.from_parent(parent, path=file_path) if file_path.name == _CASE else None
+
+
+class _CaseFile(pytest.File):
+    def collect(self) -> Iterator[pytest.Item]:
+        yield _CaseItem.from_parent(self, name=self.path.parent.name)
+
+
+class _CaseItem(pytest.Item):
+    def runtest(self) -> None:
+        from crashhunt.corpus import run_cases
+
+        (report,) = run_cases([self.path.parent], parallel=1)
+        self.user_properties += [("crashhunt_expected", report.expected), ("crashhunt_got", report.got)]
+        told = report.describe()
+        if not report.ok:
+            raise _FailedError(f"{told}\n  {_how_to_look(self)}")
+        if report.may_be_tightened:
+            self.add_report_section("call", "crashhunt", f'{told}\n  {self.path.name} may say: expect = "fixed"')
+        elif report.got == "still":
+            pytest.xfail(report.line)
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: object = None) -> str:
+        """Tell what came of it; a traceback of crashhunt's helps nobody."""
+        return str(excinfo.value) if isinstance(excinfo.value, _FailedError) else str(super().repr_failure(excinfo))
+
+    def reportinfo(self) -> tuple[Path, int | None, str]:
+        """Say where it is."""
+        return self.path, None, f"crash {self.name}"
+
+
+class _FailedError(Exception):
+    """It is not as expected."""
+
+
+def _how_to_look(item: pytest.Item) -> str:
+    from shlex import quote
+
+    case = item.path.parent
+    place = case.relative_to(item.config.invocation_params.dir) if _is_below(case, item) else case
+    return (
+        f"look at it: crashhunt corpus run {quote(str(place))} --keep out && crashhunt show {quote(f'out/{case.name}')}"
+    )
+
+
+def _is_below(path: Path, item: pytest.Item) -> bool:
+    return path.is_relative_to(item.config.invocation_params.dir)

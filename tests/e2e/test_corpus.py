@@ -1,0 +1,253 @@
+"""Crashes that are kept in a repository, and run again with today's code."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from crashhunt.corpus import add_case, find_cases, read_case, run_cases
+from crashhunt.crashes import find_bundle
+from crashhunt.errors import BundleError, HuntDirectoryError
+
+DRIVER = """
+class Driver:
+    def __init__(self, speed: float = 12.0):
+        self.speed = speed
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return (self.speed, 0)
+"""
+MENDED = DRIVER.replace("(self.speed, 0)", "(min(self.speed, 3.0), 0)")
+BROKEN = DRIVER.replace("return", "raise ValueError('no') or")
+FROZEN = Path(__file__).parent / "frozen" / "case"
+
+
+def hunted(shell):
+    (shell.folder / "driver.py").write_text(DRIVER)
+    words = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=20:22", "--seed", "1", "--keep-going")
+    shell.crashhunt("run", "h", "1", "2", "99", *words)
+    for number, note in (("0", "too fast"), ("1", "ä \x1b[2J\n|")):
+        path = next((shell.folder / "h" / "crashes").glob(f"00000{number}-*"))
+        shell.crashhunt("corpus", "add", str(path), "--to", "kept crashes", "--note", note)
+
+
+@pytest.fixture
+def kept(toy, made_once, monkeypatch):
+    """A folder with a hunt of two crashes, both of which are in a corpus, and the agent's code."""
+    made_once(hunted, toy)
+    monkeypatch.chdir(toy.folder)
+    return toy
+
+
+def drive(shell, code):
+    (shell.folder / "driver.py").write_text(code)
+
+
+def expect(shell, number, word):
+    file = sorted((shell.folder / "kept crashes").glob("*/crashhunt-case.toml"))[number]
+    file.write_text(file.read_text().replace('expect = "still"', f'expect = "{word}"'))
+
+
+def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
+    cases = kept.crashhunt("corpus", "list", "kept crashes", "--json").json["cases"]
+    assert [case["expected"] for case in cases] == ["still", "still"]
+    assert cases[0]["note"] == "too fast"
+    assert all(case["bytes"] < 40_000 and case["log"] for case in cases)
+    listed = kept.crashhunt("corpus", "list", "kept crashes").out
+    assert "drove into leader" in listed
+    assert "\x1b" not in listed
+    case = Path(cases[0]["path"])
+    assert not [file for file in (kept.folder / case).rglob("*") if file.suffix == ".py"]
+    for command in ("show", "replay", "check"):
+        kept.crashhunt(command, str(case))
+    for file in (kept.folder / case).rglob("*.json"):
+        assert str(kept.folder) not in file.read_text()
+
+
+def test_what_is_there_already_gets_another_expectation_only(kept):
+    bundle = find_bundle(kept.folder / "h", "0")
+    corpus = kept.folder / "kept crashes"
+    before = sorted(corpus.iterdir())
+    again = add_case(bundle, corpus, expect="fixed")
+    assert not again.new
+    assert (again.case.expect, again.case.note) == ("fixed", "too fast")
+    assert read_case(again.case.path) == again.case
+    assert sorted(corpus.iterdir()) == before
+
+
+def test_todays_code_is_judged(kept):
+    found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
+    assert all((kept.folder / case["path"]).is_dir() for case in found)
+    assert [(case["expected"], case["got"], case["ok"]) for case in found] == [("still", "still", True)] * 2
+    assert "2 cases: 2 still" in kept.crashhunt("corpus", "run", "kept crashes").out
+
+    drive(kept, MENDED)
+    done = kept.crashhunt("corpus", "run", "kept crashes")
+    assert done.out.count("may be tightened") == 2
+    expect(kept, 0, "fixed")
+    found = kept.crashhunt("corpus", "run", "kept crashes", "--json").json["cases"]
+    assert [(case["got"], case["may_be_tightened"]) for case in found] == [("fixed", False), ("fixed", True)]
+
+    drive(kept, BROKEN)
+    done = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json", expect=1)
+    assert [case["got"] for case in done.json["cases"]] == ["changed"] * 2
+    assert "crashes in another way, and fixed was expected" in done.err
+    assert "ValueError: no" in kept.crashhunt("show", done.json["cases"][0]["kept"]).out
+    assert kept.crashhunt("replay", done.json["cases"][0]["kept"], "--json").json["verdict"] == "reproduced"
+
+    drive(kept, DRIVER)
+    done = kept.crashhunt("corpus", "run", "kept crashes", expect=1)
+    assert "crashes still, and fixed was expected" in done.out
+    assert "2 cases: 2 still; 1 not as expected" in done.out
+
+    (kept.folder / "driver.py").unlink()
+    done = kept.crashhunt("corpus", "run", "kept crashes", "--json", expect=1)
+    assert [(case["got"], case["ok"]) for case in done.json["cases"]] == [("cannot_run", False)] * 2
+    assert "driver" in done.json["cases"][0]["now"]
+
+
+def test_what_is_damaged_or_no_case_is_told_and_does_not_keep_the_others(kept):
+    first, second = find_cases([kept.folder / "kept crashes"])
+    (next(first.glob("snapshots/*")) / "scenario" / "scenario.toml").write_text("schema = 1")
+    (report, other) = run_cases([first, second], parallel=2)
+    assert (report.got, other.got) == ("cannot_run", "still")
+    assert "has changed" in report.now
+    case = second / "crashhunt-case.toml"
+    for text, said in (("expect = 'maybe'", "maybe"), ("expect = [", "not valid TOML"), ("", "expect")):
+        case.write_text(text)
+        (report,) = run_cases([second])
+        assert report.got == "cannot_run"
+        assert said in report.now
+        assert not report.ok
+    case.write_text("expect = 'still'\nlater = 1")  # of a later version
+    assert read_case(second).expect == "still"
+    with pytest.raises(BundleError, match="no case of a corpus"):
+        find_cases([kept.folder / "h"])
+    assert "did you mean 'kept crashes'" in kept.crashhunt("corpus", "run", "kept crashs", expect=2).err
+
+
+def test_a_strangers_crash_is_added_only_with_trust(kept):
+    kept.environment["XDG_STATE_HOME"] = str(kept.folder / "one")
+    kept.crashhunt("export", "h", "crash.zip", "--crash", "0")
+    kept.crashhunt("corpus", "add", "crash.zip", "--to", "mine")
+    kept.environment["XDG_STATE_HOME"] = str(kept.folder / "other")
+    done = kept.crashhunt("corpus", "add", "crash.zip", "--to", "theirs", expect=2)
+    assert "--trust" in done.err
+    assert not (kept.folder / "theirs").exists()
+    kept.crashhunt("corpus", "add", "crash.zip", "--to", "theirs", "--trust")
+    names = [[path.name for path in find_cases([kept.folder / folder])] for folder in ("mine", "theirs")]
+    assert names[0] == names[1]
+
+
+def test_a_large_log_is_left_out_and_the_case_still_runs(kept, monkeypatch):
+    monkeypatch.setattr("crashhunt.corpus._store._MOST", 1000)
+    added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
+    assert not list(added.case.path.rglob("log.mcap"))
+    (report,) = run_cases([added.case.path])
+    assert report.got == "still"
+
+
+def test_a_full_disk_leaves_nothing_half_done(kept, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("crashhunt.corpus._store.write_log", full)
+    with pytest.raises(HuntDirectoryError, match="No space left") as raised:
+        add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "full")
+    assert "free some space" in raised.value.fix
+    assert list((kept.folder / "full").iterdir()) == []
+
+
+def test_two_add_the_same_at_once(kept, monkeypatch):
+    from crashhunt.corpus import _store
+
+    build, corpus = _store._build, kept.folder / "both"
+
+    def overtaken(bundle, case, folder):
+        build(bundle, case, folder)
+        if not corpus.joinpath(case.name).exists():
+            shutil.copytree(folder, corpus / case.name)
+
+    monkeypatch.setattr(_store, "_build", overtaken)
+    assert not add_case(find_bundle(kept.folder / "h", "0"), corpus).new
+    assert [path.name for path in corpus.iterdir()] == [path.name for path in find_cases([corpus])]
+
+
+def test_ctrl_c_ends_all_and_tells_what_has_ended(kept):
+    drive(kept, DRIVER.replace("return", "import time; time.sleep(60); return"))
+    running = kept.start("corpus", "run", "kept crashes", "--parallel", "1")
+    time.sleep(1.0)
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert running.returncode == 130, err
+    assert "2 cases: none has ended; interrupted after 0" in out
+
+
+def test_a_case_of_an_earlier_version_is_run(shell):
+    (report,) = run_cases([FROZEN])
+    assert (report.got, report.ok, report.now) == ("still", True, report.was)
+
+
+def pytest_run(kept, *words, plugins=("crashhunt.corpus.pytest_plugin",)):
+    names = [word for plugin in plugins for word in ("-p", plugin)]
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-W", "error", *names, *words], cwd=kept.folder, capture_output=True,
+        text=True, env={**kept.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}, check=False, timeout=120,
+    )  # fmt: skip
+
+
+def test_pytest_runs_each_case_and_tells_it_readably(kept):
+    expect(kept, 0, "fixed")
+    done = pytest_run(kept, "kept crashes", "--junit-xml", "junit.xml", "-rx")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 failed, 1 xfailed" in done.stdout
+    assert "crashes still, and fixed was expected" in done.stdout
+    assert "now:    ego drove into leader at step" in done.stdout
+    (hint,) = [line for line in done.stdout.splitlines() if "look at it: " in line]
+    assert "crashhunt corpus run 'kept crashes/000000-collision-" in hint
+    assert "\x1b" not in done.stdout
+    assert "Traceback" not in done.stdout
+    (suite,) = ET.parse(kept.folder / "junit.xml").getroot()
+    assert [suite.attrib[key] for key in ("tests", "failures", "skipped")] == ["2", "1", "1"]
+    found = {entry.attrib["value"] for entry in suite.iter("property") if entry.attrib["name"] == "crashhunt_got"}
+    assert found == {"still"}
+
+
+@pytest.mark.nightly
+def test_pytest_chooses_repeats_and_spreads_cases(kept):
+    expect(kept, 0, "fixed")
+    assert "1 xfailed" in pytest_run(kept, "kept crashes", "-k", "000001").stdout
+    spread = pytest_run(kept, "kept crashes", "-n", "2", plugins=("crashhunt.corpus.pytest_plugin", "xdist"))
+    assert "1 failed, 1 xfailed" in spread.stdout, spread.stdout + spread.stderr
+    assert "1 failed" in pytest_run(kept, "kept crashes", "--lf").stdout
+    drive(kept, MENDED)
+    assert "1 passed" in pytest_run(kept, "kept crashes", "--lf").stdout
+
+
+def test_pytests_start_imports_the_thin_module_only():
+    code = (
+        "import sys; import pytest; before = set(sys.modules); import crashhunt.corpus.pytest_plugin; "
+        "print(*sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ours = {name for name in done.stdout.split() if name.startswith("crashhunt")}
+    assert ours == {
+        "crashhunt", "crashhunt.base", "crashhunt.base.version", "crashhunt.corpus", "crashhunt.corpus.pytest_plugin",
+    }  # fmt: skip
+    assert {"numpy", "libsumo", "gymnasium", "pydantic"}.isdisjoint(done.stdout.split())
+
+
+def test_the_plugin_is_registered():
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert project["project"]["entry-points"]["pytest11"] == {"crashhunt": "crashhunt.corpus.pytest_plugin"}
