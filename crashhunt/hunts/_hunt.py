@@ -384,6 +384,7 @@ class Hunt:
             progress.nodes,
             *progress.about_kinds(),
             progress.time_left_s,
+            progress.disturbed if self._disturber is not None else None,
         )
 
 

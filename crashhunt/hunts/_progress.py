@@ -44,6 +44,7 @@ class HuntStatus:
         newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
         time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
+        disturbed: how many of the crashes had disturbances; None where the hunt has none.
     """
 
     phase: str
@@ -60,6 +61,7 @@ class HuntStatus:
     newest_kind_s: float | None = None
     newest_kind_trials: int | None = None
     time_left_s: float = math.inf
+    disturbed: int | None = None
 
 
 @dataclass(slots=True)
@@ -102,6 +104,11 @@ class Progress:
     def last_wanted(self) -> int | None:
         """The number of the trial with which the hunt has found what it is after; None where it goes on."""
         return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
+
+    @property
+    def disturbed(self) -> int:
+        """How many of the crashes had disturbances."""
+        return sum(bundle.result.disturbed for bundle in self.crashes)
 
     @property
     def time_left_s(self) -> float:

@@ -77,6 +77,8 @@ class Watcher:
             Text(f"{name} {count}", style=_STYLES[Outcome(name).category] if name != Outcome.INVALID else "yellow")
             for name, count in sorted(status.outcomes.items())
         )
+        if status.disturbed is not None and status.crashes:
+            outcomes += Text(f"   {_disturbed(status)}")
         rows.append(outcomes or Text("no trial has ended yet", style="dim"))
         if status.kinds:
             kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
@@ -187,11 +189,17 @@ def describe_kinds(status: HuntStatus) -> str:
     return f"{words} ({status.newest_kind_trials} {'trial' if status.newest_kind_trials == 1 else 'trials'})"
 
 
+def _disturbed(status: HuntStatus) -> str:
+    return f"of {status.crashes} {'crash' if status.crashes == 1 else 'crashes'}, {status.disturbed} with disturbances"
+
+
 def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
     line = f"{status.phase}: {_count(status)} trials ({outcomes})"
     if status.phase == "hunting" and status.done:
         line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
+    if status.disturbed is not None and status.crashes:
+        line += f"; {_disturbed(status)}"
     if status.phase == "hunting" and status.kinds:
         line += f"; {describe_kinds(status)}"
     if status.phase == "hunting" and status.nodes is not None:

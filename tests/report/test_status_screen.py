@@ -15,7 +15,7 @@ from crashhunt.executors import NodeFigures
 from crashhunt.hunts import HuntStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
-from crashhunt.report._status_screen import describe_kinds
+from crashhunt.report._status_screen import _line, describe_kinds
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -65,6 +65,21 @@ def test_kinds_of_crashes_and_when_the_last_new_one_came():
         assert any(line.startswith("2 kinds of crashes, the last new one 3") for line in lines)
     assert any("3:12 ago (1 trial): 2 rear end, the" in line for line in lines)
     assert describe_kinds(replace(found, newest_kind_trials=None)).endswith("one 3:12 ago")
+
+
+@pytest.mark.parametrize(
+    ("crashes", "disturbed", "said"),
+    [(2, 1, "of 2 crashes, 1 with disturbances"), (1, 0, "of 1 crash, 0 with disturbances"), (0, 0, ""), (2, None, "")],
+)
+def test_how_many_crashes_had_disturbances(crashes, disturbed, said):
+    found = replace(status(2), crashes=crashes, disturbed=disturbed)
+    console = Console(width=100, height=12, force_terminal=True, color_system=None)
+    with console.capture() as shown:
+        console.print(Watcher(console, TITLE)._screen(found))
+        console.print(_line(found))
+    *screen, line = shown.get().splitlines()
+    for told in ("\n".join(screen), line):
+        assert (said in told) if said else ("disturbances" not in told)
 
 
 def test_where_not_all_fit_it_says_how_many_more():
