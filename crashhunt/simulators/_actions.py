@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,7 +120,8 @@ def cast(action: object, dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
 
 def is_masked(action: object) -> bool:
     """Whether a part of an array is not there."""
-    return isinstance(action, np.ma.MaskedArray) and bool(np.ma.is_masked(action))
+    ma = sys.modules.get("numpy.ma")  # NumPy imports it for whoever asks; where nobody has, there is no such array
+    return ma is not None and isinstance(action, ma.MaskedArray) and bool(ma.is_masked(action))
 
 
 def told(action: object) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import gymnasium
 import numpy as np
@@ -48,6 +50,29 @@ def drive(simulator, meaning, steps, seed=1, options=None):
         if not acts:
             return
         yield simulator.step({agent: form.encode(form.space.meanings.index(meaning)) for agent, form in acts.items()})
+
+
+LEAN = """
+import sys
+from crashhunt.scenario import load_scenario
+from crashhunt.simulators.highway import HighwaySimulator
+simulator = HighwaySimulator(load_scenario("highway"), None)
+simulator.reset(seed=1)
+simulator.step({agent: form.encode(1) for agent, form in simulator.actions.items()})
+assert not {"matplotlib", "pandas", "numpy.ma"} & sys.modules.keys()
+from highway_env.envs.common import observation
+from highway_env.vehicle import dynamics
+from crashhunt.simulators.accelerator import why_not
+import pandas
+assert "numpy.ma" in sys.modules and not why_not()
+assert observation.pd.DataFrame is pandas.DataFrame
+from matplotlib import pyplot
+assert dynamics.plt.subplots is pyplot.subplots
+"""
+
+
+def test_what_an_episode_does_not_need_is_imported_when_it_is_asked_for():
+    subprocess.run([sys.executable, "-c", LEAN], check=True)
 
 
 # Those of our scenarios come below; of each other kind there is one here.

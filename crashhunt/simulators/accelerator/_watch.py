@@ -102,7 +102,7 @@ class _Place:
             self._seen = frozenset(space)
             self._but = frozenset(key for key in space if f"{name}.{key}" in but)
         else:  # of a namespace that is large and others' business, only these
-            self._seen, self._but = frozenset(space), frozenset(space)
+            self._seen = self._but = frozenset(space)
         self._names = names
         self._get: Callable[[Mapping[str, object]], tuple[object, ...]] = _getter(names)
         self._values = self._get(space)

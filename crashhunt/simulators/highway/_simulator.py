@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import warnings
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # an observation may be a picture; nobody wants a window
-os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+from crashhunt.simulators.highway._lean import highway_env  # before anything else imports it
 
+# isort: split
 import gymnasium
-import highway_env
 import numpy as np
 from gymnasium.spaces import Discrete
 from highway_env.envs.common.abstract import AbstractEnv
