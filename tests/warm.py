@@ -280,5 +280,11 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
 
 if __name__ == "__main__":
     _compile()
-    _import("crashhunt.executors._template", "crashhunt.executors._fresh", "crashhunt.simulators.toy", "tomli_w")
+    _import(
+        "crashhunt.executors._template",
+        "crashhunt.executors._fresh",
+        "crashhunt.simulators.toy",
+        "gymnasium",
+        "tomli_w",
+    )
     _serve(socket.socket(fileno=int(sys.argv[1])))

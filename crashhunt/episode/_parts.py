@@ -71,6 +71,8 @@ class Parts:
             for library in factory.libraries if offers(factory, NeedsLibraries) else ():
                 with suppress(ImportError):  # which the agent itself will tell
                     importlib.import_module(library)
+        # Of which every simulator's spaces are: here, so that workers that are forks of this process have it.
+        importlib.import_module("gymnasium")
 
     def simulator(self) -> Simulator:
         """Make a simulator, with a folder for files of its own."""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Signature", "signature_of"]
 
 
+_CONSTRUCTORS = ("__new__", "__init__")
 _KINDS: dict[object, Kind] = {float: "float", int: "int", bool: "bool", str: "str"}
 
 
@@ -54,6 +55,8 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     ``observation_space`` and ``action_space`` are not arguments: they receive the spaces of the vehicle. Nor is
     ``step_length_s``, which receives that of the simulation.
     """
+    if _takes_nothing(factory):
+        return Signature({}, open=False, given=())
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
@@ -73,6 +76,12 @@ def signature_of(factory: Callable[..., object]) -> Signature:
         else:
             arguments[parameter.name] = _argument(parameter, _annotation(parameter, names))
     return Signature(arguments, is_open, tuple(given))
+
+
+def _takes_nothing(factory: Callable[..., object]) -> bool:
+    """Whether it is a plain class without a constructor, of which `inspect` needs milliseconds to say so."""
+    plain = type(factory) is type and inspect.getattr_static(factory, "__signature__", None) is None
+    return plain and all(inspect.getattr_static(factory, name) is vars(object)[name] for name in _CONSTRUCTORS)
 
 
 def _annotation(parameter: inspect.Parameter, names: dict[str, object]) -> object:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import sys
 from typing import Annotated
@@ -37,6 +38,28 @@ def test_a_signature_tells_names_types_ranges_and_spaces():
     assert (signature.arguments["count"].kind, signature.arguments["count"].default) == ("int", None)
     assert signature.given == ("action_space",)
     assert not signature.open
+
+
+class TakesNothing:
+    pass
+
+
+class TakesAsMade(TakesNothing):
+    def __new__(cls, count: int = 1):
+        return super().__new__(cls)
+
+
+class SaysWhatItTakes:
+    __signature__ = inspect.signature(Planner)
+
+
+@pytest.mark.parametrize(
+    ("factory", "taken"),
+    [(TakesNothing, []), (TakesAsMade, ["count"]), (SaysWhatItTakes, ["headway_s", "mode", "count"])],
+)
+def test_classes_without_a_constructor_of_their_own(factory, taken):
+    found = signature_of(factory)
+    assert (list(found.arguments), found.open) == (taken, False)
 
 
 def test_an_unknown_argument_lists_the_accepted_ones():
