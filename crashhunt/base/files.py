@@ -59,7 +59,7 @@ def sync_tree(folder: Path) -> None:
             files.append(path)
     # Several take a disk as long as one: a file system with a journal writes it once for all of them.
     with ThreadPoolExecutor(_AT_ONCE) as threads:
-        for _ in threads.map(_sync, files):
+        for _ in threads.map(_sync_all, [files[share::_AT_ONCE] for share in range(_AT_ONCE)]):
             pass  # which raises what it has raised
         for _ in threads.map(sync_folder, folders):
             pass
@@ -70,6 +70,11 @@ def sync_folder(*folders: Path) -> None:
     with suppress(OSError):  # some network file systems cannot
         for folder in folders:
             _sync(folder)
+
+
+def _sync_all(paths: list[Path]) -> None:
+    for path in paths:
+        _sync(path)
 
 
 def _sync(path: Path) -> None:

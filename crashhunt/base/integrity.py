@@ -20,6 +20,7 @@ __all__ = [
     "FileEntry",
     "changed_file",
     "describe_files",
+    "digest_of_content",
     "digest_of_data",
     "digest_of_file",
     "digest_of_row",
@@ -54,6 +55,11 @@ def digest_of_data(data: Plain) -> str:
     """Return the digest of a JSON object, in hexadecimal, however it is laid out and ordered."""
     text = json.dumps(data, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def digest_of_content(content: bytes) -> str:
+    """Return the digest of what is in a file, in hexadecimal."""
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
 def digest_of_file(path: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from crashhunt.base.errors import BundleError, SnapshotError, UsageError
 from crashhunt.base.files import sync_folder, sync_tree
 from crashhunt.base.integrity import (
     describe_files,
+    digest_of_content,
     digest_of_data,
     digest_of_file,
 )
@@ -36,6 +38,7 @@ from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
 __all__ = ["SnapshotOptions", "take_snapshot"]
 
 _MEGABYTE = 10**6
+_SMALL = 1 << 20  # bytes
 
 
 @clear_constructor
@@ -101,6 +104,8 @@ def take_snapshot(
         snapshots.mkdir(exist_ok=True)
         shutil.rmtree(building, ignore_errors=True)
         building.mkdir()
+        for folder in {(building / name).parent for name in files}:
+            folder.mkdir(parents=True, exist_ok=True)
         entries = {name: _store(path, building / name) for name, path in files.items()}
         entries |= _store_scenario(scenario, building)
         stored = {name: entry for name, entry in entries.items() if entry is not None}
@@ -181,12 +186,20 @@ def _size(path: Path) -> int:
 
 
 def _store(path: Path, copy: Path) -> FileEntry | None:
-    copy.parent.mkdir(parents=True, exist_ok=True)
+    """Copy a file, and whether it can be run; None where it has been deleted since it was listed."""
     try:
-        shutil.copy(path, copy)
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            content = file.read() if status.st_size < _SMALL else None
+        if content is None:
+            shutil.copy(path, copy)
+            return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
     except FileNotFoundError:
-        return None  # deleted since it was listed
-    return {"size": copy.stat().st_size, "blake2b": digest_of_file(copy)}
+        return None
+    # There are hundreds of modules: to copy each and to read it again would take most of a hunt's start.
+    copy.write_bytes(content)
+    copy.chmod(stat.S_IMODE(status.st_mode))
+    return {"size": len(content), "blake2b": digest_of_content(content)}
 
 
 def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry | None]:
@@ -197,6 +210,7 @@ def _store_scenario(scenario: Scenario, building: Path) -> dict[str, FileEntry |
     relocated = scenario.backend.relocated
     for name in scenario.files():
         place = f"{layout.SCENARIO_FILES}/{name}"
+        (building / place).parent.mkdir(parents=True, exist_ok=True)
         entries[place] = _store(scenario.folder / name, building / place)
         moved = relocated(scenario.folder / name) if relocated is not None and name in texts else None
         if moved is not None:
