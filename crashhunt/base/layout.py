@@ -15,6 +15,7 @@ __all__ = [
     "CODE",
     "CRASH",
     "CRASHES",
+    "ENTERED",
     "ENVIRONMENT",
     "ERROR_LOG",
     "FILES",
@@ -81,6 +82,7 @@ ARCHIVE_KEY: Final = "archive-key"
 
 # Of the scratch folder of a trial that runs; of the whole hunt's, the last one.
 BLACK_BOX: Final = "blackbox.bin"
+ENTERED: Final = "entered.json"  # of a trial in which somebody may be left out
 STACK: Final = "stack.txt"
 MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"

@@ -1,7 +1,7 @@
 from ._archive import Archive as Archive, export_crash as export_crash, open_archive as open_archive
+from ._beside import files_of as files_of
 from ._bundle import (
     Bundle as Bundle,
-    files_of as files_of,
     read_bundle as read_bundle,
     read_params as read_params,
     write_bundle as write_bundle,

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import sync_folder, sync_tree, whole_file
-from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
+from crashhunt.base.integrity import changed_file, digest_of_data, read_object, typed
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
+from crashhunt.crashes._beside import collect_output, files_beside, see_that_it_is_whole
 from crashhunt.crashes._data import CrashData, Protected
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Bundle",
-    "files_of",
     "read_bundle",
     "read_params",
     "write_bundle",
     "write_trial",
 ]
 
-SCHEMA = 3
+SCHEMA = 4
+_ALL_TAKE_PART = 3  # what is written where nobody is left out
 _UNDISTURBED = 2  # what is written where there are no disturbances: without them, it would be another trial
 _PROTECTED = 2  # the first version with a digest of itself and of the files beside it
 _KNOWN = bool | float | str | None
@@ -66,6 +66,7 @@ _TYPES: Plain = {
     "divergence": dict | None,
     "disturbed": bool,
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
+    "only": list[str] | None,
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
@@ -171,7 +172,7 @@ class Bundle:
         plain = result.to_json()
         spec = plain["spec"]
         data: CrashData = {
-            "schema": SCHEMA if result.spec.disturbances else _UNDISTURBED,
+            "schema": _schema_of(result.spec),
             "id": self.id,
             "hunt_seed": self.hunt_seed,
             "trial": spec["number"],
@@ -195,7 +196,7 @@ class Bundle:
             "versions": versions(),
             "confirmed": self.confirmed,
             "divergence": self.divergence,
-            "files": dict(self.files) or _files_beside(folder),
+            "files": dict(self.files) or files_beside(folder),
         }
         if result.danger is not None:
             data["danger"] = plain.get("danger")
@@ -204,11 +205,20 @@ class Bundle:
             data["log_likelihood"] = plain.get("log_likelihood")
             data["disturbances"] = plain.get("disturbances", [])
             data["planned_disturbances"] = spec.get("disturbances", [])
+        if "only" in spec:
+            data["only"] = spec["only"]
         whole = merged(data, self.added)
         whole["integrity"] = digest_of_data(whole)
         with whole_file(folder / layout.CRASH) as temporary:
             text = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
             temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
+
+
+def _schema_of(spec: TrialSpec) -> int:
+    """The first version that knows everything that determines the trial."""
+    if spec.only is not None:
+        return SCHEMA
+    return _ALL_TAKE_PART if spec.disturbances else _UNDISTURBED
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -226,7 +236,7 @@ def read_bundle(path: Path) -> Bundle:
                 f"schema {data['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
             )
         if data["schema"] >= _PROTECTED or "integrity" in data:
-            _see_that_it_is_whole(data)
+            see_that_it_is_whole(data)
         return _bundle(path, data)
     except OSError as error:
         raise BundleError(
@@ -237,17 +247,6 @@ def read_bundle(path: Path) -> Bundle:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         raise BundleError(f"not an undamaged crash.json: {reason}", fix=_UNDAMAGED, where=str(file)) from None
-
-
-def _see_that_it_is_whole(data: Protected) -> None:
-    typed(data, {"integrity": str, "files": FILES})
-    said = data.pop("integrity")
-    if digest_of_data(data) != said:
-        raise ValueError("it has changed since it was written")
-    for name, entry in data["files"].items():
-        typed(entry, {"size": int, "blake2b": str})
-        if "/" in name or name in ("", ".", ".."):
-            raise ValueError(f"the file {name!r} is not beside it")
 
 
 def _bundle(path: Path, data: CrashData) -> Bundle:
@@ -270,6 +269,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         data.get("scenario_arguments", {}),
         max_steps=data["max_steps"],
         disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
+        only=tuple(only) if (only := data.get("only")) is not None else None,
     )
     result = TrialResult(
         spec,
@@ -311,7 +311,14 @@ def _added(data: CrashData) -> dict[str, object]:
 
 
 def write_bundle(
-    directory: Path, result: TrialResult, scratch: Path, *, hunt_seed: int, snapshot: str, lanes: Sequence[Lane]
+    directory: Path,
+    result: TrialResult,
+    scratch: Path,
+    *,
+    hunt_seed: int,
+    snapshot: str,
+    lanes: Sequence[Lane],
+    name: str = "",
 ) -> Bundle:
     """Make the bundle of a crash from what its trial left behind.
 
@@ -322,10 +329,11 @@ def write_bundle(
         hunt_seed: of the hunt.
         snapshot: the digest of the code that ran.
         lanes: of the map, for whoever looks at the log.
+        name: of its folder, where that is not made of the trial's number and the outcome.
     """
     from crashhunt.recording import foxglove_layout, write_log
 
-    name = f"{result.spec.number:06d}-{result.outcome}"
+    name = name or f"{result.spec.number:06d}-{result.outcome}"
     final, building = directory / layout.CRASHES / name, directory / layout.CRASHES / f".{name}.part"
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
@@ -334,8 +342,8 @@ def write_bundle(
     write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=result)
     view = json.dumps(foxglove_layout(recording), indent=1)
     (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
-    _collect_output(result, scratch, building)
-    bundle = Bundle(final, result, hunt_seed, snapshot, files=_files_beside(building))
+    collect_output(result, scratch, building)
+    bundle = Bundle(final, result, hunt_seed, snapshot, files=files_beside(building))
     bundle.write(into=building)
     sync_tree(building)
     shutil.rmtree(final, ignore_errors=True)
@@ -349,23 +357,12 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     """Keep what a trial printed that is no crash; its scratch folder is emptied."""
     target = directory / layout.TRIALS / f"{result.spec.number:06d}"
     target.mkdir(parents=True, exist_ok=True)
-    _collect_output(result, scratch, target)
-    data = {**result.to_json(), "schema": _UNDISTURBED, "files": _files_beside(target)}
+    collect_output(result, scratch, target)
+    data = {**result.to_json(), "schema": _UNDISTURBED, "files": files_beside(target)}
     data["integrity"] = digest_of_data(data)
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
     shutil.rmtree(scratch, ignore_errors=True)
-
-
-def files_of(folder: Path) -> dict[str, FileEntry]:
-    """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
-    for name in (layout.CRASH, layout.PARAMS):
-        with suppress(OSError, ValueError):
-            data = read_object(folder / name, Protected)
-            if "integrity" in data:
-                _see_that_it_is_whole(data)
-                return dict(data["files"])
-    return {}
 
 
 def read_params(folder: Path) -> list[str]:
@@ -373,26 +370,8 @@ def read_params(folder: Path) -> list[str]:
     try:
         data = read_object(folder / layout.PARAMS, Protected)
         if "integrity" in data:  # which earlier versions did not write
-            _see_that_it_is_whole(data)
+            see_that_it_is_whole(data)
         files = data.get("files", {}).items()
         return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
     except (OSError, ValueError) as error:
         return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
-
-
-def _files_beside(folder: Path) -> dict[str, FileEntry]:
-    found = describe_files(folder)
-    return {
-        name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
-    }
-
-
-def _collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
-    run_log = scratch / layout.RUN_LOG
-    if run_log.is_file():
-        shutil.copyfile(run_log, target / layout.RUN_LOG)
-    failure = result.failure
-    if failure is not None:
-        parts = (f"{failure.kind}: {failure.message}", failure.traceback, failure.last_output)
-        text = "\n\n".join(part.rstrip() for part in parts if part.strip())
-        (target / layout.ERROR_LOG).write_text(text + "\n", encoding="utf-8", errors="replace")

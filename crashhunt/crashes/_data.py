@@ -57,6 +57,7 @@ class CrashData(Protected):
     danger: NotRequired[float | None]
     disturbances: NotRequired[list[DisturbanceData]]
     planned_disturbances: NotRequired[list[DisturbanceData]]
+    only: NotRequired[list[str] | None]
 
 
 class CrashSummary(TypedDict):

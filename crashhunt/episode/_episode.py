@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from crashhunt.base.errors import RecorderError
+from crashhunt.base.errors import InvalidEpisodeError, RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import Copy, Held, held, shared_memory
 from crashhunt.episode._disturbed import Disturbed
 from crashhunt.episode._failures import close_agent, failure_of, is_emptied
 from crashhunt.episode._observer import Observer
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import FlattensObservations, HasMap
+from crashhunt.simulators import FlattensObservations, HasMap, LeavesOut
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
@@ -260,6 +260,10 @@ class Episode:
         agent = ""
         try:
             options: Options = {"arguments": spec.scenario_arguments}
+            if spec.only is not None:
+                if not offers(simulator, LeavesOut):
+                    raise InvalidEpisodeError("the simulator cannot leave anybody out")
+                options["only"] = spec.only
             self.observations, _ = simulator.reset(seed=spec.seed, options=options)
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)

@@ -27,7 +27,7 @@ from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
 from crashhunt.executors._baseline import Baseline
 from crashhunt.recording import BlackBox
-from crashhunt.simulators import BrakesFully, HasMap, TellsNotices, Tidies
+from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, TellsNotices, Tidies
 from crashhunt.trial import Outcome
 from crashhunt.world import Lane
 
@@ -172,6 +172,8 @@ class Worker:
         if kept:
             # The next trial gets a folder of its own; this one now belongs to the hunt.
             self._folder = None
+            if result.spec.only is not None and offers(simulator, LeavesOut):
+                (folder / layout.ENTERED).write_text(json.dumps(list(simulator.entered)), encoding="utf-8")
             if result.failure is not None and result.failure.traceback:
                 (folder / layout.ERROR_LOG).write_text(result.failure.traceback, encoding="utf-8", errors="replace")
         return replace(result, kept=kept, failure=failure)

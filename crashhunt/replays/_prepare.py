@@ -187,6 +187,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
         scenario_arguments=argument_values(other) | shared,
         max_steps=max(1, round(spec.max_steps * step_length_s / there)),
+        only=None,
         disturbances=tuple(
             replace(one, step=max(1, round(one.step * step_length_s / there)), agent=ids.get(one.agent, one.agent))
             for one in spec.disturbances

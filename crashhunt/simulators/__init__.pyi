@@ -18,6 +18,7 @@ from ._protocol import (
     HasMeanings as HasMeanings,
     HasWindow as HasWindow,
     Info as Info,
+    LeavesOut as LeavesOut,
     NamesObservations as NamesObservations,
     Observations as Observations,
     Options as Options,

@@ -29,6 +29,7 @@ __all__ = [
     "HasMeanings",
     "HasWindow",
     "Info",
+    "LeavesOut",
     "NamesObservations",
     "Observations",
     "Options",
@@ -45,9 +46,12 @@ class Options(TypedDict, total=False):
 
     Args:
         arguments: the arguments of the scenario, by name.
+        only: those besides the agents that take part, by the names that scenes have for them; everybody where it is
+            missing. Only given to one that is `LeavesOut`.
     """
 
     arguments: Mapping[str, Value]
+    only: Sequence[str]
 
 
 Observations = dict[str, NDArray[Any]]
@@ -95,8 +99,8 @@ class Simulator(Protocol):
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
-    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs` and
-    `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers it.
+    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
+    `LeavesOut` and `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers it.
     """
 
     @property
@@ -262,6 +266,14 @@ class Disturbs(Protocol):
         """
 
 
+class LeavesOut(Protocol):
+    """A simulator that can leave others than the agents out of an episode, by name."""
+
+    @property
+    def entered(self) -> Sequence[str]:
+        """Who has entered since `Simulator.reset` was given ``only``, whether it took part or not; else nobody."""
+
+
 class Tidies(Protocol):
     """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
 
@@ -286,6 +298,7 @@ FACULTIES: tuple[type, ...] = (
     HasWindow,
     BrakesFully,
     Disturbs,
+    LeavesOut,
     Tidies,
 )
 """Everything that a simulator may offer."""

@@ -41,4 +41,4 @@ from ._space import (
     parse_spec as parse_spec,
     without_folder as without_folder,
 )
-from ._specification import Overruled as Overruled, TrialSpec as TrialSpec
+from ._specification import EVERYBODY as EVERYBODY, Overruled as Overruled, TrialSpec as TrialSpec

@@ -51,6 +51,7 @@ class SpecExtras(TypedDict, total=False):
     parent: int
     origin: str
     disturbances: list[DisturbanceData]
+    only: list[str]
     requires: list[str]
 
 

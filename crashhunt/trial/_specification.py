@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from crashhunt.trial._data import SpecData, SpecExtras
     from crashhunt.trial._space import Value
 
-__all__ = ["Overruled", "TrialSpec"]
+__all__ = ["EVERYBODY", "Overruled", "TrialSpec"]
+
+EVERYBODY = "*"
+"""In `TrialSpec.only`: nobody is left out, but who enters is written down."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,7 @@ class TrialSpec:
         parent: the trial that the sampler made it from; None where there is none. It determines nothing.
         origin: the sampler's word on where it came from, such as the name of a strategy. It determines nothing.
         disturbances: who around the agents errs, and when; in the order of their steps.
+        only: which of the others take part; None for all. A crash that was made smaller has it.
     """
 
     number: int
@@ -57,6 +61,7 @@ class TrialSpec:
     parent: int | None = None
     origin: str = ""
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=ESSENTIAL)
+    only: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
 
     def to_json(self) -> SpecData:
         """Return plain dicts and numbers."""
@@ -69,6 +74,8 @@ class TrialSpec:
             more["origin"] = self.origin
         if self.disturbances:
             more["disturbances"] = [one.to_json() for one in self.disturbances]
+        if self.only is not None:
+            more["only"] = list(self.only)
         if requires := required_of(self):
             more["requires"] = requires
         return {
@@ -104,4 +111,5 @@ class TrialSpec:
             parent=data.get("parent"),
             origin=data.get("origin", ""),
             disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
+            only=tuple(only) if (only := data.get("only")) is not None else None,
         )

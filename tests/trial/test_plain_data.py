@@ -41,6 +41,7 @@ results = st.builds(
         arguments=st.dictionaries(st.text(), st.dictionaries(st.text(), values)),
         scenario_arguments=st.dictionaries(st.text(), values),
         max_steps=st.integers(1, 10**9),
+        only=st.none() | names,
     ),
     outcome=st.sampled_from(Outcome),
     steps=st.integers(0, 10**9),

@@ -19,6 +19,7 @@ from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
+from crashhunt.simulators.sumo._left_out import LeftOut
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.world import PERSON, Lane, is_person
@@ -74,6 +75,7 @@ class SumoSimulator:
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
+        self._left_out: LeftOut | None = None
 
     told_events = BACKEND.told_events
     disturbing_kinds = BACKEND.disturbances or ()
@@ -104,7 +106,9 @@ class SumoSimulator:
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
         global _current
-        arguments = (options or {}).get("arguments", {})
+        options = options or {}
+        arguments, only = options.get("arguments", {}), options.get("only")
+        self._left_out = None if only is None else LeftOut((*only, *self._scenario.agents))
         command = self._files.arguments(seed, arguments)
         try:
             if libsumo.isLoaded():
@@ -139,6 +143,8 @@ class SumoSimulator:
             for agent, action in actions.items():
                 self._apply(agent, action)
             libsumo.simulationStep()
+            if self._left_out is not None:
+                self._left_out.remove()
             self._steps += 1
             self._look()
             scene, present = self._scene, self._scene.roster.index
@@ -192,6 +198,11 @@ class SumoSimulator:
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return self._disturbances.disturb(vehicle, disturbance)
 
+    @property
+    def entered(self) -> list[str]:
+        """Who has entered, where somebody may be left out."""
+        return [] if self._left_out is None else self._left_out.entered
+
     def close(self) -> None:
         """End the simulation, unless another simulator of this process has begun one since."""
         if _current is not None and _current() is self and libsumo.isLoaded():
@@ -207,7 +218,10 @@ class SumoSimulator:
         setups = self._scenario.agents
         begin = libsumo.simulation.getTime()
         if self._scenario.warmup_s > 0:
-            libsumo.simulationStep(begin + self._scenario.warmup_s)
+            if self._left_out is not None:
+                self._left_out.warm_up(begin + self._scenario.warmup_s)
+            else:
+                libsumo.simulationStep(begin + self._scenario.warmup_s)
         for agent, setup in setups.items():
             if not setup.existing:
                 self._add(agent, setup)
@@ -222,6 +236,8 @@ class SumoSimulator:
                     fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
                 )
             libsumo.simulationStep()
+            if self._left_out is not None:
+                self._left_out.remove()
             waiting -= set(libsumo.simulation.getDepartedIDList())
         gone = set(setups) - set(sumo.vehicle_getIDList())
         if gone:
