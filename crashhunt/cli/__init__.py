@@ -24,6 +24,7 @@ from crashhunt.cli._crashes import add_crashes
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._export import add_export
 from crashhunt.cli._guide import add_guide
+from crashhunt.cli._judge import add_judge
 from crashhunt.cli._list import add_lists
 from crashhunt.cli._logs import add_logs
 from crashhunt.cli._replay import add_replay
@@ -145,7 +146,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
+        add_crashes, add_judge, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Commands", "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt",
-    "pairs", "say",
+    "pairs", "refuse_strangers", "say",
 ]  # fmt: skip
 
 
@@ -184,3 +184,16 @@ def number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def refuse_strangers(archive: Archive, bundle: Bundle, path: Path, *, fix: str) -> UsageError:
+    """Return the refusal to run the code of an archive that nobody here has made."""
+    from crashhunt.plans import read_settings
+
+    agents = {agent.agent for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()}
+    return UsageError(
+        f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
+        f"({', '.join(sorted(agents))})",
+        fix=fix,
+        where=str(path),
+    )

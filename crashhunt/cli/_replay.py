@@ -8,9 +8,8 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, integer, number, opened_crash, pairs, say
+from crashhunt.cli._common import add_crash, add_json, integer, number, opened_crash, pairs, refuse_strangers, say
 from crashhunt.cli._film import (
     add_film_options,
     film_options,
@@ -24,14 +23,15 @@ from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     import argparse
-    from pathlib import Path
 
     from crashhunt.cli._common import Commands
-    from crashhunt.crashes import Archive, Bundle
+    from crashhunt.crashes import Bundle
     from crashhunt.render import FilmOptions
     from crashhunt.replays import Look, ReplayData, ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
+
+_TRUST = "give --trust if you trust whoever gave it to you, or --from-log to run none of it"
 
 
 def add_replay(commands: Commands) -> None:
@@ -125,7 +125,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
                 shots.append(recorded_shot(bundle))
                 continue
             if archive is not None and not trusted and not options.from_log:
-                raise _refuse(archive, bundle, options.directory)
+                raise refuse_strangers(archive, bundle, options.directory, fix=_TRUST)
             one = replace(chosen, trusted=trusted, look=_look(options, bundle))
             with filmed(one, bundle, film, to_stderr=options.json) as asked:
                 report, answer = _replay_one(options, bundle, asked)
@@ -182,18 +182,6 @@ def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptio
         answer["table"] = table
     say(describe_replay(report), as_json=options.json)
     return report, answer
-
-
-def _refuse(archive: Archive, bundle: Bundle, path: Path) -> UsageError:
-    from crashhunt.plans import read_settings
-
-    agents = {agent.agent for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()}
-    return UsageError(
-        f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
-        f"({', '.join(sorted(agents))})",
-        fix="give --trust if you trust whoever gave it to you, or --from-log to run none of it",
-        where=str(path),
-    )
 
 
 def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:

@@ -9,6 +9,21 @@ from ._bundle import (
 )
 from ._data import CrashData as CrashData, CrashSummary as CrashSummary
 from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
-from ._escape import find_escape as find_escape, partner as partner
+from ._escape import (
+    Ending as Ending,
+    ending_of as ending_of,
+    find_escape as find_escape,
+    overruled_trial as overruled_trial,
+    partner as partner,
+    slowing as slowing,
+)
 from ._find import find_bundle as find_bundle, list_bundles as list_bundles
+from ._judgement import (
+    Attempt as Attempt,
+    AttemptData as AttemptData,
+    Judgement as Judgement,
+    JudgementData as JudgementData,
+    judgement_of as judgement_of,
+    with_judgement as with_judgement,
+)
 from ._side_effects import refuse_side_effects as refuse_side_effects

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import FullBraking
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["find_escape", "partner"]
+__all__ = ["Ending", "ending_of", "find_escape", "overruled_trial", "partner", "slowing"]
 
 _RUNS = 12  # enough to bisect a thousand steps
 _BEFORE_S = 10.0  # nobody asks what could have been done longer ago
@@ -28,7 +28,9 @@ _STANDS = 0.1  # m/s
 _AFTERWARDS_S = 5.0  # past the old end, so that a collision that only comes later is seen
 _AS_IT_CAN = "as hard as it can"
 
-Ending = Literal["avoided", "hit", "unclear"]
+Ending = Literal["avoided", "hit", "other", "unclear", "diverged"]
+"""What became of a crash when its trial was run with the agent overruled: no crash, the same two again, another crash,
+something that does not say it, or a run that was not the same before that."""
 
 
 def partner(result: TrialResult) -> str:
@@ -136,46 +138,77 @@ class _Search:
         return self.endings[after]
 
     def _run(self, after: int) -> Ending:
-        hit, dt = self.result.collision, self.recording.prologue.step_length_s
-        assert hit is not None
-        before = self.recording.scene(after)
-        speed = before.speeds[before.roster.index[hit.agent]]
-        slowest = self.braking.deceleration or _GUESS
-        afterwards = _AFTERWARDS_S + max(0.0, speed) / slowest
-        spec = replace(
-            self.result.spec,
-            overruled=Overruled(hit.agent, after),
-            max_steps=self.result.steps + math.ceil(afterwards / dt),
-        )
-        result, recording = self.run(spec)
-        # The same up to there, to the bit: else it says nothing about this crash.
-        if recording.steps < after or any(
-            self.recording.scene(step).frame[1].tobytes() != recording.scene(step).frame[1].tobytes()
-            for step in range(after + 1)
-        ):
-            return "unclear"
-        crashed = result.outcome is not Outcome.SURVIVED and result.outcome is not Outcome.FINISHED
-        self._measure(recording, hit.agent, after, crashed=crashed)
-        if result.outcome is Outcome.COLLISION:
-            same = result.collision is not None and {result.collision.collider, result.collision.victim} == {
-                hit.collider,
-                hit.victim,
-            }
-            return "hit" if same else "unclear"
-        return "avoided" if not crashed and self._is_over(recording, hit.agent) else "unclear"
+        result, recording = self.run(overruled_trial(self.result, self.recording, after, self.braking.deceleration))
+        found = ending_of(self.result, self.recording, after, result, recording)
+        if found != "diverged":
+            assert self.result.collision is not None
+            self.decelerations.append(slowing(self.result.collision.agent, after, result, recording))
+        return found if found in ("avoided", "hit") else "unclear"
 
-    def _is_over(self, recording: Recording, agent: str) -> bool:
-        """Whether the danger has passed, and is not put off only: one of them has left, stands, or goes elsewhere."""
-        scene = recording.scenes()[-1]
-        row = scene.roster.index.get(agent)
-        if row is None or self._other not in scene.roster.index or scene.speeds[row] < _STANDS:
-            return True
-        return math.isinf(self._encounter(recording).moments[-1].time_to_collision_s)
 
-    def _measure(self, recording: Recording, agent: str, after: int, *, crashed: bool) -> None:
-        """Note how hard it braked, without what a collision itself does to the speed."""
-        dt = recording.prologue.step_length_s
-        scenes = recording.scenes()[after : -1 if crashed else None]
-        speeds = [scene.speeds[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index]
-        found = [(was - now) / dt for was, now in itertools.pairwise(speeds)]
-        self.decelerations.append(max(found, default=0.0))
+def overruled_trial(
+    result: TrialResult, recording: Recording, after: int, deceleration: float | None, manoeuvre: str = "brake"
+) -> TrialSpec:
+    """Return the trial of a collision with its agent overruled after a step, long enough to see what comes of it.
+
+    Args:
+        result: of the trial.
+        recording: of it.
+        after: the step.
+        deceleration: at which the vehicle stops, in m/s²; None where nobody knows.
+        manoeuvre: as in `Overruled`.
+    """
+    assert result.collision is not None
+    agent, scene = result.collision.agent, recording.scene(after)
+    speed = scene.speeds[scene.roster.index[agent]]
+    afterwards = _AFTERWARDS_S + max(0.0, speed) / (deceleration or _GUESS)
+    steps = result.steps + math.ceil(afterwards / recording.prologue.step_length_s)
+    return replace(result.spec, overruled=Overruled(agent, after, manoeuvre), max_steps=steps)
+
+
+def ending_of(
+    result: TrialResult, recording: Recording, after: int, rerun: TrialResult, rerun_recording: Recording
+) -> Ending:
+    """Return what became of a collision in a run with its agent overruled after a step.
+
+    Args:
+        result: of the trial.
+        recording: of it.
+        after: the step.
+        rerun: what the run came to.
+        rerun_recording: of the run.
+    """
+    hit = result.collision
+    assert hit is not None
+    # The same up to there, to the bit: else it says nothing about this crash.
+    if rerun_recording.steps < after or any(
+        recording.scene(step).frame[1].tobytes() != rerun_recording.scene(step).frame[1].tobytes()
+        for step in range(after + 1)
+    ):
+        return "diverged"
+    if rerun.outcome is Outcome.COLLISION and rerun.collision is not None:
+        same = {rerun.collision.collider, rerun.collision.victim} == {hit.collider, hit.victim}
+        return "hit" if same else "other"
+    if rerun.outcome is Outcome.OFF_ROAD:
+        return "other"
+    if rerun.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
+        return "unclear"
+    return "avoided" if _is_over(rerun_recording, hit.agent, partner(result)) else "unclear"
+
+
+def _is_over(recording: Recording, agent: str, other: str) -> bool:
+    """Whether the danger has passed, and is not put off only: one of them has left, stands, or goes elsewhere."""
+    scene = recording.scenes()[-1]
+    row = scene.roster.index.get(agent)
+    if row is None or other not in scene.roster.index or scene.speeds[row] < _STANDS:
+        return True
+    return math.isinf(Encounter(recording, agent, other).moments[-1].time_to_collision_s)
+
+
+def slowing(agent: str, after: int, result: TrialResult, recording: Recording) -> float:
+    """Return how hard a vehicle braked after a step, in m/s², without what a collision itself does to the speed."""
+    crashed = result.outcome is not Outcome.SURVIVED and result.outcome is not Outcome.FINISHED
+    scenes = recording.scenes()[after : -1 if crashed else None]
+    speeds = [scene.speeds[scene.roster.index[agent]] for scene in scenes if agent in scene.roster.index]
+    found = [(was - now) / recording.prologue.step_length_s for was, now in itertools.pairwise(speeds)]
+    return max(found, default=0.0)

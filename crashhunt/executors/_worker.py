@@ -196,7 +196,9 @@ class Worker:
         self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
     ) -> Agent:
         made = self._parts.agent(agent, simulator, arguments)
-        return Braking(made, simulator, agent, overruled.after) if agent == overruled.agent else made
+        return (
+            Braking(made, simulator, agent, overruled.after, overruled.manoeuvre) if agent == overruled.agent else made
+        )
 
     def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
         """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""

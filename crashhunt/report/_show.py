@@ -7,9 +7,10 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.crashes import Encounter, last_escape
+from crashhunt.crashes import Encounter, judgement_of, last_escape
 from crashhunt.report._disturbances import about_disturbances
 from crashhunt.report._events import about_events
+from crashhunt.report._judgement import about_judgement
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 
@@ -57,6 +58,7 @@ class Story:
         self.agent = bundle.driver
         self.other = hit.other if hit else ""
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
+        self.judgement = judgement_of(bundle)
         tried = bundle.result.escape
         self.escape = tried.step if tried is not None else None
         if braking is not None:
@@ -80,6 +82,7 @@ class Story:
                 "how": tried.how if tried and not self._braking else None,
                 "too_late_step": tried.too_late if tried and not self._braking else None,
             },
+            "judged": self.judgement.to_json() if self.judgement is not None else None,
             "moments": [
                 {
                     name: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -196,6 +199,8 @@ class Story:
         tried = self.bundle.result.escape
         if self._braking is not None:
             return [self._calculated(self._braking)]
+        if self.judgement is not None and self.judgement.runs:
+            return self.about_judgement()
         if tried is None:
             return []
         braking = f"Braking {tried.how}"
@@ -206,6 +211,10 @@ class Story:
             return [f"{braking} would have avoided it until {self._ago(tried.step)}; that was run."]
         until = self._ago(tried.step)
         return [f"{braking} would have avoided it until {until}; one step later it was too late. Both were run."]
+
+    def about_judgement(self) -> list[str]:
+        """Return until when it could have been avoided, as `judge` has found out by running it."""
+        return about_judgement(self.judgement, self._ago) if self.judgement is not None else []
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:

@@ -30,6 +30,7 @@ class OverruledData(TypedDict):
 
     agent: str
     after: int
+    manoeuvre: NotRequired[str]
 
 
 class DisturbanceData(TypedDict):

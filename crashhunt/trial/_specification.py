@@ -13,7 +13,7 @@ from crashhunt.trial._disturbance import Disturbance
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from crashhunt.trial._data import SpecData, SpecExtras
+    from crashhunt.trial._data import OverruledData, SpecData, SpecExtras
     from crashhunt.trial._space import Value
 
 __all__ = ["EVERYBODY", "Overruled", "TrialSpec"]
@@ -29,10 +29,19 @@ class Overruled:
     Args:
         agent: whose.
         after: the step after which it brakes; its first decision that is not its own is the one of the next step.
+        manoeuvre: ``brake``; ``left`` or ``right`` also changes lanes to that side, in that first decision.
     """
 
     agent: str
     after: int
+    manoeuvre: str = field(default="brake", metadata=ESSENTIAL)
+
+    def to_json(self) -> OverruledData:
+        """Return plain data; what is at its default is left out."""
+        plain: OverruledData = {"agent": self.agent, "after": self.after}
+        if self.manoeuvre != "brake":
+            plain["manoeuvre"] = self.manoeuvre
+        return plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +76,7 @@ class TrialSpec:
         """Return plain dicts and numbers."""
         more: SpecExtras = {}
         if self.overruled:
-            more["overruled"] = {"agent": self.overruled.agent, "after": self.overruled.after}
+            more["overruled"] = self.overruled.to_json()
         if self.parent is not None:
             more["parent"] = self.parent
         if self.origin:
@@ -76,7 +85,7 @@ class TrialSpec:
             more["disturbances"] = [one.to_json() for one in self.disturbances]
         if self.only is not None:
             more["only"] = list(self.only)
-        if requires := required_of(self):
+        if requires := [*required_of(self), *(required_of(self.overruled) if self.overruled else ())]:
             more["requires"] = requires
         return {
             "number": self.number,
@@ -94,7 +103,7 @@ class TrialSpec:
         Raises:
             CrashhuntError: it needs what this version does not know.
         """
-        unknown = not_understood(data.get("requires") or (), cls)
+        unknown = not_understood(data.get("requires") or (), cls, Overruled)
         if unknown:
             raise CrashhuntError(
                 f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not know",

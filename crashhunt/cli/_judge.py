@@ -1,0 +1,108 @@
+"""``crashhunt judge``."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, refuse_strangers, say
+from crashhunt.cli._exit_codes import DONE, INTERRUPTED
+from crashhunt.cli._progress import shown_progress
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.crashes import Bundle, Judgement
+
+__all__ = ["add_judge"]
+
+
+def add_judge(commands: Commands) -> None:
+    """Add the command."""
+    judge = commands.add_parser(
+        "judge",
+        help="find out until when a collision could have been avoided, by running it",
+        description="Run the trial of a collision again and again, each time with the agent overruled from another "
+        "step on: braking as hard as its vehicle can, or changing lanes and braking, the others reacting as they then "
+        "do. Says until when that avoids it, writes it into crash.json, and from then on show tells it too.",
+    )
+    add_crash(judge)
+    judge.add_argument("--all", action="store_true", help="all collisions of the hunt that have not been judged yet")
+    judge.add_argument(
+        "--runs", metavar="N", type=integer, default=60, help="the most trials to run for one collision; default: 60"
+    )
+    judge.add_argument(
+        "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
+    )
+    judge.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
+    add_json(judge)
+    judge.set_defaults(command=_judge)
+
+
+def _judge(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.base.signals import stop_requests
+
+    if options.runs < 1:
+        raise UsageError(f"--runs is {options.runs}", fix="give at least 1")
+    if options.parallel < 0:
+        raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
+    if options.all and options.crash:
+        raise UsageError(f"--all and --crash {options.crash} contradict each other", fix="leave one of them out")
+    told: list[dict[str, object]] = []
+    with stop_requests() as stops:
+        if options.all:
+            told += (_judge_one(options, bundle, stops, write=True) for bundle in _unjudged(options) if not stops)
+        else:
+            with opened_crash(options.directory, options.crash) as (bundle, archive):
+                if archive is not None and not archive.made_here and not options.trust:
+                    raise refuse_strangers(archive, bundle, options.directory, fix="give --trust if you trust them")
+                told.append(_judge_one(options, bundle, stops, write=archive is None))
+    if options.json:
+        print(json.dumps({"judged": told}))
+    return INTERRUPTED if stops else DONE
+
+
+def _unjudged(options: argparse.Namespace) -> list[Bundle]:
+    from crashhunt.crashes import judgement_of, list_bundles
+    from crashhunt.hunts import find_hunts
+    from crashhunt.trial import Outcome
+
+    if options.directory.is_file():
+        raise UsageError("--all is for the directory of a hunt", fix="leave it out", where=str(options.directory))
+    bundles = [bundle for hunt in find_hunts(options.directory) for bundle in list_bundles(hunt)]
+    return [
+        bundle
+        for bundle in bundles
+        if bundle.result.outcome is Outcome.COLLISION
+        and bundle.result.collision is not None
+        and bundle.result.collision.other
+        and judgement_of(bundle) is None
+    ]
+
+
+def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *, write: bool) -> dict[str, object]:
+    from crashhunt.crashes import with_judgement
+    from crashhunt.replays import ReplayOptions, judge
+    from crashhunt.report import Story
+
+    with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
+        found: Judgement = judge(
+            bundle,
+            ReplayOptions(force=True),
+            runs=options.runs,
+            parallel=options.parallel or len(os.sched_getaffinity(0)),
+            watch=watch,
+            stopped=lambda: bool(stops),
+        )
+    bundle = with_judgement(bundle, found)
+    if write and (found.runs or found.why_not) and not stops:
+        bundle.write()
+    story = Story(bundle)
+    say(
+        "\n".join([f"{bundle.id}: {bundle.result.summary}", *(f"  {line}" for line in story.about_judgement())]),
+        as_json=options.json,
+    )
+    return {"crash": bundle.id, **found.to_json()}

@@ -1,0 +1,152 @@
+"""What running a collision again with its agent overruled has shown: until when it could have been avoided, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypedDict
+
+from crashhunt.base.integrity import typed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.crashes._bundle import Bundle
+    from crashhunt.crashes._escape import Ending
+
+__all__ = ["Attempt", "AttemptData", "Judgement", "JudgementData", "judgement_of", "with_judgement"]
+
+_KEY = "judged"
+
+
+class AttemptData(TypedDict):
+    """An `Attempt` as JSON."""
+
+    manoeuvre: str
+    endings: dict[str, Ending]
+    last_step: int | None
+    too_late_step: int | None
+    all_later_run: bool
+    deceleration: float | None
+
+
+class JudgementData(TypedDict):
+    """A `Judgement` as JSON."""
+
+    avoidable: bool | None
+    manoeuvre: str
+    last_step: int | None
+    runs: int
+    why_not: str
+    attempts: list[AttemptData]
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One manoeuvre, tried from several steps on.
+
+    Args:
+        manoeuvre: as in `Overruled`.
+        end: the step of the crash.
+        endings: step to what became of it where the agent was overruled after that step.
+        deceleration: the greatest in those runs, in m/s²; None where it never slowed down.
+    """
+
+    manoeuvre: str
+    end: int
+    endings: Mapping[int, Ending]
+    deceleration: float | None = None
+
+    @property
+    def last_step(self) -> int | None:
+        """The last step after which a run avoided it; None where none did."""
+        return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
+
+    @property
+    def too_late_step(self) -> int | None:
+        """The step after the last one, where that was run and ended in a crash; without a last one, the first such."""
+        last = self.last_step
+        crashed = [step for step, ending in self.endings.items() if ending in ("hit", "other")]
+        if last is None:
+            return min(crashed, default=None)
+        return last + 1 if last + 1 in crashed else None
+
+    @property
+    def all_later_run(self) -> bool:
+        """Whether every step after the last one was run, up to the one before the crash, and ended in a crash."""
+        first = -1 if self.last_step is None else self.last_step
+        return all(self.endings.get(step) in ("hit", "other") for step in range(first + 1, self.end))
+
+    def to_json(self) -> AttemptData:
+        """Return plain data."""
+        return {
+            "manoeuvre": self.manoeuvre,
+            "endings": {str(step): self.endings[step] for step in sorted(self.endings)},
+            "last_step": self.last_step,
+            "too_late_step": self.too_late_step,
+            "all_later_run": self.all_later_run,
+            "deceleration": self.deceleration,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What all manoeuvres have shown. Nothing is in it that was not run.
+
+    Args:
+        attempts: a manoeuvre each.
+        why_not: why there is no answer, or not a whole one; empty where there is.
+    """
+
+    attempts: tuple[Attempt, ...] = ()
+    why_not: str = ""
+
+    @property
+    def runs(self) -> int:
+        """How many trials were run for it."""
+        return sum(len(attempt.endings) for attempt in self.attempts)
+
+    @property
+    def best(self) -> Attempt | None:
+        """The manoeuvre that helps longest; braking, where another helps no longer."""
+        helping = [attempt for attempt in self.attempts if attempt.last_step is not None]
+        return max(helping, key=lambda attempt: attempt.last_step or 0, default=None)
+
+    @property
+    def avoidable(self) -> bool | None:
+        """Whether a run avoided it; False where none did, from the first step on neither; None where nobody knows."""
+        if self.best is not None:
+            return True
+        from_the_first = [attempt.endings.get(0) in ("hit", "other") for attempt in self.attempts]
+        settled = all(ending in ("hit", "other") for attempt in self.attempts for ending in attempt.endings.values())
+        return False if from_the_first and all(from_the_first) and settled and not self.why_not else None
+
+    def to_json(self) -> JudgementData:
+        """Return plain data."""
+        best = self.best
+        return {
+            "avoidable": self.avoidable,
+            "manoeuvre": best.manoeuvre if best else "",
+            "last_step": best.last_step if best else None,
+            "runs": self.runs,
+            "why_not": self.why_not,
+            "attempts": [attempt.to_json() for attempt in self.attempts],
+        }
+
+
+def judgement_of(bundle: Bundle) -> Judgement | None:
+    """Return what `judge` has written into a bundle; None where there is nothing, or nothing that can be read."""
+    data: Any = bundle.added.get(_KEY)
+    try:
+        attempts = []
+        for each in data["attempts"]:
+            typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
+            endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
+            attempts.append(Attempt(each["manoeuvre"], bundle.result.steps, endings, each["deceleration"]))
+        return Judgement(tuple(attempts), str(data.get("why_not", "")))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def with_judgement(bundle: Bundle, judgement: Judgement) -> Bundle:
+    """Return a bundle with a judgement, to be written."""
+    return replace(bundle, added={**bundle.added, _KEY: judgement.to_json()})

@@ -1,0 +1,90 @@
+"""Until when a collision could have been avoided: what `judge` says against running every step."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from crashhunt.crashes import find_bundle, judgement_of
+from crashhunt.replays import ReplayOptions, judge
+from crashhunt.replays._avoiding import Search
+
+HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
+
+
+def test_what_is_found_is_kept_and_told(toy):
+    toy.crashhunt("run", "h", "1", "1", "300", *HUNT)
+    before = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
+    found = toy.crashhunt("judge", "h", "--runs", "9", "--parallel", "2", "--json")
+    (judged,) = found.json["judged"]
+    brake = judged["attempts"][0]
+    assert judged["avoidable"] is True
+    assert judged["runs"] <= 9
+    assert brake["manoeuvre"] == "brake"
+    assert brake["deceleration"] == pytest.approx(8.0)
+    assert "by braking (at up to 8.0 m/s²); that was run" in found.err
+    after = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
+    assert {name: value for name, value in after.items() if name not in ("judged", "integrity")} == {
+        name: value for name, value in before.items() if name != "integrity"
+    }
+    assert "by braking (at up to 8.0 m/s²); that was run" in toy.crashhunt("show", "h").out
+    assert toy.crashhunt("show", "h", "--json").json["judged"] == {
+        name: value for name, value in judged.items() if name != "crash"
+    }
+    # The hunt itself had looked for the same, by its own way.
+    escape = before["escape"]
+    assert escape["step"] == brake["last_step"]
+    assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
+    assert toy.crashhunt("check", "h").out.endswith("are as written\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--runs", "0"), "--runs is 0"),
+        (("--parallel", "-1"), "--parallel is -1"),
+        (("--all", "--crash", "1"), "contradict"),
+    ],
+)
+def test_slips(toy, words, said):
+    (toy.folder / "h").mkdir()
+    (toy.folder / "h" / "hunt.toml").write_text("")
+    assert said in toy.crashhunt("judge", "h", *words, expect=2).err
+
+
+def test_what_is_no_collision_is_refused(toy):
+    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2", "--seed", "1")
+    toy.crashhunt("run", "h", "1", "1", "9", *words)
+    assert "is no collision with somebody else" in toy.crashhunt("judge", "h", expect=2).err
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("scenario", "words"),
+    [
+        ("loop", ("--arg", "speed=20:25", "--seed", "1")),
+        ("intersection", ("--seed", "2")),
+        ("highway", ("--seed", "1")),
+    ],
+)
+def test_the_last_step_is_the_one_that_running_every_step_finds(shell, monkeypatch, scenario, words):
+    shell.crashhunt("run", "h", "2", "200", "400", "--scenario", scenario, *words)
+    bundle = find_bundle(shell.folder / "h")
+    found = judge(bundle, ReplayOptions(), runs=30, parallel=2)
+    first = max(0, bundle.result.steps - 20)
+
+    def every_step(self):
+        self._try("brake", 30, bundle.result.steps - 1, first)
+
+    monkeypatch.setattr(Search, "all", every_step)
+    monkeypatch.setattr(Search, "_find", lambda *_: None)
+    monkeypatch.setattr(Search, "_look_after", lambda self, tries, first: self._ask(tries, range(first, self._end)))
+    every = judge(bundle, ReplayOptions(), runs=30, parallel=2)
+    assert set(every.attempts[0].endings) == set(range(first, bundle.result.steps))
+    assert (
+        every.attempts[0].endings | found.attempts[0].endings == found.attempts[0].endings | every.attempts[0].endings
+    )
+    if found.attempts[0].last_step is None or found.attempts[0].last_step >= first:
+        assert every.attempts[0].last_step == found.attempts[0].last_step
+    assert judgement_of(bundle) is None
