@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import sqlite3
 import tempfile
 import time
@@ -20,11 +19,10 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'crashhunt[
 
 from ray.cluster_utils import Cluster
 
-from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
+from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._address import cluster_of
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import ExecutorContract
 from crashhunt.trial import CRASHES, TrialSpec
@@ -277,75 +275,6 @@ def test_a_cluster_that_can_run_nothing_says_why(begin, settings, cluster):
     first.submit(spec(0))
     collect(first, 1)
     assert f"the Ray cluster at {cluster.address} can run nothing: none of its 2 CPUs is free; wait" in refusal(begin())
-
-
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: nobody answers there (Connection refused); start one with"),
-        ("nowhere", "--executor ray:nowhere is no address HOST:PORT; write --executor ray:nowhere:6379"),
-        ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
-        ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which a hunt does not use"),
-        ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
-    ],
-)
-def test_an_address_that_leads_nowhere_is_one_line(settings, monkeypatch, tmp_path, argument, message):
-    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    began = time.monotonic()
-    with pytest.raises(UsageError) as raised:
-        RayExecutor(settings, argument=argument)
-    assert message in str(raised.value)
-    assert time.monotonic() - began < 10
-    assert [path.name for path in settings.scratch.iterdir()] == []
-
-
-def test_a_hunt_that_nobody_would_run_ends_at_once(toy):
-    began = time.monotonic()
-    words = ("run", "h", "0", "4", "20", "--scenario", "toy", "--executor", "ray:127.0.0.1:1")
-    said = toy.crashhunt(*words, expect=2).err.splitlines()
-    assert said[-1].startswith(
-        "crashhunt: --executor ray:127.0.0.1:1: nobody answers there (Connection refused); start"
-    )
-    assert time.monotonic() - began < 10
-    assert not (toy.folder / "h" / ".scratch").exists()
-
-
-def test_the_address_may_stand_in_the_environment(settings, monkeypatch):
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: nobody answers there"):
-        RayExecutor(settings)
-
-
-def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_path):
-    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
-    monkeypatch.setenv("HOME", str(tmp_path))
-    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
-        monkeypatch.delenv(name, raising=False)
-    assert cluster_of("").address == ""
-    assert cluster_of("").environment != cluster_of("local").environment, "our own get a new one each"
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"127.0.0.1:{server.getsockname()[1]}"
-        (tmp_path / "ray").mkdir()
-        (tmp_path / "ray" / "ray_current_cluster").write_text(address)
-        assert cluster_of("") == cluster_of("auto") == (address, {})
-        (tmp_path / ".ray").mkdir()
-        (tmp_path / ".ray" / "auth_token").write_text("secret")
-        assert cluster_of("") == (address, {"RAY_AUTH_MODE": "token"})
-        assert cluster_of(address) == (address, {})
-        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-        assert cluster_of("") == (address, {})
-        monkeypatch.setenv("RAY_ADDRESS", address)
-        assert cluster_of("auto") == (address, {})
-        assert cluster_of("local").address == ""
-    monkeypatch.delenv("RAY_ADDRESS")
-    assert cluster_of("").address == "", "one that has ended is none"
-
-
-def test_without_ray_it_says_how_to_get_it(settings, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PluginError, match=r"which is not installed; pip install 'crashhunt\[ray\]'"):
-        RayExecutor(settings)
 
 
 def test_what_is_too_large_to_travel_is_refused(settings, tmp_path):

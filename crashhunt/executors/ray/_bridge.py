@@ -23,7 +23,7 @@ from crashhunt.base.blame import in_words
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._remains import died
-from crashhunt.executors.ray._cluster import Cluster, Lost, UnreachableError
+from crashhunt.executors.ray._cluster import Cluster, Lost, TokenError, UnreachableError
 from crashhunt.executors.ray._parcel import Parcel
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
 from crashhunt.executors.ray._work import unpacked
@@ -52,8 +52,8 @@ def main() -> None:
         Bridge(control, job).run()
         code = 0
     except CrashhuntError as error:
-        passing = isinstance(error, UnreachableError)
-        control.sendall(json.dumps({**error.to_json(), "passing": passing}).encode() + b"\n")
+        kinds = {"passing": isinstance(error, UnreachableError), "token": isinstance(error, TokenError)}
+        control.sendall(json.dumps({**error.to_json(), **kinds}).encode() + b"\n")
     except BaseException:
         traceback.print_exc()
         sys.stderr.flush()
@@ -245,7 +245,10 @@ class Bridge:
         self._cluster.kill(node.actor)
         self._losses[node.id] = 0 if culprits else self._losses.get(node.id, 0) + 1
         if self._losses[node.id] >= _LOSSES:
-            self._refused[node.id] = f"{node.name}: its process was ended {_LOSSES} times before a trial was done"
+            why = f"{node.name}: its process was ended {_LOSSES} times before a trial was done"
+            if self._job["address"] and not self._ever_ready and os.environ.get("RAY_AUTH_MODE") == "token":
+                why += ", as happens with RAY_AUTH_MODE=token here and not on the cluster"
+            self._refused[node.id] = why
             self._say(note=f"node {self._refused[node.id]}; it takes no part any more")
         elif node.ready:
             again = f" with {count} trial{'s' * (count != 1)}, to be run again" if count and not culprits else ""

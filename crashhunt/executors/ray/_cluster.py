@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import queue
 import threading
 import time
 from collections import Counter
@@ -13,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.executors.ray import _site
+from crashhunt.executors.ray._address import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from crashhunt.executors.ray._roster import Node
 
-__all__ = ["Cluster", "Found", "Lost", "UnreachableError"]
+__all__ = ["Cluster", "Found", "Lost", "TokenError", "UnreachableError"]
 
+_ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
 _ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, beside those of the other
 
@@ -31,6 +34,10 @@ class Lost(Exception):  # noqa: N818 - it is no fault
 
 class UnreachableError(UsageError):
     """The cluster cannot be reached, now or at all."""
+
+
+class TokenError(UnreachableError):
+    """The cluster asks for a token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +82,14 @@ class Cluster:
         if not address:
             options |= {"num_cpus": cpus, "include_dashboard": False, "_temp_dir": temporary}
             options |= {"object_store_memory": _STORE_BYTES}
+        else:
+            _greet(address)
         try:
             ray.init(address=address or "local", **options)
         except Exception as error:
-            said = " ".join(str(error).split()) or type(error).__name__
             raise UnreachableError(
-                f"the Ray cluster at {self.address} cannot be used: {said}",
-                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python, and set "
-                "RAY_AUTH_MODE=token where it asks for a token",
+                f"the Ray cluster at {self.address} cannot be used: {_in_short(error)}",
+                fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
             ) from error
         cloudpickle.register_pickle_by_value(_site)
         kind = ray.remote(concurrency_groups={_ORDERS: 1, _ANSWERS: 1}, max_restarts=0, max_task_retries=0)
@@ -170,3 +177,44 @@ class Cluster:
         for actor in actors:
             self.kill(actor)
         time.sleep(0.05)  # for the last of these to be on its way
+
+
+def _greet(address: str) -> None:
+    """See that a cluster answers, which Ray itself takes very long to doubt.
+
+    Raises:
+        UnreachableError: it does not.
+    """
+    from ray._raylet import GcsClient  # of which there is no public form
+
+    said: queue.SimpleQueue[Exception | None] = queue.SimpleQueue()
+
+    def ask() -> None:
+        try:
+            GcsClient(address=address)
+            said.put(None)
+        except Exception as error:
+            said.put(error)
+
+    threading.Thread(target=ask, daemon=True).start()
+    try:
+        error = said.get(timeout=_ANSWER_S)
+    except queue.Empty:
+        error = TimeoutError("it does not answer in time")
+    if error is None:
+        return
+    if type(error).__name__ == "AuthenticationError":  # which older ones lack, as they lack tokens
+        shown = os.environ.get("RAY_AUTH_MODE") == "token"
+        raise TokenError(
+            f"the Ray cluster at {address} {'takes another token than this one' if shown else 'asks for a token'}",
+            fix=TOKEN if shown else f"set RAY_AUTH_MODE=token, and {TOKEN}",
+        )
+    raise UnreachableError(
+        f"what answers at {address} is not the head of a Ray cluster: {_in_short(error)}",
+        fix="give the address that 'ray start --head' has printed, with its port, which is 6379 unless you chose another",
+    )
+
+
+def _in_short(error: Exception) -> str:
+    """What an error of Ray's says, in one line."""
+    return " ".join(str(error).split()).rstrip(":") or type(error).__name__

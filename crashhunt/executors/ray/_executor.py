@@ -20,7 +20,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.executors._notes import Notes
 from crashhunt.executors._protocol import NodeFigures
-from crashhunt.executors.ray._address import answers, cluster_of, require_ray
+from crashhunt.executors.ray._address import cluster_of, require_ray, silent
 from crashhunt.executors.ray._parcel import Parcel
 from crashhunt.executors.ray._site import code_digest
 from crashhunt.recording import BlackBoxHeader, Phase
@@ -67,7 +67,7 @@ class RayExecutor:
         self, settings: WorkerSettings, *, parallel: int = 0, recycle_after: int = 1000, argument: str = ""
     ) -> None:
         require_ray()
-        self._address, self._environment = cluster_of(argument)
+        self._address, self._environment, self._spare = cluster_of(argument)
         Parcel.of(settings)
         self._settings = settings
         self._parallel = parallel
@@ -213,6 +213,11 @@ class RayExecutor:
             return
         if "error" in message:
             error = CrashhuntError.from_json({"error": message["error"]})
+            if message["token"] and self._spare:
+                self._environment, self._spare = {**self._environment, **self._spare}, {}
+                self._end()
+                self._start()
+                return
             if not message["passing"] or not self._ever_up or not self._address:
                 raise error
             self._lose(error.message)
@@ -254,7 +259,7 @@ class RayExecutor:
         if time.monotonic() - self._lost_at < (_RETRY_S if self._address else 0.0):
             return False
         self._lost_at = time.monotonic()
-        if self._address and answers(self._address):
+        if self._address and silent(self._address):
             return False
         self._start()
         return True

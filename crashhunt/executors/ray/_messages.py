@@ -64,13 +64,15 @@ class Figures(TypedDict):
 class FromBridge(TypedDict, total=False):
     """What a bridge says: a trial has ended, or what has become of nodes.
 
-    ``passing`` belongs to an error that may be over when somebody tries again; ``where`` to a ``node``.
+    ``passing`` belongs to an error that may be over when somebody tries again, ``token`` to one for want of a token;
+    ``where`` belongs to a ``node``.
     """
 
     ticket: int
     result: ResultData
     error: ErrorWords
     passing: bool
+    token: bool
     capacity: int
     note: str
     nodes: list[Figures]

@@ -1,0 +1,150 @@
+"""Which cluster is meant, and what is said where there is none; without Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+
+import pytest
+
+from crashhunt.base.errors import PluginError, UsageError
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors.ray import RayExecutor
+from crashhunt.executors.ray._address import cluster_of, require_ray
+from crashhunt.scenario import Scenario
+from crashhunt.trial import CRASHES
+
+SETTINGS = bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # what every HTTP/2 server says first
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_set(monkeypatch, tmp_path):
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_USE_TLS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("crashhunt.executors.ray._executor.require_ray", lambda: None)
+
+
+@pytest.fixture
+def settings(tmp_path):
+    (tmp_path / "scratch").mkdir()
+    scenario = Scenario(simulator="toy", folder=tmp_path)
+    return WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=tmp_path / "scratch")
+
+
+@contextlib.contextmanager
+def listener(answer):
+    """Somebody who says the same to everybody, and nothing where that is None; yields the address."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    if answer is None:
+                        held.append(connection)
+                    else:
+                        connection.sendall(answer)
+                        connection.close()
+
+        held = []
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+        for connection in held:
+            connection.close()
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("127.0.0.1:1", "--executor ray:127.0.0.1:1: nobody answers there (Connection refused); start one with"),
+        ("nowhere", "--executor ray:nowhere is no address HOST:PORT; write --executor ray:nowhere:6379"),
+        ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
+        ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which a hunt does not use"),
+        ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
+    ],
+)
+def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
+    began = time.monotonic()
+    with pytest.raises(UsageError) as raised:
+        RayExecutor(settings, argument=argument)
+    assert message in str(raised.value)
+    assert time.monotonic() - began < 10
+    assert [path.name for path in settings.scratch.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (b"HTTP/1.0 400 Bad Request\r\n\r\n", "what answers there is not the head of a Ray cluster; start one"),
+        (b"", "what answers there is not the head of a Ray cluster; start one"),
+        (None, "somebody listens there and does not answer; start one"),
+    ],
+)
+def test_whoever_answers_and_is_no_cluster_is_told_from_one(monkeypatch, answer, message):
+    monkeypatch.setattr("crashhunt.executors.ray._address._ANSWER_S", 0.5)
+    with listener(answer) as address:
+        with pytest.raises(UsageError) as raised:
+            cluster_of(address)
+        assert f"--executor ray:{address}: {message}" in str(raised.value)
+        monkeypatch.setenv("RAY_USE_TLS", "1")
+        assert cluster_of(address).address == address, "what is encrypted is left to Ray"
+
+
+def test_a_hunt_that_nobody_would_run_ends_at_once(toy):
+    began = time.monotonic()
+    words = ("run", "h", "0", "4", "20", "--scenario", "toy", "--executor", "ray:127.0.0.1:1")
+    said = toy.crashhunt(*words, expect=2).err.splitlines()
+    assert said[-1].startswith(
+        "crashhunt: --executor ray:127.0.0.1:1: nobody answers there (Connection refused); start"
+    )
+    assert time.monotonic() - began < 10
+    assert not (toy.folder / "h" / ".scratch").exists()
+
+
+def test_the_address_may_stand_in_the_environment(settings, monkeypatch):
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(UsageError, match=r"RAY_ADDRESS=127\.0\.0\.1:1: nobody answers there"):
+        RayExecutor(settings)
+
+
+def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_path):
+    """And there only where it is asked for."""
+    assert cluster_of("").address == ""
+    assert cluster_of("").environment != cluster_of("local").environment, "our own get a new one each"
+    if_asked = {"RAY_AUTH_MODE": "token"}
+    with listener(SETTINGS) as address:
+        (tmp_path / "ray").mkdir()
+        (tmp_path / "ray" / "ray_current_cluster").write_text(address)
+        assert cluster_of("") == cluster_of("auto") == (address, {}, {})
+        (tmp_path / ".ray").mkdir()
+        (tmp_path / ".ray" / "auth_token").write_text("secret")
+        assert cluster_of("") == (address, {}, if_asked)
+        assert cluster_of(address) == (address, {}, if_asked)
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+        assert cluster_of("") == (address, {}, {})
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        assert cluster_of("auto") == (address, {}, {})
+        assert cluster_of("local").address == ""
+        monkeypatch.setenv("RAY_AUTH_MODE", "token")
+        assert cluster_of("") == (address, {}, {})
+        (tmp_path / ".ray" / "auth_token").unlink()
+        with pytest.raises(UsageError, match="RAY_AUTH_MODE=token, and there is no token; put the one that"):
+            cluster_of("")
+    monkeypatch.delenv("RAY_ADDRESS")
+    assert cluster_of("").address == "", "one that has ended is none"
+    monkeypatch.delenv("RAY_AUTH_MODE")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "secret")
+    monkeypatch.setattr("crashhunt.executors.ray._address.silent", lambda address: "")
+    assert cluster_of("127.0.0.1:6379").spare == if_asked
+    assert cluster_of("198.51.100.7:6379").spare == {}, "another machine"
+
+
+def test_without_ray_it_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(PluginError, match=r"which is not installed; pip install 'crashhunt\[ray\]'"):
+        require_ray()
