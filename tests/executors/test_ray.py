@@ -186,23 +186,36 @@ def on_one_machine(settings, specs, tmp_path):
         pool.close()
 
 
+def busy(executor, specs, found, until):
+    """Collect until something is so; the executor has something to do all the time."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not until():
+        assert time.monotonic() < deadline, f"only {sorted(found)} came back; {executor.notes()}"
+        while len(specs) < len(found) + 12:
+            specs.append(spec(len(specs), step_wall_s=0.02))
+            executor.submit(specs[-1])
+        for result in executor.completed(0.2):
+            assert result.spec.number not in found, "a trial came back twice"
+            found[result.spec.number] = result
+
+
 def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_path):
     """A node that joins late, its actor, then the node: every trial comes back once, as it does on one machine."""
-    specs = [spec(number, step_wall_s=0.02) for number in range(24)]
+    specs, found = [], {}
     executor = begin()
-    for one in specs:
-        executor.submit(one)
-    found = collect(executor, 1)
+    busy(executor, specs, found, lambda: found)
     assert executor.capacity == 2
     node = add(num_cpus=2)
-    while not (actor := process_of(node, "ray::Site")) or executor.capacity < 4:
-        collect_into(found, executor, len(found) + 1)
+    busy(executor, specs, found, lambda: executor.capacity == 4)
+    actor = process_of(node, "ray::Site")
     os.kill(actor, signal.SIGSTOP)  # so that it has something to do when it ends
     left = below(actor)
     os.kill(actor, signal.SIGKILL)
     assert gone(left), "the workers of an actor end with it"
-    collect_into(found, executor, len(found) + 4)
+    count = len(found)
+    busy(executor, specs, found, lambda: len(found) >= count + 4)
     os.kill(raylet(node), signal.SIGKILL)
+    busy(executor, specs, found, lambda: executor.capacity == 2)
     collect_into(found, executor, len(specs))
     assert list(executor.completed(0.3)) == []
     assert any("was lost" in note for note in executor.notes())

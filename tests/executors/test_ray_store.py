@@ -12,6 +12,7 @@ import pytest
 
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings
+from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
 from crashhunt.executors.ray._store import Store
@@ -93,6 +94,19 @@ def test_a_place_is_removed_by_whoever_comes_after_its_owner(tmp_path):
     assert not list((tmp_path / "store").iterdir())
 
 
+def test_the_folder_of_a_cluster_is_removed_by_whoever_comes_after_its_owner(tmp_path):
+    mine, left = Folder(tmp_path), Folder(tmp_path)
+    heir = os.dup(left.fileno())  # as a process has it that was started
+    left._lock.close()  # as when its process is killed
+    (tmp_path / "chr-other").mkdir()
+    Folder(tmp_path).remove()
+    assert left.path.exists(), "somebody still uses it"
+    os.close(heir)
+    Folder(tmp_path).remove()
+    mine.remove()
+    assert [path.name for path in tmp_path.iterdir()] == ["chr-other"], "which is not of ours"
+
+
 def test_a_folder_of_somebody_else_is_not_used(tmp_path):
     (tmp_path / "open").mkdir(mode=0o777)
     (tmp_path / "open").chmod(0o777)
@@ -117,7 +131,7 @@ def test_trials_at_a_time_are_divided_evenly(free, wanted, expected):
 
 def roster(**slots):
     found = Roster()
-    found.nodes = {name: Node(name, name, count, None, ready=True) for name, count in slots.items()}
+    found.nodes = {name: Node(name, name, name, count, None, ready=True) for name, count in slots.items()}
     return found
 
 
@@ -146,10 +160,10 @@ def test_what_was_on_a_lost_node_runs_again_and_what_ends_every_node_in_the_end_
     assert given == {"a": [0, 2], "b": [1, 3]}
     assert found.lose(found.nodes["a"]) == []
     assert [trial.number for trial in found.waiting] == [0, 2, 4]
-    found.nodes["a"] = Node("a", "a", 1, None, ready=True)
+    found.nodes["a"] = Node("a", "a", "a", 1, None, ready=True)
     assert numbers(found.assign()) == {"a": [0, 2]}
     assert found.lose(found.nodes["a"]) == []
-    found.nodes["a"] = Node("a", "a", 1, None, ready=True)
+    found.nodes["a"] = Node("a", "a", "a", 1, None, ready=True)
     assert numbers(found.assign()) == {"a": [0]}, "0 has been lost twice, and is alone now"
     assert numbers(found.assign()) == {}, "nobody joins it, and 2 waits for a node of its own"
     (culprit,) = found.lose(found.nodes["a"])

@@ -20,7 +20,11 @@ TOKEN = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or i
 """What to do about a token that is asked for."""
 _ANSWER_S = 5.0
 _HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and no settings of ours
-_FRAME, _KIND, _SETTINGS = 9, 3, 4  # bytes of a frame's head, the place of its kind there, and the first kind that is sent
+_FRAME, _KIND, _SETTINGS = (
+    9,
+    3,
+    4,
+)  # bytes of a frame's head, the place of its kind there, and the first kind that is sent
 _START = "start one with 'ray start --head', or give the address of one: --executor ray:HOST:PORT"
 
 

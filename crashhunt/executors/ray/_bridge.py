@@ -6,6 +6,7 @@ here none of that reaches the hunt. The hunt tells it by a socket what to run, a
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -30,6 +31,7 @@ from crashhunt.executors.ray._work import unpacked
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
+    from crashhunt.executors.ray._cluster import Found
     from crashhunt.executors.ray._messages import BridgeJob, Ended, FromBridge, News, NodeJob, ToBridge
 
 __all__ = ["main"]
@@ -38,6 +40,8 @@ _LOOK_EVERY_S = 1.0  # which nodes there are
 _WAIT_S = 0.2  # for a node to answer, before somebody else is looked at
 _TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
 _FREE_S = 3.0  # for CPUs to become free that somebody else has just left
+_START_S = 30.0  # for an actor to be where it should stand; then whoever came before it has the CPUs
+_LOOKS = 3  # that show free CPUs, before a node that takes part runs more: Ray is late to say what has been taken
 _CLOSE_S = 1.5  # for nodes to end everything; then they are killed
 _LOSSES = 3  # of a node without a trial between
 
@@ -77,8 +81,11 @@ class Bridge:
         self._digest = self._parcel.digest()
         self._lock = threading.RLock()
         self._roster = Roster()
-        self._refused: dict[str, str] = {}  # node to why
+        self._refused: dict[str, str] = {}  # machine to why
         self._losses: dict[str, int] = {}
+        self._free: dict[str, int] = {}  # machine to looks that have shown free CPUs
+        self._patience: dict[str, float] = {}  # machine to s
+        self._parts = itertools.count()
         self._maps: dict[str, bytes] = {}
         self._began = time.monotonic()
         self._looked = self._told = 0.0
@@ -91,21 +98,25 @@ class Bridge:
         """Work until the hunt wants no more."""
         threading.Thread(target=self._listen, daemon=True).start()
         while not self._closing:
-            with self._lock:
-                self._look_for_nodes()
-                self._hand_out()
-                self._tell_figures()
-                asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
-            if not asked:
-                time.sleep(_WAIT_S / 2)
-                continue
-            for answer in self._cluster.answered(list(asked), _WAIT_S):
-                with self._lock:
-                    if asked[answer].answer is answer and not self._closing:
-                        self._hear(asked[answer])
+            self.turn()
         with self._lock:
             ready = [node for node in self._roster.nodes.values() if node.ready]
             self._cluster.close([node.actor for node in self._roster.nodes.values()], ready, _CLOSE_S)
+
+    def turn(self, wait_s: float = _WAIT_S) -> None:
+        """See who is there, have them work, and hear what they answer, waiting so long for a first one."""
+        with self._lock:
+            self._look_for_nodes()
+            self._hand_out()
+            self._tell_figures()
+            asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
+        if not asked:
+            time.sleep(wait_s / 2)
+            return
+        for answer in self._cluster.answered(list(asked), wait_s):
+            with self._lock:
+                if asked[answer].answer is answer and not self._closing:
+                    self._hear(asked[answer])
 
     def _listen(self) -> None:
         """Take what the hunt wants, also while nodes are waited for."""
@@ -137,18 +148,17 @@ class Bridge:
         self._looked = time.monotonic()
         alive = self._cluster.nodes()
         for node in list(self._roster.nodes.values()):
-            if node.id not in alive:
+            if node.machine not in alive:
                 self._lose(node)
+            elif self._is_too_late(node):
+                self._give_up(node)
         able = {found.id: found for found in alive.values() if found.cpus > 0}
         taken = sum(node.slots for node in self._roster.nodes.values())
-        free = {
-            found.id: found.free
-            for found in able.values()
-            if found.id not in self._refused and found.id not in self._roster.nodes
-        }
-        wanted = self._job["parallel"] - taken if self._job["parallel"] else None
-        for name, slots in shares(free, wanted).items():
-            node = Node(name, able[name].name, slots, self._cluster.stand(name, slots))
+        free = {found.id: self._room(found) for found in able.values() if found.id not in self._refused}
+        wanted = max(0, self._job["parallel"] - taken) if self._job["parallel"] else None
+        for machine, slots in shares(free, wanted).items():
+            name, now = f"{machine}-{next(self._parts)}", time.monotonic()
+            node = Node(name, machine, able[machine].name, slots, self._cluster.stand(machine, slots), now)
             self._roster.nodes[name] = node
             self._ask(node, "differs", self._job["versions"], self._job["code"])
         if self._roster.nodes:
@@ -168,6 +178,28 @@ class Bridge:
         if self._ever_ready and not self._alone:
             self._alone = True
             self._say(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
+
+    def _room(self, found: Found) -> int:
+        """How many trials more a machine can run."""
+        parts = self._roster.parts(found.id)
+        if not parts:
+            return found.free
+        settled = found.free > 0 and all(node.ready for node in parts)
+        self._free[found.id] = self._free.get(found.id, 0) + 1 if settled else 0
+        return found.free if self._free[found.id] >= _LOOKS else 0
+
+    def _is_too_late(self, node: Node) -> bool:
+        """Whether an actor still waits for CPUs that were free."""
+        patience = self._patience.get(node.machine, _START_S)
+        first = node.doing == "differs" and time.monotonic() - node.stood > patience
+        return first and self._cluster.waits(node.actor)
+
+    def _give_up(self, node: Node) -> None:
+        """Take back an actor that stands nowhere; the next one has more patience, as it may have been about to."""
+        self._patience[node.machine] = 2 * self._patience.get(node.machine, _START_S)
+        self._roster.lose(node)
+        self._cluster.kill(node.actor)
+        self._began = time.monotonic()  # Ray takes a moment to say that what it had is free
 
     def _ask(self, node: Node, what: str, *arguments: Any) -> None:
         node.doing, node.answer = what, self._cluster.ask(node.actor, what, *arguments)
@@ -211,7 +243,7 @@ class Bridge:
             self._maps[node.id] = news.map
         found = [ended for ended in news.ended if self._roster.ended(node, ended.ticket)]
         if found:
-            self._losses.pop(node.id, None)
+            self._losses.pop(node.machine, None)
             self._tell_figures(now=self._roster.idle)  # before the last result, after which nobody listens
         for ended in found:
             if ended.files:
@@ -243,13 +275,13 @@ class Bridge:
         culprits = self._roster.lose(node)
         self._tell_figures(now=True)
         self._cluster.kill(node.actor)
-        self._losses[node.id] = 0 if culprits else self._losses.get(node.id, 0) + 1
-        if self._losses[node.id] >= _LOSSES:
+        self._losses[node.machine] = 0 if culprits else self._losses.get(node.machine, 0) + 1
+        if self._losses[node.machine] >= _LOSSES:
             why = f"{node.name}: its process was ended {_LOSSES} times before a trial was done"
             if self._job["address"] and not self._ever_ready and os.environ.get("RAY_AUTH_MODE") == "token":
                 why += ", as happens with RAY_AUTH_MODE=token here and not on the cluster"
-            self._refused[node.id] = why
-            self._say(note=f"node {self._refused[node.id]}; it takes no part any more")
+            self._refused[node.machine] = why
+            self._say(note=f"node {self._refused[node.machine]}; it takes no part any more")
         elif node.ready:
             again = f" with {count} trial{'s' * (count != 1)}, to be run again" if count and not culprits else ""
             self._say(note=f"node {node.name} was lost{again}")
@@ -263,7 +295,7 @@ class Bridge:
 
     def _refuse(self, node: Node, why: str) -> None:
         """Go on without a node that cannot run trials."""
-        self._refused[node.id] = f"{node.name}: {why}"
+        self._refused[node.machine] = f"{node.name}: {why}"
         for trial in node.running.values():
             trial.losses -= 1  # it is not to blame
         self._roster.lose(node)
@@ -276,4 +308,4 @@ class Bridge:
     def _tell_figures(self, *, now: bool = False) -> None:
         if now or time.monotonic() - self._told > _LOOK_EVERY_S:
             self._told = time.monotonic()
-            self._say(nodes=[node.figures() for node in self._roster.nodes.values() if node.ready])
+            self._say(nodes=self._roster.figures())

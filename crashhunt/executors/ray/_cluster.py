@@ -123,6 +123,15 @@ class Cluster:
         strategy = self._affinity(node_id=node, soft=False)
         return self._kind.options(num_cpus=slots, scheduling_strategy=strategy).remote()
 
+    def waits(self, actor: Any) -> bool:
+        """Whether an actor stands nowhere yet: somebody else has the CPUs, or its process takes long to start."""
+        from ray._private.state import actors  # of which there is no public form
+
+        with suppress(Exception):
+            found = actors(actor._actor_id.hex())
+            return bool(found) and not (found.get("Address") or {}).get("IPAddress")
+        return False
+
     def ask(self, actor: Any, what: str, *arguments: Any) -> Any:
         """Call a method of an actor; return where its answer will be."""
         return getattr(actor, what).options(concurrency_group=_ANSWERS).remote(*arguments)
@@ -185,7 +194,7 @@ def _greet(address: str) -> None:
     Raises:
         UnreachableError: it does not.
     """
-    from ray._raylet import GcsClient  # of which there is no public form
+    from ray._raylet import GcsClient  # type: ignore[attr-defined]  # of which there is no public form
 
     said: queue.SimpleQueue[Exception | None] = queue.SimpleQueue()
 
@@ -211,7 +220,7 @@ def _greet(address: str) -> None:
         )
     raise UnreachableError(
         f"what answers at {address} is not the head of a Ray cluster: {_in_short(error)}",
-        fix="give the address that 'ray start --head' has printed, with its port, which is 6379 unless you chose another",
+        fix="give the address that 'ray start --head' has printed; its port is 6379 unless another was chosen",
     )
 
 

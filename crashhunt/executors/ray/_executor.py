@@ -7,10 +7,8 @@ import json
 import os
 import platform
 import select
-import shutil
 import socket
 import subprocess
-import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +19,7 @@ from crashhunt.base.keeper import Kept
 from crashhunt.executors._notes import Notes
 from crashhunt.executors._protocol import NodeFigures
 from crashhunt.executors.ray._address import cluster_of, require_ray, silent
+from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel
 from crashhunt.executors.ray._site import code_digest
 from crashhunt.recording import BlackBoxHeader, Phase
@@ -40,7 +39,6 @@ _RECEIVED = 1 << 18  # bytes at a time
 _CLOSE_S = 3.0  # for the bridge to end what runs on the nodes
 _RETRY_S = 3.0  # between looks whether a cluster that was lost is back
 _LOSSES = 3  # of a cluster of the hunt's own, without a trial between
-_LONGEST = 40  # characters of a folder in which Ray can make its sockets
 _numbers = itertools.count()
 
 
@@ -83,7 +81,7 @@ class RayExecutor:
         self._lost_at = 0.0
         self._ever_up = False
         self._closed = False
-        self._temporary: str | None = None
+        self._folder: Folder | None = None
         self._kept: Kept | None = None
         self._control: socket.socket | None = None
         self._log = Path()
@@ -153,14 +151,14 @@ class RayExecutor:
         number = next(_numbers)
         scratch = self._settings.scratch
         job, self._log = scratch / f"ray-{number}.json", scratch / f"ray-{number}.log"
-        self._temporary = None if self._address else _short_folder()
+        self._folder = None if self._address else Folder()
         content: BridgeJob = {
             "settings": self._settings.to_json(),
             "parallel": self._parallel,
             "recycle_after": self._recycle_after,
             "address": self._address,
             "cpus": self._parallel or len(os.sched_getaffinity(0)),
-            "temporary": self._temporary,
+            "temporary": None if self._folder is None else str(self._folder.path),
             "versions": {"machine": platform.machine(), **versions()},
             "code": code_digest(),
             "resumed": self._ever_up,
@@ -172,7 +170,7 @@ class RayExecutor:
                 "crashhunt.executors.ray._bridge",
                 [str(theirs.fileno()), str(job)],
                 environment={**os.environ, **_QUIET, **self._environment},
-                inherited=[theirs.fileno()],
+                inherited=[theirs.fileno(), *([] if self._folder is None else [self._folder.fileno()])],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -271,9 +269,9 @@ class RayExecutor:
         if self._control is not None:
             self._control.close()
             self._control = None
-        if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
-            self._temporary = None
+        if self._folder is not None:
+            self._folder.remove()
+            self._folder = None
 
 
 # Nothing goes to the makers of Ray, and it gives a lost head up soon: the hunt looks for it again.
@@ -284,9 +282,3 @@ _QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "PYTHONUNBUFFERED": "1",
 }
-
-
-def _short_folder() -> str:
-    """A folder in which Ray can make its sockets, whose names must not be long."""
-    folder = tempfile.gettempdir()
-    return tempfile.mkdtemp(prefix="chr-", dir=folder if len(folder) <= _LONGEST else "/tmp")

@@ -46,13 +46,15 @@ class Trial:
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """A machine that takes part.
+    """A machine that takes part, or a part of one whose CPUs became free one after another.
 
     Args:
-        id: Ray's.
-        name: for people.
+        id: of this part.
+        machine: Ray's.
+        name: of the machine, for people.
         slots: how many trials at a time.
         actor: that stands there.
+        stood: since when, as of `time.monotonic`.
         doing: what it was asked last, and has not answered yet.
         answer: where its answer to that will be.
         ready: whether it runs trials.
@@ -62,9 +64,11 @@ class Node:
     """
 
     id: str
+    machine: str
     name: str
     slots: int
     actor: Any
+    stood: float = 0.0
     doing: str = ""
     answer: Any = None
     ready: bool = False
@@ -72,11 +76,16 @@ class Node:
     done: int = 0
     since: float = 0.0
 
-    def figures(self) -> Figures:
-        """Return what people want to know about it."""
+    @property
+    def has_room(self) -> bool:
+        """Whether it can be given a trial more."""
+        return self.ready and len(self.running) < _AHEAD * self.slots
+
+    @property
+    def rate_per_s(self) -> float:
+        """How many trials have ended a second, by the clock of this machine here."""
         elapsed_s = time.monotonic() - self.since if self.ready else 0.0
-        rate = self.done / elapsed_s if elapsed_s > 0 else 0.0
-        return {"name": self.name, "parallel": self.slots, "trials": self.done, "rate_per_s": rate}
+        return self.done / elapsed_s if elapsed_s > 0 else 0.0
 
 
 class Roster:
@@ -96,17 +105,37 @@ class Roster:
         """Whether there is nothing to do."""
         return not self.waiting and not any(node.running for node in self.nodes.values())
 
+    def figures(self) -> list[Figures]:
+        """Return what people want to know about the machines that are ready."""
+        found: dict[str, Figures] = {}
+        for node in self.nodes.values():
+            if node.ready:
+                none: Figures = {"name": node.name, "parallel": 0, "trials": 0, "rate_per_s": 0.0}
+                told = found.setdefault(node.machine, none)
+                told["parallel"] += node.slots
+                told["trials"] += node.done
+                told["rate_per_s"] += node.rate_per_s
+        return list(found.values())
+
+    def parts(self, machine: str) -> list[Node]:
+        """Return the parts of a machine that take part."""
+        return [node for node in self.nodes.values() if node.machine == machine]
+
     def assign(self) -> dict[Node, list[Trial]]:
         """Give trials that wait to nodes, in their order, each to the one that has least to do; return who got what."""
         given: dict[Node, list[Trial]] = {}
+        kept = {node.machine for node in self.nodes.values() for trial in node.running.values() if trial.alone}
         while self.waiting:
             alone = self.waiting[0].alone
-            free = [node for node in self.nodes.values() if node.ready and _has_room(node, alone=alone)]
+            busy = {node.machine for node in self.nodes.values() if node.running} if alone else kept
+            free = [node for node in self.nodes.values() if node.has_room and node.machine not in busy]
             if not free:
                 break
             node = min(free, key=lambda node: len(node.running) / node.slots)
             trial = self.waiting.popleft()
             node.running[trial.ticket] = trial
+            if alone:
+                kept.add(node.machine)
             given.setdefault(node, []).append(trial)
         return given
 
@@ -155,9 +184,3 @@ def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:
 
 def _still(left: Mapping[str, int]) -> Iterable[str]:
     return (node for node, count in left.items() if count > 0)
-
-
-def _has_room(node: Node, *, alone: bool) -> bool:
-    if alone:
-        return not node.running
-    return len(node.running) < _AHEAD * node.slots and not any(trial.alone for trial in node.running.values())

@@ -1,0 +1,367 @@
+"""The bridge between a hunt and the nodes, with a cluster that is made up, and a clock."""
+
+from __future__ import annotations
+
+import json
+import socket
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors.ray import _bridge
+from crashhunt.executors.ray._cluster import Found, Lost
+from crashhunt.executors.ray._messages import Ended, News
+from crashhunt.scenario import Scenario
+from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
+
+
+class Actor:
+    """One that stands on a machine."""
+
+    def __init__(self, machine, slots):
+        self.machine, self.slots, self.alive, self.asked = machine, slots, True, None
+
+
+class Made:
+    """A cluster of which the test says what there is and what is answered."""
+
+    def __init__(self, address, *, cpus, temporary):
+        self.address = address
+        self.cpus = {}  # machine to CPUs
+        self.others = {}  # machine to CPUs that somebody else has
+        self.actors = []
+        self.late = False  # whether actors wait
+        self.nowhere = set()  # those that do
+        self.ready = {}  # answer to value
+        self.orders = []
+        self.differing = {}  # machine to what
+
+    def nodes(self):
+        taken = {machine: self.others.get(machine, 0) for machine in self.cpus}
+        for actor in self.actors:
+            if actor.alive and actor.machine in taken and actor not in self.nowhere:
+                taken[actor.machine] += actor.slots
+        return {name: Found(name, name, cpus, max(0, cpus - taken[name])) for name, cpus in self.cpus.items()}
+
+    def stand(self, machine, slots):
+        self.actors.append(Actor(machine, slots))
+        if self.late:
+            self.nowhere.add(self.actors[-1])
+        return self.actors[-1]
+
+    def waits(self, actor):
+        return actor in self.nowhere
+
+    def ask(self, actor, what, *arguments):
+        actor.asked = answer = object()
+        if actor in self.nowhere:
+            return answer
+        if what == "differs":
+            self.ready[answer] = self.differing.get(actor.machine, "")
+        elif what in ("begin", "deliver"):
+            self.ready[answer] = "ready" if what == "deliver" else "lacks"
+        return answer
+
+    def order(self, actor, what, *arguments):
+        self.orders.append((actor.machine, what, *arguments))
+
+    def answered(self, answers, wait_s):
+        return [answer for answer in answers if answer in self.ready]
+
+    def value(self, answer):
+        found = self.ready.pop(answer)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def shared(self, make):
+        return make()
+
+    def kill(self, actor, *, after_s=0.0):
+        actor.alive = False
+
+    def news(self, actor, *ended, where=None, notes=(), error=None):
+        """Have an actor answer what it was asked last."""
+        self.ready[actor.asked] = News(list(ended), where, list(notes), error, b"")
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time goes by when somebody lets it."""
+    found = SimpleNamespace(now=100.0, sleep=lambda seconds: None)
+    found.monotonic = lambda: found.now
+    monkeypatch.setattr(_bridge, "time", found)
+    monkeypatch.setattr("crashhunt.executors.ray._roster.time", found)
+    return found
+
+
+@pytest.fixture
+def begin(tmp_path, monkeypatch, clock):
+    """Makes a bridge; returns it, its cluster, and what lets a second go by and returns what the hunt is told."""
+    monkeypatch.setattr(_bridge, "Cluster", Made)
+    scenario = Scenario(simulator="toy", folder=tmp_path)
+    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=tmp_path)
+    ends = []
+
+    def make(parallel=0, resumed=False, **cpus):
+        theirs, ours = socket.socketpair()
+        ends.extend((theirs, ours))
+        job = {
+            "settings": settings.to_json(), "parallel": parallel, "recycle_after": 0, "address": "x:1", "cpus": 2,
+            "temporary": None, "versions": {}, "code": "", "resumed": resumed,
+        }  # fmt: skip
+        bridge = _bridge.Bridge(theirs, job)
+        bridge._cluster.cpus = cpus
+        ours.setblocking(False)
+
+        def after(seconds=1):
+            said = b""
+            for _ in range(seconds):
+                clock.now += 1.01
+                for _ in range(4):  # what is asked next is answered, too
+                    bridge.turn(0)
+                try:
+                    while data := ours.recv(1 << 16):
+                        said += data
+                except BlockingIOError:
+                    pass
+            return [json.loads(line) for line in said.splitlines()]
+
+        return bridge, bridge._cluster, after
+
+    yield make
+    for end in ends:
+        end.close()
+
+
+def submit(bridge, *numbers):
+    specs = [TrialSpec(number, number, {}, {}, max_steps=3).to_json() for number in numbers]
+    bridge._roster.waiting += [_bridge.Trial(100 + spec["number"], spec) for spec in specs]
+
+
+def ended(number, files=None):
+    result = TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, steps=3, wall_s=0.0)
+    line = json.dumps({"ticket": 100 + number, "result": result.to_json()}).encode() + b"\n"
+    return Ended(100 + number, number, line, files or {})
+
+
+def notes(told):
+    return [message["note"] for message in told if "note" in message]
+
+
+def submitted(cluster):
+    return [(machine, [ticket - 100 for ticket, _ in words[0]]) for machine, what, *words in cluster.orders if words]
+
+
+def test_a_node_gets_ready_and_runs_what_is_submitted(begin):
+    bridge, cluster, after = begin(a=2)
+    submit(bridge, 0, 1)
+    told = after()
+    assert {"capacity": 2} in told
+    assert submitted(cluster) == [("a", [0, 1])]
+    cluster.news(cluster.actors[0], ended(1), where={0: [1, 0, 0.0, 1, 1, 2, 0]}, notes=["said"])
+    told = after()
+    assert [message["ticket"] for message in told if "result" in message] == [101]
+    assert notes(told) == ["said"]
+    assert [list(message["where"]) for message in told if "where" in message] == [["0"]]
+    cluster.news(cluster.actors[0], ended(1))
+    assert not [message for message in after() if "result" in message], "it has come back already"
+
+
+def test_what_is_kept_is_written_before_the_hunt_hears_of_it(begin, tmp_path):
+    import zlib
+
+    bridge, cluster, after = begin(a=1)
+    submit(bridge, 0)
+    after()
+    cluster.news(cluster.actors[0], ended(0, {"blackbox.bin": zlib.compress(b"box")}))
+    after()
+    assert (_bridge.scratch_of(tmp_path, 0) / "blackbox.bin").read_bytes() == b"box"
+
+
+@pytest.mark.parametrize(("parallel", "slots"), [(0, [2, 2]), (3, [2, 1]), (2, [2])])
+def test_cpus_that_become_free_later_are_taken_where_there_is_room(begin, parallel, slots):
+    """Not at once: Ray is late to say what has been taken."""
+    _, cluster, after = begin(parallel=parallel, a=4)
+    cluster.others["a"] = 2
+    assert {"capacity": 2} in after()
+    cluster.others.clear()
+    after()
+    assert [actor.slots for actor in cluster.actors] == [2]
+    told = after(9)
+    assert [actor.slots for actor in cluster.actors] == slots
+    figures = [message["nodes"] for message in told if "nodes" in message][-1]
+    assert [(node["name"], node["parallel"]) for node in figures] == [("a", sum(slots))], "one line a machine"
+
+
+def test_a_machine_is_lost_with_all_its_parts(begin):
+    bridge, cluster, after = begin(a=4, b=1)
+    cluster.others["a"] = 3
+    after()
+    cluster.others.clear()
+    after(5)
+    assert {actor.machine: actor.slots for actor in cluster.actors} == {"a": 3, "b": 1}
+    submit(bridge, *range(10))
+    after()
+    del cluster.cpus["a"]
+    told = after()
+    assert [message["capacity"] for message in told if "capacity" in message][-1] == 1
+    assert len([note for note in notes(told) if note.startswith("node a was lost")]) == 2
+    (left,) = bridge._roster.nodes.values()
+    left = [trial.number for trial in left.running.values()] + [trial.number for trial in bridge._roster.waiting]
+    assert sorted(left) == [*range(10)]
+
+
+def test_an_actor_whose_cpus_somebody_else_got_is_taken_back(begin):
+    """Two hunts that begin at once both see the same CPUs free; whoever is late says so, or waits for other nodes."""
+    _, cluster, after = begin(a=2)
+    cluster.late = True
+    after(2)
+    cluster.others["a"] = 2
+    with pytest.raises(UsageError, match="can run nothing: none of its 2 CPUs is free; wait until others are done"):
+        after(40)
+    assert not any(actor.alive for actor in cluster.actors)
+
+
+def test_an_actor_that_takes_long_to_start_is_given_more_time_again(begin):
+    _, cluster, after = begin(a=2)
+    cluster.late = True
+    after(120)
+    assert [actor.alive for actor in cluster.actors] == [False, False, True], "after 30 s, and after 60 s"
+    cluster.late = False
+    cluster.nowhere.clear()
+    cluster.ready[cluster.actors[-1].asked] = ""
+    assert {"capacity": 2} in after()
+
+
+def test_where_no_node_is_left_it_says_so_once_and_goes_on(begin):
+    bridge, cluster, after = begin(a=2)
+    submit(bridge, 0, 1, 2)
+    after()
+    cluster.cpus.clear()
+    told = after(5)
+    assert notes(told) == [
+        "node a was lost with 3 trials, to be run again",
+        "no node of the cluster is left; the hunt waits until one is back",
+    ]
+    assert [message["capacity"] for message in told if "capacity" in message] == [0, 0]
+    cluster.cpus["b"] = 1
+    cluster.orders.clear()
+    assert {"capacity": 1} in after()
+    assert submitted(cluster) == [("b", [0, 1])]
+    cluster.cpus.clear()
+    assert "no node of the cluster is left; the hunt waits until one is back" in notes(after(2)), "and again"
+
+
+def test_a_hunt_that_has_had_nodes_waits_for_them_from_the_start(begin):
+    _, _, after = begin(resumed=True)
+    assert notes(after(20)) == ["no node of the cluster is left; the hunt waits until one is back"]
+
+
+def test_an_actor_that_ends_again_and_again_is_not_asked_any_more(begin, monkeypatch):
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    _, cluster, after = begin(a=1)
+    cluster.differing["a"] = Lost("gone")
+    with pytest.raises(
+        UsageError, match=r"a: its process was ended 3 times .*, as happens with RAY_AUTH_MODE=token here"
+    ):
+        after(5)
+    assert len(cluster.actors) == 3
+
+
+def test_a_loss_between_trials_that_end_is_no_reason_to_give_a_node_up(begin):
+    bridge, cluster, after = begin(a=1)
+    for number in range(5):
+        submit(bridge, number)
+        after()
+        cluster.news(cluster.actors[-1], ended(number))
+        after()
+        cluster.ready[cluster.actors[-1].asked] = Lost("gone")
+        after()
+    assert len(cluster.actors) == 5
+    assert not bridge._refused
+
+
+def test_whoever_ends_every_node_is_told_apart_from_who_was_there(begin):
+    bridge, cluster, after = begin(a=1)
+    submit(bridge, 0, 1)
+    results = []
+    for _ in range(6):
+        told = after()
+        results += [message["result"] for message in told if "result" in message]
+        if not results:
+            cluster.ready[cluster.actors[-1].asked] = Lost("gone")
+    (culprit,) = results
+    assert culprit["spec"]["number"] == 0
+    assert "was lost 3 times, at last with this trial alone on it" in json.dumps(culprit)
+    after()
+    (node,) = bridge._roster.nodes.values()
+    assert [trial.number for trial in node.running.values()] == [1]
+
+
+def test_a_node_that_differs_is_named_once_and_not_asked_again(begin):
+    _, cluster, after = begin(a=1, b=1)
+    cluster.differing["b"] = "libsumo is 1 there and 2 here"
+    assert notes(after(4)) == ["node b takes no part: libsumo is 1 there and 2 here"]
+    assert [actor.machine for actor in cluster.actors] == ["a", "b"]
+    assert ("b", "close") in cluster.orders
+    cluster.cpus.pop("a")
+    with pytest.raises(UsageError, match="no node of the cluster can run the trials: b: libsumo is 1 there"):
+        after(4)
+
+
+def test_what_a_node_cannot_run_runs_elsewhere_and_is_not_to_blame(begin):
+    bridge, cluster, after = begin(a=1, b=1)
+    submit(bridge, *range(4))
+    after()
+    error = CrashhuntError("the disk is full").to_json()
+    cluster.news(cluster.actors[1], error=error)
+    cluster.orders.clear()
+    assert notes(after()) == ["node b takes no part: the disk is full"]
+    (left,) = bridge._roster.nodes.values()
+    assert not any(trial.losses for trial in [*left.running.values(), *bridge._roster.waiting])
+    cluster.news(cluster.actors[0], ended(0), ended(2))
+    after()
+    assert submitted(cluster) == [("a", [1, 3])]
+
+
+def test_an_error_of_ours_over_there_costs_the_node(begin):
+    _, cluster, after = begin(a=1, b=1)
+    after()
+    cluster.ready[cluster.actors[0].asked] = OSError(28, "No space left on device")
+    assert notes(after()) == ["node a takes no part: OSError: [Errno 28] No space left on device"]
+
+
+def test_rates_are_by_the_clock_here(begin):
+    """Nothing that a node says holds a time of day, and what it says of its own clock is not looked at."""
+    bridge, cluster, after = begin(a=1)
+    submit(bridge, 0)
+    after()
+    cluster.news(cluster.actors[0], ended(0), where={0: [1, 0, 1e9, 1, 1, 2, 0]})
+    told = after(9)
+    (figures,) = [message["nodes"] for message in told if "nodes" in message][-1]
+    assert figures["rate_per_s"] == pytest.approx(1 / 9, rel=0.3)
+
+
+def test_what_is_given_up_is_given_up_everywhere(begin):
+    bridge, cluster, after = begin(a=1, b=1)
+    submit(bridge, *range(6))
+    after()
+    lines = SimpleNamespace(makefile=lambda mode: _Lines([json.dumps({"cancel": 1}).encode()]))
+    bridge._control, control = lines, bridge._control
+    bridge._listen()
+    bridge._control, bridge._closing = control, False
+    assert sorted(order for order in cluster.orders if order[1] == "cancel") == [("a", "cancel", 1), ("b", "cancel", 1)]
+    cluster.news(cluster.actors[0], ended(2))
+    assert not [message for message in after() if "result" in message]
+    assert not bridge._roster.waiting
+
+
+class _Lines(list):
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
