@@ -44,7 +44,9 @@ class HuntFigures:
         median_steps_to_crash: NaN where there was no crash.
         median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
             on a collision course.
-        outcomes: how many trials ended how, invalid ones too.
+        outcomes: how many trials ended how, invalid ones too; of all trials.
+        counted: the origin of the trials that all other figures are of, where the hunt guided the rest of them: only
+            of these does it say something how often they crash. Empty where it is all trials.
     """
 
     dir: str
@@ -58,6 +60,7 @@ class HuntFigures:
     median_steps_to_crash: float
     median_time_to_collision_s: float
     outcomes: dict[str, int]
+    counted: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +181,10 @@ def compare(*directories: Path | str) -> Comparison:
 
 
 def _table(hunt: HuntResults) -> NDArray[np.void]:
-    """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers."""
+    """Number, seed, steps, least time to collision, whether it counts and whether it crashed, in order of numbers.
+
+    Of a hunt that guided its trials, those that it did not.
+    """
     crash_on = hunt.settings.crash_on
     fields = [("number", "i8"), ("seed", "i8"), ("steps", "i8"), ("ttc", "f8"), ("valid", "?"), ("crash", "?")]
     with closing(Ledger(hunt.directory / layout.LEDGER)) as ledger:
@@ -187,6 +193,9 @@ def _table(hunt: HuntResults) -> NDArray[np.void]:
             for number, seed, name, steps, ttc in ledger.table()
         )
         table = np.fromiter(rows, fields)
+    if hunt.plain_origin:
+        plain = [row.number for row in hunt.trial_rows() if row.data["spec"].get("origin") == hunt.plain_origin]
+        table = table[np.isin(table["number"], plain)]
     return np.sort(table, order="number")
 
 
@@ -194,7 +203,7 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
     valid = table[table["valid"]]
     crashes = int(valid["crash"].sum())
     crashed, fine = valid[valid["crash"]], valid[~valid["crash"]]
-    why_not = _why_no_interval(hunt, crashes)
+    why_not = _why_no_interval(hunt)
     interval = None
     if not why_not and len(valid):
         from scipy.stats import binomtest
@@ -213,16 +222,17 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
         float(np.median(crashed["steps"])) if crashes else float("nan"),
         float(np.median(fine["ttc"])) if len(fine) else float("nan"),
         hunt.state.outcomes,
+        hunt.plain_origin,
     )
 
 
-def _why_no_interval(hunt: HuntResults, crashes: int) -> str:
+def _why_no_interval(hunt: HuntResults) -> str:
     settings = hunt.settings
-    if not hunt.independent:
+    if not (hunt.independent or hunt.plain_origin):
         return f"the sampler {settings.sampler} does not draw trials independently"
-    if crashes and not settings.run.keep_going:
+    if not settings.run.keep_going and any(hunt.state.outcomes.get(kind) for kind in settings.crash_on):
         return "it stopped at its first crash, and the rate of such a hunt is too high; use --keep-going"
-    if settings.run.distinct and hunt.state.trials_run < settings.trials:
+    if settings.run.distinct and (not settings.trials or hunt.state.trials_run < settings.trials):
         return f"it stopped at {settings.run.distinct} kinds of crashes, and the rate of such a hunt is too high"
     if hunt.state.state not in ("finished", "crashed"):
         return f"it is {hunt.state.state}, and quick trials are over-represented"
@@ -307,7 +317,7 @@ def _same_arguments(first: HuntResults, second: HuntResults, numbers: NDArray[np
 
 def _unpaired_test(first: HuntResults, second: HuntResults, totals: tuple[int, int, int, int]) -> tuple[float, str]:
     a, trials_a, b, trials_b = totals
-    if _why_no_interval(first, a) or _why_no_interval(second, b) or not (trials_a and trials_b):
+    if _why_no_interval(first) or _why_no_interval(second) or not (trials_a and trials_b):
         return 1.0, ""  # their trials say nothing about how often they crash
     from scipy.stats import fisher_exact
 

@@ -35,6 +35,7 @@ class Noted(TypedDict, total=False):
         until: when its time is up, in s since the epoch; None where it has all the time.
         hunt_seed: what its trials are drawn from.
         independent: whether they were drawn independently of each other.
+        plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
         lag: by how many trials a sampler that learns is told late.
         origins: whether its sampler says where trials come from.
         disturb: how often what disturbs its trials; None where nothing does.
@@ -51,6 +52,7 @@ class Noted(TypedDict, total=False):
     until: float | None
     hunt_seed: int
     independent: bool
+    plain_origin: str | None
     lag: int | None
     origins: bool
     disturb: list[str] | None

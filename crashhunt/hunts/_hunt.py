@@ -154,6 +154,7 @@ class Hunt:
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
             independent=sampler.independent and (not finished or draws_independently(before, settings)),
+            plain_origin=sampler.plain_origin or None,
             disturb=list(settings.disturb) or None,
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )

@@ -88,6 +88,12 @@ class HuntResults:
             return draws_independently(ledger.facts(), self.settings)
 
     @cached_property
+    def plain_origin(self) -> str:
+        """The origin of the trials that were drawn independently of all others, where not all were; else empty."""
+        with closing(self._ledger()) as ledger:
+            return ledger.facts().get("plain_origin") or ""
+
+    @cached_property
     def columns(self) -> tuple[str, ...]:
         """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing.
 

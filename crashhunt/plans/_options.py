@@ -98,7 +98,9 @@ class TrialOptions(_Options):
     """What a trial is; `HuntSettings` has them too."""
 
     sampler: str = option(
-        "random", "its name", help="random, halton, sobol, grid or sweep", flag="--sampler", metavar="NAME",
+        "random", "its name",
+        help="random, halton, sobol, grid or sweep; or one that learns: guided, cross-entropy, mutation, cma-es",
+        flag="--sampler", metavar="NAME",
     )  # fmt: skip
     points: int = option(
         10, "values that grid and sweep try of a range without a step", flag="--points", metavar="N",

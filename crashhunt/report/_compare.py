@@ -69,6 +69,11 @@ def describe_comparison(found: Comparison) -> str:
         for hunt in found.hunts
     ]
     lines = aligned([header, *rows], left=1)
+    lines += [
+        f"{hunt.dir}: counted are the trials of origin {hunt.counted}, for the hunt guided all others"
+        for hunt in found.hunts
+        if hunt.counted
+    ]
     lines += [f"{hunt.dir}: no interval, for {hunt.why_not}" for hunt in found.hunts if hunt.why_not]
     for pair in found.pairs:
         lines += ["", pair.verdict]
@@ -113,6 +118,8 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
         rate = hunt.crash_rate if hunt.trials else 0.0
         said = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
+        if hunt.counted:
+            said += f", of origin {html.escape(hunt.counted)} only, as the hunt guided all others"
         if hunt.interval:
             low, high = hunt.interval
             said += f", 95 % interval {low:.2%} to {high:.2%}"
@@ -151,7 +158,7 @@ def _arguments(hunt: HuntResults) -> dict[str, tuple[NDArray[np.generic], NDArra
     crashed: list[bool] = []
     crash_on = hunt.settings.crash_on
     for row in islice(hunt.rows(), _MOST):
-        if row["outcome"] == Outcome.INVALID:
+        if row["outcome"] == Outcome.INVALID or (hunt.plain_origin and row["origin"] != hunt.plain_origin):
             continue
         crashed.append(row["outcome"] in crash_on)
         for name in names:

@@ -13,6 +13,8 @@ from crashhunt.samplers._cube import Cube
 from crashhunt.samplers._protocol import HuntFacts, Proposal
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from crashhunt.samplers._protocol import Space
     from crashhunt.trial import TrialResult
 
@@ -43,12 +45,14 @@ class HaltonSampler:
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return the arguments whose turn it is."""
-        return Proposal(self._cube.arguments(self._point(number % _LONGEST)))
+        return Proposal(self._cube.arguments(self.point(number)))
 
     def tell(self, result: TrialResult) -> None:
         """Nothing to learn."""
 
-    def _point(self, number: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def point(self, number: int) -> NDArray[np.float64]:
+        """Return the point whose turn it is, in the cube of the arguments that vary."""
+        number %= _LONGEST
         if not self._cube.dimensions:
             return np.empty(0)
         if self._points is None:
@@ -61,7 +65,7 @@ class HaltonSampler:
             self._points.reset()
         if number > self._points.num_generated:
             self._points.fast_forward(number - self._points.num_generated)
-        point: np.ndarray[Any, np.dtype[np.float64]] = self._points.random(1)[0]
+        point: NDArray[np.float64] = self._points.random(1)[0]
         return point
 
 

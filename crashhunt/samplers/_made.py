@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError
 from crashhunt.base.plugins import locate
-from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, Proposal, WantsHunt
+from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, WantsHunt
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,6 +65,11 @@ class NamedSampler:
     def independent(self) -> bool:
         """Whether it draws every trial independently of the others; one that does not say so does not."""
         return isinstance(self._sampler, Independent) and self._sampler.independent
+
+    @property
+    def plain_origin(self) -> str:
+        """The origin of the trials that it draws independently of all others; empty where it keeps none apart."""
+        return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
         """Return its proposal.

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialResult
 
-__all__ = ["HuntFacts", "Independent", "Key", "OnlyAsked", "Proposal", "Sampler", "Space", "WantsHunt"]
+__all__ = [
+    "HuntFacts", "Independent", "Key", "OnlyAsked", "PlainStream", "Proposal", "Sampler", "Space",
+    "WantsHunt",
+]  # fmt: skip
 
 Key = tuple[str, str]
 """(agent id, argument name); the agent id is empty for an argument of the scenario."""
@@ -119,3 +122,14 @@ class Independent(Protocol):
     """
 
     independent: bool
+
+
+@runtime_checkable
+class PlainStream(Protocol):
+    """A sampler that learns, and keeps some trials apart that it draws as `RandomSampler` does, whatever it was told.
+
+    Their numbers are fixed beforehand, and ``plain_origin`` is the origin of all of them and of no other. How often
+    they crash says how often the agent does, as the other trials never could.
+    """
+
+    plain_origin: str

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from crashhunt.samplers import Independent, OnlyAsked, Proposal, Sampler, Space
+from crashhunt.samplers import Independent, OnlyAsked, PlainStream, Proposal, RandomSampler, Sampler, Space
 from crashhunt.trial import Outcome, Range, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -81,6 +81,21 @@ class SamplerContract:
         sampler = make(space)
         assert isinstance(sampler.learns, bool)
         assert not isinstance(sampler, OnlyAsked) or isinstance(sampler.only_asked, bool)
+
+    def test_trials_that_it_keeps_apart_are_plain_random_ones(self, make: Make, space: Space) -> None:
+        """At fixed numbers, whatever it was told: how often they crash says how often the agent does."""
+        sampler = make(space)
+        if not isinstance(sampler, PlainStream):
+            return
+        assert sampler.learns
+        plain, never_told, origin = RandomSampler(space), make(space), sampler.plain_origin
+        apart = set()
+        for number, (_, proposal) in enumerate(_talk(sampler)):
+            if proposal.origin == origin:
+                apart.add(number)
+                assert proposal.arguments == _ask(plain, number).arguments
+                assert (proposal.seed, proposal.parent) == (None, None)
+        assert apart == {number for number in range(_TRIALS) if _ask(never_told, number).origin == origin} != set()
 
     def test_independent_draws_of_the_scenario_do_not_depend_on_who_drives(self, make: Make, space: Space) -> None:
         """So that two hunts with one seed have the same traffic; and what learns is not independent."""

@@ -17,7 +17,17 @@ from crashhunt.agents import CarFollowing, IntelligentDriver, KeepLaneWithSpeed,
 from crashhunt.errors import UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose, TrafficEvents
-from crashhunt.samplers import GridSampler, HaltonSampler, RandomSampler, SobolSampler, SweepSampler
+from crashhunt.samplers import (
+    CmaEsSampler,
+    CrossEntropySampler,
+    GridSampler,
+    GuidedSampler,
+    HaltonSampler,
+    MutationSampler,
+    RandomSampler,
+    SobolSampler,
+    SweepSampler,
+)
 from crashhunt.scenario import AgentSetup, Scenario, with_action
 from crashhunt.simulators import MetaAction, SpeedAndLaneChange
 from crashhunt.simulators.toy import ToySimulator
@@ -120,6 +130,19 @@ class TestSobolSampler(TestRandomSampler):
     @pytest.fixture
     def make(self):
         return SobolSampler
+
+
+@pytest.mark.parametrize("kind", [CmaEsSampler, CrossEntropySampler, GuidedSampler, MutationSampler])
+class TestSamplersThatLearn(SamplerContract):
+    @pytest.fixture
+    def make(self, kind):
+        if kind is CmaEsSampler:
+            pytest.importorskip("cmaes")
+        return kind
+
+    @pytest.fixture
+    def space(self):
+        return SPACE
 
 
 class TestSweepSampler(SamplerContract):

@@ -7,6 +7,7 @@ from contextlib import closing
 import crashhunt
 from crashhunt.hunts import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
+from crashhunt.report import describe_comparison
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
@@ -22,6 +23,8 @@ def hunt(
     shift=0.0,
     max_steps=9,
     disturb=(),
+    plain=None,
+    **run,
 ):
     """A hunt whose trials below ``crashes`` crash, without running it."""
     path.mkdir()
@@ -34,18 +37,19 @@ def hunt(
         sampler=sampler,
         agents={"ego": AgentSettings(agent="keep-lane", arguments={"speed": ArgumentSpec(spec="4.0")})},
         scenario_arguments={"gap_m": ArgumentSpec(spec=gap, kind="float")},
-        run=RunSettings(keep_going=True),
+        run=RunSettings(**{"keep_going": True, **run}),
         disturb=disturb,
     )
     write_settings(path / "hunt.toml", settings, ["crashhunt"])
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
         for number in range(trials):
-            spec = TrialSpec(
-                number, seed + number, {"ego": {"speed": 4.0}}, {"gap_m": 20 + number + shift}, max_steps=9
-            )
+            origin = "" if plain is None else "random" if number % plain == 0 else "mutation"
+            gap_m = 20 + number + (0 if origin == "random" else shift)
+            spec = TrialSpec(number, seed + number, {"ego": {"speed": 4.0}}, {"gap_m": gap_m}, 9, origin=origin)
             outcome = Outcome.COLLISION if number < crashes else Outcome.SURVIVED
             ledger.record(TrialResult(spec, outcome, steps=9), snapshot="")
-        ledger.enter("all_trials", planned=trials, hunt_seed=seed)
+        facts = {} if plain is None else {"independent": False, "plain_origin": "random", "origins": True}
+        ledger.enter("all_trials", planned=trials, hunt_seed=seed, **facts)
     return path
 
 
@@ -79,3 +83,37 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
 def test_trials_of_another_length_are_no_fair_comparison(tmp_path):
     (pair,) = crashhunt.compare(hunt(tmp_path / "a", 9), hunt(tmp_path / "b", 2, max_steps=5)).pairs
     assert "9 steps to crash in, those of the other 5" in pair.caution
+
+
+def test_of_a_hunt_that_guided_its_trials_only_those_count_that_it_did_not(tmp_path):
+    guided = hunt(tmp_path / "guided", 16, sampler="guided", plain=5, shift=0.5)  # 0, 5, 10 and 15 crash of its eight
+    plain = hunt(tmp_path / "plain", 12)
+    found = crashhunt.compare(guided, plain)
+    first, second = found.hunts
+    assert (first.trials, first.crashes, first.crash_rate, first.counted) == (8, 4, 0.5, "random")
+    assert first.outcomes == {"collision": 16, "survived": 24}
+    assert first.interval is not None
+    assert first.interval[0] < 0.2 < 0.8 < first.interval[1]  # of eight trials, and not of forty
+    assert (second.trials, second.counted) == (40, "")
+    (pair,) = found.pairs  # the same trials, as the same number and seed is the same draw
+    assert (pair.trials, pair.only_first, pair.only_second, pair.both) == (8, 1, 0, 3)
+    assert "guided: counted are the trials of origin random" in describe_comparison(found)
+
+
+def test_a_hunt_that_stopped_at_a_guided_crash_says_nothing_either(tmp_path):
+    """The trials that count have not crashed, but how many there are was up to one that does not."""
+    guided = hunt(tmp_path / "guided", 0, sampler="guided", plain=5, trials=13, keep_going=False)
+    with closing(Ledger(guided / "ledger.sqlite", writable=True)) as ledger:
+        spec = TrialSpec(13, 14, {"ego": {"speed": 4.0}}, {"gap_m": 20}, max_steps=9, origin="mutation")
+        ledger.record(TrialResult(spec, Outcome.COLLISION, steps=9), snapshot="")
+    figures = crashhunt.compare(guided, hunt(tmp_path / "plain", 12)).hunts[0]
+    assert (figures.crashes, figures.interval) == (0, None)
+    assert "it stopped at its first crash" in figures.why_not
+
+
+def test_a_hunt_without_a_last_trial_that_was_to_stop_at_kinds_has_no_interval(tmp_path):
+    stopped = hunt(tmp_path / "stopped", 3, distinct=2)
+    path = stopped / "hunt.toml"
+    path.write_text(path.read_text().replace("trials = 40", "trials = 0"))
+    figures = crashhunt.compare(stopped, hunt(tmp_path / "plain", 12)).hunts[0]
+    assert "it stopped at 2 kinds of crashes" in figures.why_not

@@ -1,0 +1,176 @@
+"""Samplers that learn find what is rare, whatever the arguments are, and never pretend that their trials are random."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+from spaces import are_inside, ask, spaces, spec_of
+
+from crashhunt.errors import UsageError
+from crashhunt.samplers import (
+    CmaEsSampler,
+    CrossEntropySampler,
+    GuidedSampler,
+    HuntFacts,
+    MutationSampler,
+    RandomSampler,
+)
+from crashhunt.space import Choice, Range
+from crashhunt.trial import Outcome, TrialResult
+
+KINDS = [CrossEntropySampler, GuidedSampler, MutationSampler]
+KINDS += [CmaEsSampler] if importlib.util.find_spec("cmaes") else []
+UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
+LAG = 4
+
+
+def hunt(sampler, danger_of, trials, *, keep_going=False, seed=1):
+    """Ask and tell as a hunt does; returns proposals and results, up to the first crash or to the end."""
+    asked, results = [], []
+    for number in range(trials):
+        if number >= LAG:
+            sampler.tell(results[number - LAG])
+        asked.append(ask(sampler, number, seed))
+        danger = danger_of(asked[-1])
+        outcome = Outcome.INVALID if danger is None else Outcome.COLLISION if danger >= 1 else Outcome.SURVIVED
+        results.append(TrialResult(spec_of(number, asked[-1]), outcome, danger=danger))
+        if outcome is Outcome.COLLISION and not keep_going:
+            break
+    return asked, results
+
+
+def values(proposal):
+    return np.array(list(proposal.arguments.values()))
+
+
+def corner(proposal):
+    """A crash in one of 40,000 random trials, in a corner that danger leads to."""
+    return 1.0 if (x := values(proposal)).max() < 1 / 14 else 1.0 - float(np.linalg.norm(x)) / 2.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_rare_is_found_where_danger_leads_to_it(kind):
+    for seed in (1, 2):
+        asked, results = hunt(kind(UNIT, hunt=HuntFacts(seed)), corner, 900, seed=seed)
+        assert results[-1].outcome is Outcome.COLLISION
+        assert asked[-1].origin not in ("", "random")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.too_slow])
+@given(space=spaces, seed=st.integers(0, 2**40), luck=st.integers(0, 2**20))
+def test_whatever_the_arguments_proposals_are_inside(kind, space, seed, luck):
+    dangers = np.random.default_rng(luck)
+
+    def danger_of(proposal):
+        drawn = dangers.random()
+        return None if drawn < 0.1 else 1.0 if drawn > 0.95 else round(drawn, 1)
+
+    asked, results = hunt(kind(space, hunt=HuntFacts(seed)), danger_of, 60, keep_going=True)
+    assert all(are_inside(proposal, space) for proposal in asked)
+    varies = any(known.quantile(0.0) != known.quantile(1.0) for known in space.values())
+    assert {proposal.origin for proposal in asked} == ({"random", "start"} if not varies else {*origins(asked)})
+    for number, proposal in enumerate(asked):
+        assert proposal.parent is None or proposal.parent <= number - LAG
+        if proposal.seed is not None:
+            parent = results[proposal.parent].spec
+            assert proposal.seed == parent.seed
+            assert (results[number].spec.arguments, results[number].spec.scenario_arguments) != (
+                parent.arguments,
+                parent.scenario_arguments,
+            )
+
+
+def origins(asked):
+    return {proposal.origin for proposal in asked}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_fifth_trial_is_the_random_one_of_that_number(kind):
+    asked, _ = hunt(kind(UNIT, hunt=HuntFacts(3)), corner, 300, keep_going=True)
+    plain = RandomSampler(UNIT)
+    for number, proposal in enumerate(asked):
+        assert (proposal.origin == "random") == (number % 5 == 0)
+        if number % 5 == 0:
+            assert proposal.arguments == ask(plain, number).arguments
+
+
+def test_danger_that_says_nothing_gets_probes_only():
+    luck = np.random.default_rng(1)
+    asked, _ = hunt(GuidedSampler(UNIT), lambda _: luck.random() * 0.9, 800)
+    guided = [proposal.origin for proposal in asked[100:]]
+    assert guided.count("halton") > 0.6 * len(guided)
+    asked, _ = hunt(GuidedSampler(UNIT), lambda _: 0.0, 400)
+    assert [proposal.origin for proposal in asked[100:]].count("halton") > 0.6 * 300
+
+
+def test_danger_that_leads_nowhere_never_has_more_than_half():
+    asked, _ = hunt(GuidedSampler(UNIT), lambda proposal: 0.9 - float(np.linalg.norm(values(proposal) - 0.5)) / 2, 800)
+    unguided = [proposal.origin in ("halton", "random") for proposal in asked]
+    assert sum(unguided) > 0.6 * 800
+    assert sum(not one for one in unguided) > 0.15 * 800  # and it does try
+
+
+def test_a_hunt_that_goes_on_looks_for_other_crashes():
+    def two(proposal):
+        x = values(proposal)
+        near = min(np.linalg.norm(x - 0.2), np.linalg.norm(x - 0.8))
+        return 1.0 if near < 0.08 else 0.95 - float(near) / 2
+
+    asked, results = hunt(GuidedSampler(UNIT), two, 1200, keep_going=True)
+    found = [values(one).mean() for one, result in zip(asked, results, strict=True) if result.danger == 1.0]
+    assert min(found) < 0.5 < max(found)
+    assert len(found) < 200
+
+
+def test_only_what_the_hunt_is_after_is_a_crash():
+    """A collision where nobody hunts for one says nothing; one that somebody does is the most there is."""
+    off_road = HuntFacts(1, (Outcome.OFF_ROAD,))
+    for crash_on, learns in ((HuntFacts(1), True), (off_road, False)):
+        sampler = CrossEntropySampler(UNIT, hunt=crash_on)
+        for number in range(60):
+            result = TrialResult(spec_of(number, ask(sampler, number)), Outcome.COLLISION, danger=1.0)
+            sampler.tell(result)
+        assert (ask(sampler, 61).origin == "cross-entropy") is learns
+
+
+def test_a_hunt_without_the_package_is_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cmaes", None)
+    with pytest.raises(UsageError, match=r"needs the package cmaes; pip install 'crashhunt\[search\]'"):
+        CmaEsSampler(UNIT)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_words_and_whole_numbers_are_found_too(kind):
+    space = {("", f"c{index}"): Choice(tuple("abcde")) for index in range(4)} | {("", "n"): Range(1, 10, integer=True)}
+
+    def danger_of(proposal):
+        right = sum(proposal.arguments["", f"c{index}"] == "bdac"[index] for index in range(4))
+        return 1.0 if right == 4 and proposal.arguments["", "n"] > 4 else 0.15 * right
+
+    _, results = hunt(kind(space), danger_of, 3000)
+    assert results[-1].danger == 1.0
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", KINDS)
+def test_learning_takes_at_most_a_millisecond_after_100_000_trials(kind):
+    space = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(10)}
+    sampler, dangers = kind(space), np.random.default_rng(1)
+    proposal = ask(sampler, 1)
+    told = [TrialResult(spec_of(0, ask(RandomSampler(space), n)), Outcome.SURVIVED, danger=0.0) for n in range(500)]
+    for number in range(100_000):
+        result = told[number % 500]
+        spec = replace(result.spec, number=number, origin=("cross-entropy", "halton", "mutation", "cma-es")[number % 4])
+        sampler.tell(replace(result, spec=spec, danger=float(dangers.random()) * 0.99))
+    began = time.process_time()
+    for number in range(100_000, 101_000):
+        proposal = ask(sampler, number)
+        sampler.tell(TrialResult(spec_of(number, proposal), Outcome.SURVIVED, danger=float(dangers.random()) * 0.99))
+    assert time.process_time() - began < 1.0
