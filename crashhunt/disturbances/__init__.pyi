@@ -5,9 +5,11 @@ from ._models import (
     dawdle as dawdle,
     ignore_priority as ignore_priority,
     late_action as late_action,
+    late_merge as late_merge,
     late_observation as late_observation,
     noisy_observation as noisy_observation,
     speed as speed,
+    step_out as step_out,
     stop as stop,
     unseen as unseen,
 )

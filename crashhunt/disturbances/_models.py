@@ -20,9 +20,11 @@ __all__ = [
     "dawdle",
     "ignore_priority",
     "late_action",
+    "late_merge",
     "late_observation",
     "noisy_observation",
     "speed",
+    "step_out",
     "stop",
     "unseen",
 ]
@@ -85,6 +87,17 @@ def speed() -> Choices:
 def cut_in() -> Choices:
     """Somebody from a neighbouring lane changes into the agent's, however small the gap, and may brake there."""
     return Choices("cut_in", _AROUND, {0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, {2.0: 1.0, 4.0: 1.0})
+
+
+def late_merge() -> Choices:
+    """Somebody whose lane ends, beside the agent or ahead, merges at the very end of it, however small the gap."""
+    return Choices("late_merge", _AROUND, {5.0: 1.0, 15.0: 1.0, 30.0: 1.0}, {10.0: 1.0, 20.0: 1.0})
+
+
+def step_out() -> Choices:
+    """Somebody who walks at the roadside steps out onto the road, and turns back in the middle of the agent's way."""
+    places = {"right ahead": 2.0, "left ahead": 1.0}
+    return Choices("step_out", places, {0.8: 1.0, 1.4: 2.0, 2.0: 1.0}, {6.0: 1.0, 10.0: 1.0})
 
 
 def ignore_priority() -> Choices:

@@ -371,7 +371,7 @@ class Hunt:
     def _status(
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
     ) -> HuntStatus:
-        elapsed = time.monotonic() - progress.began
+        elapsed, crashes = time.monotonic() - progress.began, progress.all_crashes
         return HuntStatus(
             phase,
             self.settings.trials,
@@ -381,11 +381,11 @@ class Hunt:
             elapsed,
             progress.nearest,
             dict(workers or {}),
-            len(progress.crashes) + (1 if progress.found else 0),
+            len(crashes),
             progress.nodes,
             *progress.about_kinds(),
             progress.time_left_s,
-            progress.disturbed if self._disturber is not None else None,
+            sum(crash.disturbed for crash in crashes) if self._disturber is not None else None,
         )
 
 

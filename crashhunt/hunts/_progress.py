@@ -38,7 +38,7 @@ class HuntStatus:
         elapsed_s: wall time of this run.
         nearest: the trial that came nearest to a crash without one.
         workers: trial number to where it is.
-        crashes: saved so far.
+        crashes: found so far; all but the last are saved.
         nodes: the machines that take part now; None where there is this one only.
         kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
@@ -106,9 +106,12 @@ class Progress:
         return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
 
     @property
-    def disturbed(self) -> int:
-        """How many of the crashes had disturbances."""
-        return sum(bundle.result.disturbed for bundle in self.crashes)
+    def all_crashes(self) -> tuple[TrialResult, ...]:
+        """Those that are saved, and the one that is to be."""
+        saved = [bundle.result for bundle in self.crashes]
+        if self.found and min(self.found) not in [result.spec.number for result in saved]:
+            saved.append(self.found[min(self.found)])
+        return tuple(saved)
 
     @property
     def time_left_s(self) -> float:

@@ -52,6 +52,8 @@ KINDS: Mapping[str, Kind] = {
     "dawdle": Kind("", "{vehicle} drives {share:.0f} % slower than it did for {long:g} s"),
     "speed": Kind("", "{vehicle} wants to drive {share:.0f} % faster for {long:g} s"),
     "cut_in": Kind("m/s²", "{vehicle} cuts in on {agent} within {long:g} s| and brakes with {strong:.3g} m/s²"),
+    "late_merge": Kind("m", "{vehicle} merges only in the last {strong:.3g} m of its lane, for {long:g} s"),
+    "step_out": Kind("m/s", "{vehicle} steps out onto the road with {strong:.3g} m/s, and is back after {long:g} s"),
     "ignore_priority": Kind("", "{vehicle} heeds neither red lights nor priority for {long:g} s"),
     "late_observation": Kind("s", "{agent} sees everything {strong:g} s late for {long:g} s", of_agent=True),
     "noisy_observation": Kind("", "what {agent} sees is up to {share:.0f} % off for {long:g} s", of_agent=True),

@@ -237,7 +237,16 @@ def test_who_is_not_seen_is_left_out_of_the_observation_and_nothing_else_changes
     assert all((a == b).all() for a, b in zip(plain[:3] + plain[13:], hidden[:3] + hidden[13:], strict=True))
 
 
-RATES = {"unseen": 0.3, "brake": 0.6, "stop": 0.1, "dawdle": 0.2, "speed": 0.4, "cut_in": 0.6, "ignore_priority": 0.3}
+RATES = {
+    "unseen": 0.3,
+    "brake": 0.6,
+    "stop": 0.1,
+    "dawdle": 0.2,
+    "speed": 0.4,
+    "cut_in": 0.6,
+    "ignore_priority": 0.3,
+    "late_merge": 0.4,
+}
 
 
 @pytest.mark.parametrize("name", ["merge", "intersection"])

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import libsumo
 from libsumo import _libsumo as sumo
 
+from crashhunt.simulators.sumo._stepping_out import SteppingOut, roadside
+from crashhunt.trial import steps_of
 from crashhunt.world import is_person
 
 if TYPE_CHECKING:
@@ -26,7 +28,9 @@ _IN_LANE_M, _BESIDE_M, _CROSSING_M = 100.0, 50.0, 80.0  # who is further away th
 _LEFT, _RIGHT, _AHEAD = 0, 1, 2  # bits of SUMO's vehicle.getNeighbors
 _GENTLY = 1.5  # m/s²; how a dawdler slows down
 _NEITHER_RED_NOR_PRIORITY = 7  # speed mode: safe speed and physical limits, and nothing at junctions
+_NOT_AT_ALL = 0  # lane change mode
 _NOT_INTO_OTHERS = 256  # lane change mode: none of its own accord, and a commanded one unless somebody is there
+_FOR_EVER_S = 3600.0  # a command to change lanes holds for so long
 _LATERAL_M = 1.6  # half a lane: who is less to the side is ahead
 
 
@@ -36,17 +40,23 @@ class SumoDisturbances:
     Args:
         controlled: the vehicles that are driven from outside, which are never meant.
         step_length_s: of the simulation.
+
+    Attributes:
+        speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
     """
 
     def __init__(self, controlled: Collection[str], step_length_s: float) -> None:
         self._controlled = controlled
         self._dt = step_length_s
+        self.speeds: dict[str, float] = {}
 
     def whom(self, disturbance: Disturbance, scene: Scene) -> str:
         """Return who is at a place around an agent; empty where nobody is who is not controlled."""
         try:
             if disturbance.what == "ignore_priority":
                 found = self._crossing(disturbance.agent, disturbance.who, scene)
+            elif disturbance.what == "step_out":
+                found = roadside(scene, disturbance.agent, disturbance.who)
             else:
                 found = _at(disturbance.agent, disturbance.who)
         except libsumo.TraCIException:  # the agent has just arrived
@@ -57,6 +67,11 @@ class SumoDisturbances:
         """Command a vehicle; None where it cannot do that."""
         strong = disturbance.how_strong
         try:
+            if disturbance.what == "step_out":
+                steps = steps_of(disturbance.how_long, self._dt)
+                return SteppingOut(vehicle, disturbance.agent, strong, steps, self._dt, self.speeds)
+            if disturbance.what == "late_merge":
+                return _late_merge(vehicle, strong)
             decel = float(sumo.vehicle_getDecel(vehicle))
             if disturbance.what in ("brake", "stop"):
                 return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
@@ -156,6 +171,37 @@ class _CutsIn:
                 sumo.vehicle_setSpeed(self._vehicle, -1.0)
 
 
+class _MergesLate:
+    """Stays in a lane that ends until little of it is left, and then changes as soon as nobody is in the very place."""
+
+    def __init__(self, vehicle: str, target: int, length: float, how_strong: float) -> None:
+        self.how_strong = how_strong
+        self._vehicle = vehicle
+        self._edge = sumo.vehicle_getRoadID(vehicle)
+        self._target = target
+        self._length = length
+        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
+        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_AT_ALL)
+        self._is_waiting = True
+
+    def keep(self) -> None:
+        with _gone():
+            if self._is_waiting and (
+                sumo.vehicle_getRoadID(self._vehicle) != self._edge
+                or self._length - sumo.vehicle_getLanePosition(self._vehicle) <= self.how_strong
+            ):
+                self._is_waiting = False
+                sumo.vehicle_setLaneChangeMode(self._vehicle, _NOT_INTO_OTHERS)
+                if sumo.vehicle_getRoadID(self._vehicle) == self._edge:
+                    sumo.vehicle_changeLane(self._vehicle, self._target, _FOR_EVER_S)
+
+    def end(self) -> None:
+        with _gone():
+            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)
+            if not self._is_waiting:  # the command would hold it in its lane for good
+                sumo.vehicle_changeLane(self._vehicle, sumo.vehicle_getLaneIndex(self._vehicle), 0.0)
+
+
 class _Ignores:
     """Drives on at a junction as if it were not there; SUMO wants the speed commanded for that."""
 
@@ -249,3 +295,17 @@ def _cut_in(vehicle: str, side: int, how_long: float, deceleration: float, dt: f
     if allowed and sumo.vehicle_getVehicleClass(vehicle) not in allowed:
         return None
     return _CutsIn(vehicle, target, deceleration, dt, how_long)
+
+
+def _late_merge(vehicle: str, how_strong: float) -> _MergesLate | None:
+    """Have a vehicle put off that it leaves a lane that ends; None where its lane does not."""
+    lane = sumo.vehicle_getLaneID(vehicle)
+    known = next((one for one in libsumo.vehicle.getBestLanes(vehicle) if one[0] == lane), None)
+    if known is None or not known[3]:
+        return None
+    _, length, _, offset, *_ = known
+    left = length - sumo.vehicle_getLanePosition(vehicle)
+    if left <= 0:
+        return None
+    target = sumo.vehicle_getLaneIndex(vehicle) + (1 if offset > 0 else -1)
+    return _MergesLate(vehicle, target, length, min(how_strong, left))

@@ -44,11 +44,15 @@ class Sight:
         controlled: the vehicles around which to look.
         step_length_s: in s.
         lateral: whether vehicles may be elsewhere than in the middle of a lane.
+        speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
     """
 
-    def __init__(self, controlled: Sequence[str], step_length_s: float, *, lateral: bool) -> None:
+    def __init__(
+        self, controlled: Sequence[str], step_length_s: float, *, lateral: bool, speeds: dict[str, float]
+    ) -> None:
         self._controlled = tuple(controlled)
         self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
+        self._speeds = speeds
         self._high: bool | None = None
         self._bends = Bends(lateral=lateral)
         self._known: dict[str, Actor] = {}
@@ -58,6 +62,7 @@ class Sight:
         """Forget the previous episode; the network is the same."""
         self._known.clear()  # the same id may be another vehicle now
         self._bends.reset()
+        self._speeds.clear()
         self._touched: set[tuple[str, str]] = set()
         self._ids: tuple[str, ...] = ()
         self._persons: tuple[str, ...] = ()
@@ -94,6 +99,8 @@ class Sight:
             points += map(sumo.person_getPosition, persons)
             headings += [(90.0 - angle) * _RADIANS for angle in map(sumo.person_getAngle, persons)]
             speeds += map(sumo.person_getSpeed, persons)
+            for person in self._speeds.keys() & set(persons) if self._speeds else ():
+                speeds[len(ids) + persons.index(person)] = self._speeds[person]
             lanes = (*lanes, *map(sumo.person_getLaneID, persons)) if lanes else ()
         heights: list[float] = []
         grades: list[float] = []

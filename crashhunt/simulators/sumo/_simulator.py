@@ -68,13 +68,18 @@ class SumoSimulator:
         # Without these options of SUMO a vehicle is always in the middle of a lane.
         options = scenario.table(SumoSetup).options
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
-        self._sight = Sight(tuple(scenario.agents), scenario.step_length_s, lateral=self._lateral)
+        self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
+        self._sight = Sight(
+            tuple(scenario.agents),
+            scenario.step_length_s,
+            lateral=self._lateral,
+            speeds=self._disturbances.speeds,
+        )
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
-        self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
         self._left_out: LeftOut | None = None
 
     told_events = BACKEND.told_events
