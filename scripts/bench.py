@@ -14,6 +14,7 @@ import time
 from collections import deque
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +60,9 @@ def folder() -> Iterator[Path]:
 def in_child(function: str, *arguments: str) -> dict[str, float]:
     """Run a function of this module in a process of its own: libsumo is one simulation per process."""
     done = subprocess.run(
-        [sys.executable, __file__, "--child", function, *arguments], check=True, stdout=subprocess.PIPE
-    )
+        [sys.executable, __file__, "--child", function, *arguments], check=True, stdout=subprocess.PIPE,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -243,6 +245,61 @@ def bench_waves() -> Iterator[Figure]:
     theirs = trials / (time.monotonic() - began)
     note = f"{60 * ours:.0f} against {60 * theirs:.0f} trials a minute, {steps} steps each"
     yield Figure("waves_ratio", ours / theirs, "x", "higher", 5.0, note)
+
+
+def bench_warmup() -> Iterator[Figure]:
+    """Trials in a few traffics, from one warm-up of each and from one of their own; and what a copy costs."""
+    steps, few, many = 85, 12, 112
+    for scenario, target in (("loop", 2.5), ("merge", None)):
+        costs: dict[str, list[float]] = {"0": [], "8": []}
+        for _ in range(2):
+            for copies, spent in costs.items():
+                wall_s = []
+                for trials in (few, many):
+                    with folder() as place:
+                        options = (*QUIET, "--crash-on", "hang", "--scenario", scenario, "--seeds", "4")
+                        found = hunt(place / "h", 1, trials, steps, *options, "--warm-copies", copies)
+                        wall_s.append(found["wall_s"])
+                spent.append((wall_s[1] - wall_s[0]) / (many - few))
+        alone, shared = (statistics.fmean(spent) for spent in costs.values())
+        note = (
+            f"{60 / shared:.0f} against {60 / alone:.0f} trials a minute on {scenario}, {steps} steps each, one worker"
+        )
+        yield Figure(f"warmup_{scenario}", alone / shared, "x", "higher", target, note)
+    found = in_child("child_fork")
+    yield Figure("fork", found["ms"], "ms", "lower", None, "CPU time of a copy on loop, its end included")
+    yield Figure("fork_probe", found["probe_ms"], "ms", "lower", None, "the same, with 50 steps in the copy")
+
+
+def child_fork() -> dict[str, float]:
+    """What a copy of an episode costs."""
+    from crashhunt.agents import KeepLaneWithSpeed
+    from crashhunt.episode import Episode
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.trial import TrialSpec
+
+    scenario, copies = load_scenario("loop"), 50
+    found = {}
+    with folder() as stage:
+        simulator = SumoSimulator(scenario, stage)
+        spec = TrialSpec(0, 1, {}, argument_values(scenario), max_steps=1000)
+        made = KeepLaneWithSpeed(5.0)
+        with Episode(spec, simulator=simulator, make_agent=lambda *_: made, forks=True) as episode:
+            episode.start()
+
+            def drive(copy: Episode, steps: int) -> dict[str, object]:
+                for _ in range(steps):
+                    copy.step()
+                return {}
+
+            for name, steps in (("ms", 0), ("probe_ms", 50)):
+                before = sum(os.times()[:4])
+                for _ in range(copies):
+                    if episode.fork(partial(drive, steps=steps), observed=False).answer(60.0) is None:
+                        raise RuntimeError("a copy failed")
+                found[name] = 1e3 * (sum(os.times()[:4]) - before) / copies
+    return found
 
 
 def child_trial(number: str, steps: str) -> dict[str, float]:
@@ -717,6 +774,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "orchestration": bench_orchestration,
     "ceiling": bench_ceiling,
     "waves": bench_waves,
+    "warmup": bench_warmup,
     "help": bench_help,
     "memory": bench_memory,
     "bundle": bench_bundle,

@@ -43,6 +43,7 @@ __all__ = [
     "fork",
     "held",
     "shared_memory",
+    "threads",
     "watchdog",
 ]
 
@@ -68,17 +69,22 @@ class Watchdog:
     """Writes down where a process is at a time limit; its thread stands back while the process is copied.
 
     Attributes:
-        file: where to.
+        file: where to; None where nobody counts.
+        threads: its own.
     """
 
     def __init__(self) -> None:
         self.file: TextIO | None = None
+        self.threads: frozenset[str] = frozenset()
         self._until = 0.0
 
     def arm(self, limit_s: float, file: TextIO) -> None:
         """Begin to count, in s of wall time."""
         self.file, self._until = file, time.monotonic() + limit_s
+        before = threads()
         faulthandler.dump_traceback_later(limit_s, file=file)
+        # The kernel may show it for a while after it was told to end.
+        self.threads = (self.threads & before) | (threads() - before)
 
     def cancel(self) -> None:
         """Let it be."""
@@ -97,8 +103,15 @@ class Watchdog:
             yield
         finally:
             if os.getpid() == owner and self.file is not None:
-                self._until = time.monotonic() + left
-                faulthandler.dump_traceback_later(max(left, 1e-3), file=self.file)
+                self.arm(max(left, 1e-3), self.file)
+
+
+def threads() -> frozenset[str]:
+    """Return the ids of the threads of this process; none elsewhere than on Linux."""
+    try:
+        return frozenset(os.listdir("/proc/self/task"))  # noqa: PTH208 - names are enough
+    except OSError:
+        return frozenset()
 
 
 watchdog = Watchdog()
@@ -289,9 +302,9 @@ def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, i
     Raises:
         CannotForkError: one of them, or something else, has no copy.
     """
-    threads = len(os.listdir("/proc/self/task"))  # noqa: PTH208 - how many is enough
-    if threads > 1:
-        raise CannotForkError(f"threads have no copy, and {threads - 1} run besides the first")
+    others = len(threads() - watchdog.threads) - 1
+    if others > 0:
+        raise CannotForkError(f"threads have no copy, and {others} run{'s' * (others == 1)} besides the first")
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         raise CannotForkError("a graphics card has no copy, and PyTorch uses one")

@@ -1,10 +1,15 @@
-from ._episode import Episode as Episode, MakeAgent as MakeAgent
+from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
 from ._failures import failure_of as failure_of, words_of as words_of
 from ._nearness import Nearness as Nearness
 from ._observer import Observer as Observer
 from ._parts import Braking as Braking, Parts as Parts, require_origin as require_origin, seal as seal
 from ._recorder import Recorder as Recorder
-from ._run import run_episode as run_episode, seed_everything as seed_everything
+from ._run import (
+    generators as generators,
+    run_episode as run_episode,
+    seed_everything as seed_everything,
+    set_generators as set_generators,
+)
 from ._settings import (
     SettingsData as SettingsData,
     WorkerSettings as WorkerSettings,

@@ -30,14 +30,16 @@ if TYPE_CHECKING:
 
     from crashhunt.agents import Agent
     from crashhunt.base.plain import Plain
-    from crashhunt.simulators import Observations, Options, Simulator, StepResult
+    from crashhunt.simulators import Info, Observations, Options, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
-__all__ = ["Episode", "MakeAgent"]
+__all__ = ["Episode", "MakeAgent", "Reset"]
 
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
+Reset = Callable[..., "tuple[Observations, Info]"]
+"""What `Simulator.reset` is: called with ``seed`` and ``options``."""
 
 _ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # nobody writes to it
 
@@ -56,6 +58,7 @@ class Episode:
         crash_on: what ends the episode; a traffic crash or event of another kind is passed over, and it goes on.
         observers: told of everything that happens, in this order.
         forks: whether copies of it may be made: then it notes what is open before the agents are made, as not theirs.
+        reset: what resets the simulator, where it is not the simulator itself.
 
     Attributes:
         spec: which trial.
@@ -83,6 +86,7 @@ class Episode:
         crash_on: Sequence[Outcome] = CRASHES,
         observers: Sequence[Observer] = (),
         forks: bool = False,
+        reset: Reset | None = None,
     ) -> None:
         self.spec = spec
         self.simulator = simulator
@@ -118,6 +122,7 @@ class Episode:
         self._on_end: list[Callable[[TrialResult], TrialResult]] = _told(observers[::-1], "end")
         self._disturbed: Disturbed | None = None
         self._forks = forks
+        self._reset = reset or simulator.reset
         self._held = Held()
 
     def start(self) -> TrialResult | None:
@@ -264,7 +269,7 @@ class Episode:
                 if not offers(simulator, LeavesOut):
                     raise InvalidEpisodeError("the simulator cannot leave anybody out")
                 options["only"] = spec.only
-            self.observations, _ = simulator.reset(seed=spec.seed, options=options)
+            self.observations, _ = self._reset(seed=spec.seed, options=options)
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:

@@ -6,7 +6,7 @@ import random
 import sys
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,14 +18,14 @@ from crashhunt.trial import CRASHES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.episode._episode import MakeAgent
+    from crashhunt.episode._episode import MakeAgent, Reset
     from crashhunt.episode._observer import Observer
     from crashhunt.oracles import Oracle
     from crashhunt.recording import BlackBox
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
-__all__ = ["run_episode", "seed_everything"]
+__all__ = ["generators", "run_episode", "seed_everything", "set_generators"]
 
 
 def run_episode(
@@ -37,6 +37,7 @@ def run_episode(
     oracles: Sequence[Oracle],
     crash_on: Sequence[Outcome] = CRASHES,
     observers: Sequence[Observer] = (),
+    reset: Reset | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -48,6 +49,7 @@ def run_episode(
         oracles: what decides whether a step is a crash.
         crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
         observers: who else is told; after the recorder.
+        reset: what resets the simulator, where it is not the simulator itself.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -59,7 +61,13 @@ def run_episode(
     seed_everything(spec.seed)
     everybody = (Recorder(box, simulator), Nearness(box.take_frames), *observers)
     with Episode(
-        spec, simulator=simulator, make_agent=make_agent, oracles=oracles, crash_on=crash_on, observers=everybody
+        spec,
+        simulator=simulator,
+        make_agent=make_agent,
+        oracles=oracles,
+        crash_on=crash_on,
+        observers=everybody,
+        reset=reset,
     ) as episode:
         result = episode.start()
         while result is None:
@@ -74,3 +82,18 @@ def seed_everything(seed: int) -> None:
     torch = sys.modules.get("torch")
     if torch is not None:
         torch.manual_seed(seed)
+
+
+def generators() -> tuple[Any, ...]:
+    """Return where the generators of the process are."""
+    torch = sys.modules.get("torch")
+    ours = np.random.get_state()  # noqa: NPY002 - agents may use the global generator
+    return random.getstate(), ours, torch.get_rng_state() if torch is not None else None
+
+
+def set_generators(state: tuple[Any, ...]) -> None:
+    """Have the generators of the process go on where they were."""
+    random.setstate(state[0])
+    np.random.set_state(state[1])  # noqa: NPY002
+    if state[2] is not None:
+        sys.modules["torch"].set_rng_state(state[2])

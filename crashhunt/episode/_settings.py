@@ -49,6 +49,7 @@ class SettingsData(TypedDict):
     find_escapes: NotRequired[bool]
     audit: NotRequired[float]
     hunt_seed: NotRequired[int]
+    warm_copies: NotRequired[int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +71,7 @@ class WorkerSettings:
             few times more; only in a fresh process.
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: what decides which.
+        warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
     """
 
     scenario: Scenario
@@ -84,6 +86,7 @@ class WorkerSettings:
     find_escapes: bool = False
     audit: float = 0.0
     hunt_seed: int = 0
+    warm_copies: int = 0
 
     def is_audited(self, result: TrialResult) -> bool:
         """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
@@ -115,6 +118,8 @@ class WorkerSettings:
             "audit": self.audit,
             "hunt_seed": self.hunt_seed,
         }
+        if self.warm_copies:
+            data["warm_copies"] = self.warm_copies
         if requires:
             data["requires"] = requires
         return data
@@ -152,6 +157,7 @@ class WorkerSettings:
             find_escapes=data.get("find_escapes", False),
             audit=data.get("audit", 0.0),
             hunt_seed=data.get("hunt_seed", 0),
+            warm_copies=data.get("warm_copies", 0),
         )
 
 

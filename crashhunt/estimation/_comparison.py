@@ -228,6 +228,8 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
 
 def _why_no_interval(hunt: HuntResults) -> str:
     settings = hunt.settings
+    if settings.seeds:
+        return f"its trials take place in {settings.seeds} traffics (--seeds), and are not independent of each other"
     if not (hunt.independent or hunt.plain_origin):
         return f"the sampler {settings.sampler} does not draw trials independently"
     if not settings.run.keep_going and any(hunt.state.outcomes.get(kind) for kind in settings.crash_on):
@@ -283,6 +285,8 @@ def _counts(table: NDArray[np.void]) -> tuple[int, int]:
 
 
 def _other_traffic(one: HuntSettings, other: HuntSettings) -> str:
+    if shared := one.seeds or other.seeds:
+        return f"trials take place in {shared} traffics (--seeds), and are not independent of each other"
     if one.scenario_digest != other.scenario_digest:
         return "they are of two scenarios, in which the same seed is another traffic"
     differing = [

@@ -123,7 +123,7 @@ def _be_worker(pool: socket.socket, settings: WorkerSettings, parts: Parts | Non
         with pool.makefile("rb") as specs:
             for line in specs:
                 try:
-                    worker = worker or Worker(settings, parts)
+                    worker = worker or Worker(settings, parts, warm_copies=settings.warm_copies)
                     result = worker.run(TrialSpec.from_json(_loads(line)))
                     answer = {"result": result.to_json(), "change": worker.change}
                 except CrashhuntError as error:

@@ -24,8 +24,17 @@ from crashhunt.base.faculties import offers
 from crashhunt.base.files import whole_file
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
-from crashhunt.episode import Braking, Parts, WorkerSettings, run_episode, scratch_of
+from crashhunt.episode import (
+    Braking,
+    Parts,
+    WorkerSettings,
+    generators,
+    run_episode,
+    scratch_of,
+    set_generators,
+)
 from crashhunt.executors._baseline import Baseline
+from crashhunt.executors._warm import WarmCopies
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, TellsNotices, Tidies
 from crashhunt.trial import Outcome
@@ -35,7 +44,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from crashhunt.agents import Agent
-    from crashhunt.simulators import FullBraking, Simulator
+    from crashhunt.episode import Reset
+    from crashhunt.simulators import FullBraking, Info, Observations, Options, Simulator
     from crashhunt.trial import Overruled, TrialResult, TrialSpec, Value
 
 __all__ = [
@@ -71,6 +81,7 @@ class Worker:
     Args:
         settings: of the hunt.
         parts: what has been imported already.
+        warm_copies: for how many traffics it keeps a copy of itself asleep.
 
     Attributes:
         change: what the last trial has changed in this process, in words. Where there is something, the next trial
@@ -78,17 +89,19 @@ class Worker:
         used: whether an agent has run here.
     """
 
-    def __init__(self, settings: WorkerSettings, parts: Parts | None = None) -> None:
+    def __init__(self, settings: WorkerSettings, parts: Parts | None = None, *, warm_copies: int = 0) -> None:
         self.change = ""
         self._noticed: set[str] = set()
         self.used = False
         self._pid = os.getpid()
+        self._is_copy = False
         self._settings = settings
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
         self._folder: Path | None = None
         self._lanes: Sequence[Lane] | None = None  # of the map that all workers share
         self._fresh = 0
+        self._warm = WarmCopies(warm_copies, self._notice) if warm_copies else None
         self._home = Path.cwd()
         adopt_orphans()
         # Ctrl-C reaches the whole terminal; the hunt decides what becomes of its workers. A request to end must work
@@ -112,6 +125,24 @@ class Worker:
         """
         os.chdir(self._home)  # from wherever the last agent has gone
         box, folder = self._prepare(spec)
+        if self._warm is not None:
+            self.used = True
+            known = self._warm.run(spec, box.reserved)
+            if known is not None:
+                self.change = "which processes run" if self._end_strangers() else ""
+                self._folder = None if known.kept else self._folder
+                return known
+        return self._carry_out(spec, box, folder)
+
+    def _carry_out(self, spec: TrialSpec, box: BlackBox, folder: Path, reset: Reset | None = None) -> TrialResult:
+        """Run a trial in this process.
+
+        Args:
+            spec: the trial.
+            box: which records it.
+            folder: of its own.
+            reset: what resets the simulator, where it has been reset already.
+        """
         # Writes down where every thread is, without needing the interpreter; then it is the hunt's turn to act. It
         # counts, as the hunt does, from here on, with what the first trial of a worker has to make.
         watchdog.arm(self._settings.timeout_s, self._stack)
@@ -125,7 +156,9 @@ class Worker:
             files = [scenario.folder / name for name in scenario.files()]
             watched = scenario.backend.watched
             self._baseline = Baseline(self._settings.code, self._settings.scratch, files, watched)
-        self._baseline.begin()
+        if reset is None:
+            self._baseline.begin()
+            reset = self._reset_of(spec, simulator)
         self.used = True
         made = time.monotonic()
         try:
@@ -136,6 +169,7 @@ class Worker:
                 box=box,
                 oracles=self._parts.oracles(),
                 crash_on=self._settings.crash_on,
+                reset=reset,
             )
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
@@ -148,13 +182,53 @@ class Worker:
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)
 
+    def _reset_of(self, spec: TrialSpec, simulator: Simulator) -> Reset | None:
+        """What resets the simulator, and leaves a copy of this process asleep there for further trials."""
+        warm = self._warm
+        if warm is None:
+            return None
+
+        def reset(*, seed: int, options: Options) -> tuple[Observations, Info]:
+            began = time.monotonic()
+            begun = simulator.reset(seed=seed, options=options)
+            took_s = time.monotonic() - began
+            drawn = generators()
+
+            def again(**_given: object) -> tuple[Observations, Info]:
+                set_generators(drawn)
+                return begun
+
+            warm.keep(spec, partial(self._go_on, again), took_s=took_s)
+            assert self._baseline is not None
+            self._baseline.begin()  # the files by which it talks to the copy
+            return begun
+
+        return reset
+
+    def _go_on(self, reset: Reset, spec: TrialSpec, reserved: int) -> TrialResult:
+        """Run a trial in a copy of this process, whose simulator has been reset; it runs no other."""
+        self._pid = os.getpid()
+        self._warm, self._is_copy = None, True
+        folder = scratch_of(self._settings.scratch, spec.number)
+        self._box = BlackBox(folder / layout.BLACK_BOX, begun=reserved)
+        self._write_into(folder)
+        self._folder = folder
+        result = self._carry_out(spec, self._box, folder, reset)
+        with Path(os.devnull).open("wb") as nothing:  # what threads still print is not of the next trial
+            os.dup2(nothing.fileno(), 1)
+            os.dup2(nothing.fileno(), 2)
+        return result
+
     def _tell(self, simulator: Simulator) -> None:
         """Write down what the simulator wants people to know, for the hunt to tell them once."""
         for notice in simulator.notices if offers(simulator, TellsNotices) else ():
-            if notice not in self._noticed:
-                self._noticed.add(notice)
-                with (self._settings.scratch / layout.NOTICES).open("a", encoding="utf-8") as file:
-                    file.write(f"{notice}\n")
+            self._notice(notice)
+
+    def _notice(self, notice: str) -> None:
+        if notice not in self._noticed:
+            self._noticed.add(notice)
+            with (self._settings.scratch / layout.NOTICES).open("a", encoding="utf-8") as file:
+                file.write(f"{notice}\n")
 
     def _stand_aside(self) -> None:
         """Keep the copy of this process that an agent forks from writing into the recording."""
@@ -181,12 +255,19 @@ class Worker:
     def _changed(self, simulator: Simulator) -> str:
         """End what the trial has started; return what else is not as before it."""
         assert self._baseline is not None
-        if end_descendants(self._baseline.children):
+        if self._end_strangers() and not self._is_copy:
             return "which processes run"
+        if self._is_copy:
+            return ""  # nobody comes after it
         if not os.path.samestat(os.fstat(1), self._output) or not os.path.samestat(os.fstat(2), self._output):
             return "standard output"
         _tidy(simulator)
         return self._baseline.change()
+
+    def _end_strangers(self) -> bool:
+        """End what a trial has started; return whether there was anything."""
+        ours = self._warm.processes if self._warm is not None else frozenset()
+        return end_descendants(ours | (self._baseline.children if self._baseline is not None else frozenset()))
 
     def full_braking(self, agent: str) -> FullBraking | None:
         """Return how a vehicle of the last trial brakes as hard as it can, where its simulator says."""
@@ -229,14 +310,7 @@ class Worker:
             if self._box is not None:
                 self._box.close()
             self._box = BlackBox(made / layout.BLACK_BOX)
-            output = os.open(made / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-            os.dup2(output, 1)
-            os.dup2(output, 2)
-            os.close(output)
-            self._output = os.fstat(1)
-            self._stack = (made / layout.STACK).open("w")
-            faulthandler.enable(self._stack)
-            faulthandler.register(signal.SIGUSR1, self._stack)
+            self._write_into(made)
             self._folder = made
         assert self._box is not None
         self._box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
@@ -245,6 +319,17 @@ class Worker:
         os.rename(self._folder, folder)  # noqa: PTH104 - Path.rename builds a path for nothing
         self._folder = folder
         return self._box, folder
+
+    def _write_into(self, folder: Path) -> None:
+        """Have what is printed, and where this process is when it dies, written down there."""
+        output = os.open(folder / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        os.close(output)
+        self._output = os.fstat(1)
+        self._stack = (folder / layout.STACK).open("a")
+        faulthandler.enable(self._stack)
+        faulthandler.register(signal.SIGUSR1, self._stack)
 
 
 def read_map(scratch: Path, trial: Path) -> list[Lane]:

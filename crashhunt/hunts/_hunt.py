@@ -153,7 +153,9 @@ class Hunt:
             planned=settings.trials,
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
-            independent=sampler.independent and (not finished or draws_independently(before, settings)),
+            independent=sampler.independent
+            and not settings.seeds
+            and (not finished or draws_independently(before, settings)),
             plain_origin=sampler.plain_origin or None,
             disturb=list(settings.disturb) or None,
             lag=lag if sampler.learns and settings.run.deterministic else None,
@@ -209,6 +211,7 @@ class Hunt:
             argument_files=snapshot.argument_files,
             timeout_s=run.timeout_s,
             keep_trials=run.keep_trials,
+            warm_copies=run.warm_copies if settings.seeds else 0,
             audit=run.audit,
             hunt_seed=settings.seed,
         )

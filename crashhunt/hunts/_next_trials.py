@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LAG", "Trials", "spec_of"]
 
+_TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
 LAG = 32
 """By how many trials a deterministic hunt tells late: a constant, so that 1 and 16 workers run the same trials."""
 
@@ -142,15 +143,25 @@ def spec_of(
 ) -> TrialSpec:
     """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
 
+    Where the hunt has so many traffics and no more, trials have them in turns: the seed, and what an independent
+    sampler draws for the scenario; what another one proposes for that stays.
+
     Raises:
         CrashhuntError: the sampler fails.
     """
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     seed = int(rng.integers(2**31))
     proposal = sampler.ask(number, rng)
+    values = dict(proposal.arguments)
+    if settings.seeds:
+        turn = number % settings.seeds
+        rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(turn, _TRAFFIC)))
+        seed = int(rng.integers(2**31))
+        if sampler.independent:
+            values |= {key: value for key, value in sampler.ask(turn, rng).arguments.items() if not key[0]}
     arguments: dict[str, dict[str, Value]] = {agent: {} for agent in settings.agents}
     scenario_arguments: dict[str, Value] = {}
-    for (agent, name), value in sorted(proposal.arguments.items()):
+    for (agent, name), value in sorted(values.items()):
         (arguments[agent] if agent else scenario_arguments)[name] = value
     if proposal.seed is not None:
         seed = proposal.seed

@@ -217,11 +217,13 @@ def _disturbed(directory: Path) -> int:
 def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     """Whether every trial of a hunt was drawn independently of the others, as its sampler said when it ran.
 
+    Trials in the same traffic are not.
+
     Args:
         facts: of its ledger.
         settings: of the hunt; before samplers said it, of ours the random one did.
     """
-    return bool(facts.get("independent", settings.sampler == "random"))
+    return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
 
 def this_process() -> Owner:

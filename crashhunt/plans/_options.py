@@ -124,6 +124,12 @@ class TrialOptions(_Options):
         unset="as the scenario says, and nothing where it is silent",
         flag="--disturb", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
+    seeds: int = option(
+        0, "how many traffics there are, each used for many arguments; 0: every trial has its own",
+        help="draw so many traffics (a seed, and the scenario's arguments), and use each for many arguments of the "
+        "agents, from one warm-up",
+        unset="every trial has its own", flag="--seeds", metavar="N", check=at_least(0, zero="every trial has its own"),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,6 +170,11 @@ class RunOptions(_Options):
         1000, "trials after which a worker is replaced; 0 for never",
         help="replace a worker after so many trials; 0: never",
         flag="--recycle-after", metavar="N", check=at_least(0, zero="never"),
+    )  # fmt: skip
+    warm_copies: int = option(
+        8, "with ``seeds``, for how many traffics each worker keeps a warmed-up copy of itself asleep; 0: none",
+        help="with --seeds: for how many traffics each worker keeps a warmed-up copy of itself asleep; 0: none",
+        flag="--warm-copies", metavar="N", check=at_least(0, zero="none"),
     )  # fmt: skip
     audit: float = option(
         0.0, "the share of trials without a crash that are run again in a fresh process, to see that they are the same",

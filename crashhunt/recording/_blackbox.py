@@ -89,15 +89,17 @@ class BlackBox:
 
     Args:
         path: the file to create.
+        begun: how much of it another process has reserved that has begun the next trial there, in bytes; 0 where it is
+            to be created.
 
     Raises:
         RecorderError: the disk is full.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, begun: int = 0) -> None:
         self._path = path
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
-        self._reserved = 0
+        self._file = os.open(path, os.O_RDWR | (0 if begun else os.O_CREAT | os.O_TRUNC), 0o644)
+        self._reserved = begun
         self._mapped = 0
         self._map: mmap.mmap
         self._offset = _FIRST
@@ -112,6 +114,11 @@ class BlackBox:
         except RecorderError:
             os.close(self._file)
             raise
+
+    @property
+    def reserved(self) -> int:
+        """How much of the file there is, in bytes."""
+        return self._reserved
 
     def begin(self, *, pid: int, trial: int, started: float) -> None:
         """Forget the previous trial and open the next."""

@@ -63,7 +63,7 @@ def test_a_copy_and_a_copy_of_it_go_on_to_the_same_bits(ask, scenario):
 def test_what_has_no_copy_is_named(ask):
     assert ask("refused") == {
         "nothing": "",
-        "thread": "threads have no copy, and 1 run besides the first",
+        "thread": "threads have no copy, and 1 runs besides the first",
         "process": "a process that was started has no copy",
         "socket": Words("a connection to others has no copy: socket:"),
         "pipe": Words("a connection to others has no copy: pipe:"),

@@ -24,6 +24,7 @@ def hunt(
     max_steps=9,
     disturb=(),
     plain=None,
+    seeds=0,
     **run,
 ):
     """A hunt whose trials below ``crashes`` crash, without running it."""
@@ -39,6 +40,7 @@ def hunt(
         scenario_arguments={"gap_m": ArgumentSpec(spec=gap, kind="float")},
         run=RunSettings(**{"keep_going": True, **run}),
         disturb=disturb,
+        seeds=seeds,
     )
     write_settings(path / "hunt.toml", settings, ["crashhunt"])
     with closing(Ledger(path / "ledger.sqlite", writable=True)) as ledger:
@@ -78,6 +80,16 @@ def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
             assert (pair.test, pair.counts) == ("fisher", (20, 40, 2, 40))
             assert 0 < pair.p_value < 1e-4
             assert f"{name} crashes less: 20 of 40 trials crash in" in pair.verdict
+
+
+def test_of_trials_that_share_traffics_nothing_is_said_that_takes_them_for_independent(tmp_path):
+    found = crashhunt.compare(hunt(tmp_path / "shared", 20, seeds=5), hunt(tmp_path / "alone", 2))
+    assert found.hunts[0].interval is None
+    assert "its trials take place in 5 traffics" in found.hunts[0].why_not
+    assert found.hunts[1].interval
+    (pair,) = found.pairs
+    assert (pair.trials, pair.test, pair.p_value) == (0, "", 1.0)
+    assert "trials take place in 5 traffics (--seeds)" in pair.verdict
 
 
 def test_trials_of_another_length_are_no_fair_comparison(tmp_path):

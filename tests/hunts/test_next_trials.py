@@ -264,3 +264,27 @@ def test_a_sampler_that_is_none_is_one_clear_line(tmp_path, argument, says):
 def test_what_is_no_sampler_is_told_before_anything_runs(sampler, says):
     with pytest.raises(PluginError, match=says):
         NamedSampler(sampler, settings().space, points=3)
+
+
+def test_trials_take_turns_in_so_many_traffics():
+    chosen = settings("random")
+    sampler = NamedSampler("random", chosen.space, points=10)
+    alone = [spec_of(number, chosen, sampler) for number in range(9)]
+    shared = [spec_of(number, replace(chosen, seeds=3), sampler) for number in range(9)]
+    traffic = [(one.seed, one.scenario_arguments["gap_m"]) for one in shared]
+    assert traffic == traffic[:3] * 3
+    assert len(set(traffic)) == 3
+    assert [one.arguments for one in shared] == [one.arguments for one in alone]
+    more = replace(chosen, seeds=3, trials=1000)
+    assert shared == [spec_of(number, more, sampler) for number in range(9)]
+
+
+def test_what_another_sampler_proposes_for_the_scenario_stays():
+    chosen = settings("grid")
+    sampler = NamedSampler("grid", chosen.space, points=4)
+    alone = [spec_of(number, chosen, sampler) for number in range(16)]
+    shared = [spec_of(number, replace(chosen, seeds=3), sampler) for number in range(16)]
+    assert len({one.seed for one in shared}) == 3
+    assert [(one.arguments, one.scenario_arguments) for one in shared] == [
+        (one.arguments, one.scenario_arguments) for one in alone
+    ]
