@@ -27,6 +27,7 @@ __all__ = [
     "LOG",
     "MANIFEST",
     "MAP",
+    "NEAR_MISSES",
     "NOTICES",
     "PACKAGE",
     "PARAMS",
@@ -52,6 +53,7 @@ LEDGER: Final = "ledger.sqlite"
 REQUEST: Final = "request.json"
 SNAPSHOTS: Final = "snapshots"
 CRASHES: Final = "crashes"
+NEAR_MISSES: Final = "near-misses"
 TRIALS: Final = "trials"
 REPORT: Final = "report.html"
 

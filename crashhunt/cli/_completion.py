@@ -123,9 +123,10 @@ def _outcomes(*, crashes: bool) -> list[str]:
 
 def _crashes(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
-    return (
-        sorted(path.parent.name for path in Path(folder).glob(f"{layout.CRASHES}/*/{layout.CRASH}")) if folder else []
-    )
+    if not folder:
+        return []
+    places = (layout.CRASHES, layout.NEAR_MISSES)
+    return sorted(path.parent.name for place in places for path in Path(folder).glob(f"{place}/*/{layout.CRASH}"))
 
 
 def _runs(parsed_args: argparse.Namespace, **_: object) -> list[str]:

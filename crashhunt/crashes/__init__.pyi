@@ -17,7 +17,11 @@ from ._escape import (
     partner as partner,
     slowing as slowing,
 )
-from ._find import find_bundle as find_bundle, list_bundles as list_bundles
+from ._find import (
+    find_bundle as find_bundle,
+    list_bundles as list_bundles,
+    list_near_misses as list_near_misses,
+)
 from ._judgement import (
     Attempt as Attempt,
     AttemptData as AttemptData,

@@ -110,6 +110,11 @@ class Bundle:
         return self.path.parent.parent
 
     @property
+    def is_near_miss(self) -> bool:
+        """Whether it is a trial without a crash, which was kept because it was dangerous."""
+        return self.result.outcome.category == "no crash"
+
+    @property
     def driver(self) -> str:
         """The agent that it is about; of one that is about none, the first."""
         result = self.result
@@ -160,6 +165,8 @@ class Bundle:
             "digest": plain["digest"],
             "confirmed": self.confirmed,
         }
+        if self.is_near_miss:
+            found["danger"] = plain.get("danger")
         if "log_likelihood" in plain:
             found["disturbed"] = self.result.disturbed
             found["log_likelihood"] = plain["log_likelihood"]
@@ -319,8 +326,10 @@ def write_bundle(
     snapshot: str,
     lanes: Sequence[Lane],
     name: str = "",
+    place: str = layout.CRASHES,
+    confirmed: bool | None = None,
 ) -> Bundle:
-    """Make the bundle of a crash from what its trial left behind.
+    """Make the bundle of a crash, or of a near miss, from what its trial left behind.
 
     Args:
         directory: of the hunt.
@@ -330,20 +339,23 @@ def write_bundle(
         snapshot: the digest of the code that ran.
         lanes: of the map, for whoever looks at the log.
         name: of its folder, where that is not made of the trial's number and the outcome.
+        place: the folder of the directory that it goes into.
+        confirmed: whether a fresh process did the same, where that is known already.
     """
     from crashhunt.recording import foxglove_layout, write_log
 
     name = name or f"{result.spec.number:06d}-{result.outcome}"
-    final, building = directory / layout.CRASHES / name, directory / layout.CRASHES / f".{name}.part"
+    final, building = directory / place / name, directory / place / f".{name}.part"
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)
     recording = Recording(read_black_box(scratch / layout.BLACK_BOX))
+    crash = result if result.outcome.category != "no crash" else None
     metadata = {"trial": str(result.spec.number), "seed": str(result.spec.seed), "outcome": str(result.outcome)}
-    write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=result)
+    write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=crash)
     view = json.dumps(foxglove_layout(recording), indent=1)
     (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
     collect_output(result, scratch, building)
-    bundle = Bundle(final, result, hunt_seed, snapshot, files=files_beside(building))
+    bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
     bundle.write(into=building)
     sync_tree(building)
     shutil.rmtree(final, ignore_errors=True)

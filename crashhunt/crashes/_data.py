@@ -75,6 +75,7 @@ class CrashSummary(TypedDict):
     confirmed: bool | None
     disturbed: NotRequired[bool]
     log_likelihood: NotRequired[float | None]
+    danger: NotRequired[float | None]
 
 
 class ArchiveIndex(TypedDict):

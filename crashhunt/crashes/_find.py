@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 from crashhunt.crashes._bundle import Bundle, read_bundle
 
-__all__ = ["find_bundle", "list_bundles"]
+__all__ = ["find_bundle", "list_bundles", "list_near_misses"]
 
 
 def list_bundles(directory: Path) -> list[Bundle]:
@@ -24,25 +24,33 @@ def list_bundles(directory: Path) -> list[Bundle]:
     return [read_bundle(folder) for folder in _folders(directory)]
 
 
-def _folders(directory: Path) -> list[Path]:
+def list_near_misses(directory: Path) -> list[Bundle]:
+    """Return the near misses of a hunt, the most dangerous first."""
+    found = [read_bundle(folder) for folder in _folders(directory, layout.NEAR_MISSES)]
+    return sorted(found, key=lambda bundle: (-(bundle.result.danger or 0.0), bundle.result.spec.number))
+
+
+def _folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
     """The folders of crashes, also of one that has lost its ``crash.json``."""
-    found = (path for path in (directory / layout.CRASHES).glob(layout.SHOWN) if path.is_dir())
+    found = (path for path in (directory / place).glob(layout.SHOWN) if path.is_dir())
     return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
 
 
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
-    """Return one crash of a hunt: the one that is named, or the one with the fewest steps.
+    """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
+
+    Of a hunt that has near misses only, that is the most dangerous of them.
 
     Args:
         directory: of the hunt, or of the bundle itself.
-        crash: its id, the beginning of it, or its trial's number, with leading zeros or without.
+        crash: its id or that of a near miss, the beginning of it, or its trial's number, with leading zeros or without.
 
     Raises:
         BundleError: there is no such crash.
     """
     if (directory / layout.CRASH).is_file() and not crash:
         return read_bundle(directory)
-    bundles = _readable(directory, crash) if crash else list_bundles(directory)
+    bundles = _readable(directory, crash) if crash else list_bundles(directory) or list_near_misses(directory)[:1]
     if not bundles:
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
@@ -58,7 +66,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
 def _readable(directory: Path, crash: str) -> list[Bundle]:
     """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
     found = []
-    for path in _folders(directory):
+    for path in (*_folders(directory), *_folders(directory, layout.NEAR_MISSES)):
         try:
             found.append(read_bundle(path))
         except BundleError:

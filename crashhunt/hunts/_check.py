@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
@@ -258,7 +258,8 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         bundle = _check_bundle(found, folder)
         if bundle is not None:
             bundles[folder.name] = bundle
-    needed = {bundle.snapshot: bundle.id for bundle in reversed(bundles.values())}
+    near = _check_near_misses(found, hunt)
+    needed = {bundle.snapshot: bundle.id for bundle in (*near, *reversed(bundles.values()))}
     there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
     for name in sorted(there | needed.keys()):
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
@@ -288,6 +289,21 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
     else:
         found.crashes.append(folder.name)
     return bundle
+
+
+def _check_near_misses(found: Checked, hunt: Path) -> list[Bundle]:
+    """Those that are whole; what is lost with one is had again from the ledger."""
+    whole = []
+    for folder in sorted((hunt / layout.NEAR_MISSES).glob(layout.SHOWN)):
+        one = Checked(folder, "crash")
+        bundle = _check_bundle(one, folder)
+        if bundle is not None:
+            whole.append(bundle)
+        fix = "remove it: the same hunt with --near-misses makes it again"
+        for finding in one.findings:
+            lost = f"the near miss {folder.name}"
+            found.findings.append(replace(finding, lost=lost, fix=fix) if finding.damaged else finding)
+    return whole
 
 
 _AGAIN = "crashhunt check --salvage TO leaves it out, and the same hunt runs its trial again there"
@@ -351,6 +367,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
     places = (
         hunt.glob(".*.*"),
         (hunt / layout.CRASHES).glob(".*"),
+        (hunt / layout.NEAR_MISSES).glob(".*"),
         (hunt / layout.SNAPSHOTS).glob(".*"),
         hunt.glob(".scratch"),
     )

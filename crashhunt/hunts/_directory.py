@@ -22,7 +22,16 @@ __all__ = ["HuntDirectory"]
 
 _DIFFERENCES_SHOWN = 4
 # What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
-_OWN = ("snapshots", "crashes", "trials", layout.LEDGER, "ledger.sqlite-wal", "ledger.sqlite-shm", layout.HUNT)
+_OWN = (
+    "snapshots",
+    "crashes",
+    layout.NEAR_MISSES,
+    "trials",
+    layout.LEDGER,
+    "ledger.sqlite-wal",
+    "ledger.sqlite-shm",
+    layout.HUNT,
+)
 _BEFORE = (".lock", ".scratch", ".hunt.")  # what may be there before: of a hunt that could not begin
 
 

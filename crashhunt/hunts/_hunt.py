@@ -20,6 +20,7 @@ from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._ledger import Ledger
+from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
 from crashhunt.hunts._preflight import Preflight, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
@@ -169,6 +170,7 @@ class Hunt:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
+        near = keep_near_misses(self._place, ledger, settings, progress.notes, self._parallel_here, self._stops)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         reason = ""
@@ -189,6 +191,7 @@ class Hunt:
             ledger.traffic_events(),
             progress.audit,
             progress.about_kinds()[0],
+            near,
         )
 
     def _hunt(

@@ -212,19 +212,9 @@ class LedgerReader:
 
         In a ledger of before danger was measured, that with the least time to collision.
         """
-        if "danger" in self._shape.columns["trials"]:
-            # Of two that are equal, the first.
-            most = [
-                row
-                for outcome in ("survived", "finished")
-                for row in self._select(
-                    "SELECT -danger, min(number) FROM trials WHERE outcome = ?1 AND danger = "
-                    "(SELECT max(danger) FROM trials WHERE outcome = ?1) GROUP BY danger",
-                    (outcome,),
-                )
-            ]
-            if most:
-                return self.result(min(most)[1])
+        most = self.most_dangerous(1)
+        if most:
+            return self.result(most[0])
         least = [
             row
             for outcome in ("survived", "finished")
@@ -235,6 +225,24 @@ class LedgerReader:
             )
         ]
         return self.result(min(least)[1]) if least else None
+
+    def most_dangerous(self, count: int) -> list[int]:
+        """Return the numbers of the trials without a crash that were the most dangerous, the greatest danger first.
+
+        Of several that are equal, the first. Those without any, or of which nobody measured it, are none.
+        """
+        if "danger" not in self._shape.columns["trials"]:
+            return []
+        found = [
+            row
+            for outcome in ("survived", "finished")
+            for row in self._select(
+                "SELECT -danger, number FROM trials WHERE outcome = ? AND danger > 0 "
+                "ORDER BY danger DESC, number LIMIT ?",
+                (outcome, count),
+            )
+        ]
+        return [number for _, number in sorted(found)[:count]]
 
     def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
         """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.

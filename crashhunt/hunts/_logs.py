@@ -50,7 +50,8 @@ class LogReader:
             if "state" in self._kinds:
                 yield from self._states()
             yield from self._texts(self._hunt, "")
-        folders = [*(self._hunt / layout.CRASHES).glob("[!.]*"), *(self._hunt / layout.TRIALS).glob("[!.]*")]
+        places = (layout.CRASHES, layout.NEAR_MISSES, layout.TRIALS)
+        folders = [folder for place in places for folder in (self._hunt / place).glob(layout.SHOWN)]
         for folder in sorted(folders, key=lambda folder: folder.name):
             number = folder.name.partition("-")[0]
             if number.isdecimal() and self._trial in (None, int(number)):

@@ -43,6 +43,7 @@ class HuntReportData(TypedDict):
     notes: list[str]
     audit: AuditData | None
     kinds: NotRequired[list[KindData]]
+    near_misses: NotRequired[list[CrashSummary]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class HuntReport:
         events: traffic events of all trials: kind to how many, and in how many trials.
         audit: what came of running trials without a crash again; None where nobody asked for it.
         kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
+        near_misses: that were kept, the most dangerous first.
     """
 
     directory: Path
@@ -76,6 +78,7 @@ class HuntReport:
     events: dict[str, tuple[int, int]] = field(default_factory=dict)
     audit: AuditReport | None = None
     kinds: tuple[Group, ...] | None = None
+    near_misses: tuple[Bundle, ...] = ()
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -95,4 +98,6 @@ class HuntReport:
         }
         if self.kinds is not None:
             found["kinds"] = list(map(kind_data, self.kinds))
+        if self.settings.run.near_misses:
+            found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
         return found

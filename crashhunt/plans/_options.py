@@ -182,6 +182,12 @@ class RunOptions(_Options):
         "the same: 0.02 is one in fifty",
         flag="--audit", metavar="SHARE", check=within(0, 1, "give a share of the trials, from 0 to 1"),
     )  # fmt: skip
+    near_misses: int = option(
+        0, "how many of the most dangerous trials without a crash are kept as bundles of their own",
+        help="keep the N most dangerous trials without a crash as bundles of their own, to be replayed and shown; each "
+        "is run once more for that, at the end",
+        flag="--near-misses", metavar="N", check=at_least(0, zero="none"),
+    )  # fmt: skip
     executor: str = option(
         "pool", "where trials run: its name, and perhaps ``:ARG``",
         help="where trials run: pool (warm processes on this machine), fresh (a new process for each), "

@@ -140,6 +140,8 @@ def _judge(
     # Whoever stopped before the crash does not know whether it would have come.
     if (rerun.code == "current" or rerun.edits) and crashed:
         return "changed", ""
+    if rerun.bundle.is_near_miss:  # there is no crash that could be fixed
+        return "diverged", ""
     if rerun.other_traffic and whole:
         return "not_comparable", _no_fix(rerun)
     if (rerun.code == "current" or rerun.edits) and whole:

@@ -6,6 +6,7 @@ import math
 import shlex
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.text import in_lines
 from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
 from crashhunt.report._groups import describe_groups
@@ -60,6 +61,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         lines += ["", *_describe_crash(bundle)]
     if len(report.crashes) > _SHOWN:
         lines += ["", f"… and {len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"]
+    lines += _near_misses(report, program)
     if report.crashes:
         first = crashes[0]
         command = [program, "replay", str(report.directory)]
@@ -67,6 +69,20 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
             command += ["--crash", first.id]
         lines += ["", f"Replay it:  {shlex.join(command)}"]
     return in_lines(lines)
+
+
+def _near_misses(report: HuntReport, program: str) -> list[str]:
+    """The near misses that were kept, a line each."""
+    if not report.near_misses:
+        return []
+    lines = ["", f"Near misses, kept in {report.directory / layout.NEAR_MISSES}:"]
+    for bundle in report.near_misses[:_SHOWN]:
+        result = bundle.result
+        lines.append(f"  {bundle.id}  danger {result.danger or 0.0:.2f}  {format_arguments(result)}")
+    if len(report.near_misses) > _SHOWN:
+        lines.append(f"  … and {len(report.near_misses) - _SHOWN} more")
+    first = report.near_misses[0].id
+    return [*lines, f"Replay one:  {shlex.join([program, 'replay', str(report.directory), '--crash', first])}"]
 
 
 def _describe_events(report: HuntReport) -> list[str]:
@@ -121,7 +137,8 @@ def _verdict(report: ReplayReport) -> list[str]:
     if report.verdict == "fixed":
         return [f"fixed: no crash; {now.summary}", f"  it was: {was.summary}"]
     if report.verdict == "changed":
-        return ["changed: another crash", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
+        what = "it crashes now" if report.bundle.is_near_miss else "another crash"
+        return [f"changed: {what}", f"  it was: {was.summary}", f"  it is:  {now.summary}"]
     if report.verdict == "not_comparable":
         ended = [f"  it was: {was.summary}", f"  it is:  {now.summary}"] if report.rerun.other_traffic else []
         return [f"not comparable: {report.reason}", *ended]

@@ -1,0 +1,113 @@
+"""The most dangerous trials without a crash are kept as bundles of their own, and work as those of crashes do."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+WORDS = ("run", "h", "2", "8", "30", "--scenario", "toy", "--seed", "4", "--keep-going", "--arg", "speed=6:16")
+
+
+def with_near_misses(toy):
+    (toy.folder / "run.json").write_text(json.dumps(toy.crashhunt(*WORDS, "--near-misses", "2", "--json").json))
+
+
+@pytest.fixture
+def hunt(toy, made_once):
+    return made_once(with_near_misses, toy)
+
+
+def survivors(hunt):
+    """By danger, the greatest first."""
+    rows = hunt.crashhunt("trials", "h", "--format", "json").json
+    return sorted((row for row in rows if row["outcome"] in ("survived", "finished")), key=lambda row: -row["danger"])
+
+
+def test_they_are_the_most_dangerous_survivors(hunt):
+    kept = json.loads((hunt.folder / "run.json").read_text())["near_misses"]
+    rows = survivors(hunt)
+    assert len(rows) > 2
+    assert [one["trial"] for one in kept] == [row["number"] for row in rows[:2]]
+    assert [one["danger"] for one in kept] == [row["danger"] for row in rows[:2]]
+    assert 1 > kept[0]["danger"] >= kept[1]["danger"] > 0
+    assert all(one["confirmed"] for one in kept)
+    folders = sorted(path.name for path in (hunt.folder / "h" / "near-misses").iterdir())
+    assert folders == sorted(one["id"] for one in kept)
+    assert hunt.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == 8 - len(rows)
+    assert hunt.crashhunt("check", "h", "--json").json["fine"]
+
+
+def test_one_is_replayed_shown_and_exported_by_its_number(hunt):
+    number = str(survivors(hunt)[0]["number"])
+    replayed = hunt.crashhunt("replay", "h", "--crash", number, "--json").json
+    assert (replayed["verdict"], replayed["outcome_recorded"]) == ("reproduced", "survived")
+    assert "survived after 30 steps" in hunt.crashhunt("show", "h", "--crash", number).out
+    hunt.crashhunt("export", "h", "near.zip", "--crash", number)
+    assert hunt.crashhunt("replay", "near.zip", "--from-log", "--json").json["verdict"] == "reproduced"
+    hunt.crashhunt(
+        "replay", "h", "--crash", number, "--from-log", "--gif", "near.gif", "--size", "128x64", "--fps", "1"
+    )
+    assert (hunt.folder / "near.gif").stat().st_size > 1000
+
+
+def test_without_a_crash_there_is_nothing_to_be_fixed(hunt):
+    number = str(survivors(hunt)[0]["number"])
+    slower = hunt.crashhunt("replay", "h", "--crash", number, "--set", "speed=5", "--json", expect=1).json
+    assert slower["verdict"] == "diverged"
+    faster = hunt.crashhunt("replay", "h", "--crash", number, "--set", "gap_m=10", expect=1)
+    assert "changed: it crashes now" in faster.out
+
+
+def test_a_hunt_that_goes_on_keeps_those_of_all_its_trials(hunt):
+    before = {path.name: path.stat().st_mtime_ns for path in (hunt.folder / "h" / "near-misses").iterdir()}
+    done = hunt.crashhunt(*WORDS[:3], "8", *WORDS[4:], "--near-misses", "1", "--json").json
+    (kept,) = done["near_misses"]
+    (left,) = (hunt.folder / "h" / "near-misses").iterdir()
+    assert left.name == kept["id"]
+    assert left.stat().st_mtime_ns == before[left.name]  # which was not run again
+    assert "near_misses" not in hunt.crashhunt(*WORDS, "--json").json
+    assert left.exists()
+
+
+def test_one_that_is_damaged_is_found_and_made_again(hunt):
+    log = next((hunt.folder / "h" / "near-misses").iterdir()) / "log.mcap"
+    log.write_bytes(log.read_bytes()[:-100])
+    (found,) = hunt.crashhunt("check", "h", "--json", expect=1).json["hunts"]
+    findings = found["findings"]
+    assert [finding["lost"] for finding in findings] == [f"the near miss {log.parent.name}"] * len(findings)
+    (log.parent / "crash.json").unlink()
+    log.unlink()
+    for path in log.parent.iterdir():
+        path.unlink()
+    log.parent.rmdir()
+    hunt.crashhunt(*WORDS, "--near-misses", "2")
+    assert hunt.crashhunt("check", "h", "--json").json["fine"]
+    assert log.exists()
+
+
+def test_of_a_hunt_without_a_crash_the_most_dangerous_is_meant(toy):
+    words = ("run", "h", "2", "3", "20", "--scenario", "toy", "--seed", "4", "--arg", "speed=11:13")
+    done = toy.crashhunt(*words, "--near-misses", "3")
+    first = done.out.split("--crash ")[1].split()[0]
+    assert toy.crashhunt("replay", "h", "--json").json["crash"] == first
+
+
+REMEMBERS = """
+from faulty import Remembers
+
+
+class Fast(Remembers):
+    def act(self, observation):
+        speed, change = super().act(observation)
+        return speed + 12, change
+"""
+
+
+def test_one_that_is_another_trial_in_a_fresh_process_is_not_kept(toy):
+    (toy.folder / "fast.py").write_text(REMEMBERS)
+    words = ("run", "h", "1", "3", "30", "--scenario", "toy", "--seed", "4", "--agent", "fast:Fast")
+    done = toy.crashhunt(*words, "--near-misses", "3", "--json").json
+    assert all("a near miss, is another one in a fresh process" in note for note in done["notes"])
+    assert len(done["near_misses"]) + len(done["notes"]) == 3
+    assert done["notes"]
