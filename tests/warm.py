@@ -10,6 +10,7 @@ that a test starts by `Shell.process` or `Shell.start` does.
 from __future__ import annotations
 
 import atexit
+import dataclasses
 import fcntl
 import gc
 import importlib
@@ -25,6 +26,7 @@ import threading
 import traceback
 import types
 from contextlib import suppress
+from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -40,7 +42,8 @@ _MESSAGE = 1 << 20
 _FREE = 500  # where a process has no files of its own
 
 
-_compiled: dict[bytes, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
+_compiled: dict[bytes | str, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
+_read: dict[tuple[str, str], str | None] = {}  # what a file says of something that is installed
 
 
 def at_start(environment: Mapping[str, str]) -> dict[str, str]:
@@ -247,10 +250,31 @@ def _with_simulator(simulator: str) -> socket.socket:
 def _import(*names: str) -> None:
     for name in names:
         importlib.import_module(name)
+    if "crashhunt.base.plugins" in sys.modules:
+        sys.modules["crashhunt.base.plugins"].registered("agents")
     for name in [name for name in sys.modules if name.partition(".")[0] == "crashhunt"]:
         del sys.modules[name]
     gc.collect()
     gc.freeze()
+
+
+def _remember() -> None:
+    """Have done once what is the same in every fork: what dataclasses compile, what is read of what is installed."""
+    read = metadata.PathDistribution.read_text
+
+    def read_once(self: metadata.PathDistribution, filename: str) -> str | None:
+        key = str(self._path), filename  # type: ignore[attr-defined]
+        if key not in _read:
+            _read[key] = read(self, filename)
+        return _read[key]
+
+    def run(text: str, *namespaces: dict[str, object]) -> None:
+        if text not in _compiled:
+            _compiled[text] = compile(text, "<string>", "exec")
+        exec(_compiled[text], *namespaces)
+
+    metadata.PathDistribution.read_text = read_once  # type: ignore[method-assign]
+    vars(dataclasses)["exec"] = run
 
 
 def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
@@ -279,6 +303,7 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
 
 
 if __name__ == "__main__":
+    _remember()
     _compile()
     _import(
         "crashhunt.executors._template",
