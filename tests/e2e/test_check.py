@@ -6,6 +6,7 @@ import json
 import os
 import py_compile
 import random
+import re
 import shutil
 import sqlite3
 from contextlib import closing
@@ -61,6 +62,7 @@ def edited(path, change, *, schema: int = 2):
     path.write_text(json.dumps(data))
 
 
+CLOCK = re.compile(r'"newest_kind_s": [\d.e-]+')  # how long ago
 ASKED = {
     "trials": ("trials", "h", "--format", "json"),
     "status": ("status", "h", "--json"),
@@ -73,14 +75,15 @@ ASKED = {
 }
 
 
-def test_damage_is_one_line_or_makes_no_difference(hunt):
+@pytest.mark.parametrize(("seed", "times"), [(10, 12), pytest.param(11, 60, marks=pytest.mark.nightly)])
+def test_damage_is_one_line_or_makes_no_difference(hunt, seed, times):
     """Whatever becomes of whichever file: no traceback, and nobody exits with 0 and other numbers."""
-    generator = random.Random(10)
+    generator = random.Random(seed)
     whole = copied(hunt, hunt.with_name("whole"), but="code")
     right = {name: command(*words) for name, words in ASKED.items()}
     assert {code for code, _, _ in right.values()} == {0}
     refused = 0
-    for number in range(24):
+    for number in range(times):
         copied(whole, hunt, but="code")
         signed = False
         files = sorted(path for path in hunt.rglob("*.*") if path.is_file() and "code" not in path.parts)
@@ -105,8 +108,8 @@ def test_damage_is_one_line_or_makes_no_difference(hunt):
             assert len(said) <= 1, (what, words, err)
             assert "\x1b" not in err, (what, words)
             if code == 0 and not signed and name != "check":
-                assert out == right[name][1], (what, words)
-    assert refused > 20
+                assert CLOCK.sub("", out) == CLOCK.sub("", right[name][1]), (what, words)
+    assert refused > 0.8 * times
 
 
 def test_damaged_archives_are_one_line(hunt):

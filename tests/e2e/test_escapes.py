@@ -45,7 +45,7 @@ def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
     assert "Braking at 8 m/s², all that its type can do, would have avoided it" in shell.crashhunt("show", "h").out
 
 
-@pytest.mark.parametrize("length", ["0.5", "1.0"])
+@pytest.mark.parametrize("length", [pytest.param("0.5", marks=pytest.mark.nightly), "1.0"])
 def test_long_steps(shell, length):
     folder = shell.folder / "slow"
     shutil.copytree(shipped_folder() / "loop", folder)

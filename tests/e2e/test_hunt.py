@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import mostly_nightly
 
 FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
 ON_SUMO = ("--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
@@ -109,7 +110,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     assert [path.name for path in crashes.iterdir()] == ["000000-agent_error"]
 
 
-@pytest.mark.parametrize(("number", "hunted", "trials"), [(signal.SIGINT, FINE, 30), (signal.SIGTERM, ON_SUMO, 40)])
+@pytest.mark.parametrize(("number", "hunted", "trials"), [(signal.SIGINT, FINE, 30), (signal.SIGTERM, ON_SUMO, 24)])
 def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, number, hunted, trials):
     words = ("run", "h", "2", str(trials), "300", *hunted, "--json")
     process = toy.start(*words, start_new_session=True)
@@ -127,7 +128,7 @@ def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, 
     assert {key: after[key] for key in before} == before  # nothing that had finished ran again
 
 
-@pytest.mark.parametrize("after_s", [0.15, 0.2, 0.25, 0.3, 0.4])
+@pytest.mark.parametrize("after_s", mostly_nightly([0.15, 0.2, 0.25, 0.3, 0.4], always=(0.2, 0.3)))
 def test_an_interrupt_while_it_starts_is_not_lost(toy, after_s):
     process = toy.start("run", "h", "2", "100000", "300", *FINE, start_new_session=True)
     time.sleep(after_s)

@@ -1,4 +1,8 @@
-"""Every shipped scenario has a crash, which is replayed and filmed; on some, all else is done with it too."""
+"""Every shipped scenario has a crash, which is replayed and filmed; on some, all else is done with it too.
+
+By day it is one of each simulator, and one of several agents on each. Of the others, pages of the guide hunt in merge,
+highway-policy and motorway; the contracts drive in loop-two-agents, intersection and all of highway-env's.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import rewritten
+from conftest import mostly_nightly, rewritten
 
 import crashhunt
 from crashhunt.recording import read_lanes
@@ -27,8 +31,11 @@ SEEDS = {  # with which a crash comes soon
 }
 
 
+ALWAYS = ("highway", "intersection-two-agents", "loop", "roundabout")
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("scenario", sorted(shipped_scenarios()))
+@pytest.mark.parametrize("scenario", mostly_nightly(sorted(shipped_scenarios()), ALWAYS))
 def test_a_crash_of_it_is_found_replayed_and_filmed(shell, scenario):
     seed = str(SEEDS.get(scenario, 1))
     words = ("--scenario", scenario, "--seed", seed, "--deterministic")
