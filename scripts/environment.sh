@@ -18,7 +18,7 @@ find_python() {
 
 environment() {
     extra=$1
-    wanted=$(cat "$root/pyproject.toml" | cksum)
+    wanted=$(cat "$root/pyproject.toml" "$root/hatch_build.py" "$root"/crashhunt/native/*core.* | cksum)
     # A development environment serves users too.
     for have in dev "$extra"; do
         if [ "$(cat "$venv/made-for-${have:-users}" 2>/dev/null)" = "$wanted" ]; then return; fi
@@ -31,6 +31,10 @@ environment() {
         echo "making the virtual environment $venv (once; about a minute) ..." >&2
         "$python" -m venv "$venv"
         "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root${extra:+[$extra]}" >&2
+        if ! "$venv/bin/python" -c 'import _crashhunt_core' 2>/dev/null; then
+            echo "crashhunt goes without its compiled core, which needs a C++ compiler and Python's headers:" \
+                "steps on SUMO take longer, and results are the same" >&2
+        fi
         echo "$wanted" >"$venv/made-for-${extra:-users}"
     fi
     exec 9>&-

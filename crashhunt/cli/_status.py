@@ -100,6 +100,8 @@ def states_table(states: list[HuntState]) -> Table:
             str(state.errors),
             Text(said),
         )
+        if state.core is not None:
+            table.add_row(Text(one_line(f"  compiled core {state.core}")))
         for node in (state.nodes or [])[:_NODES]:
             name = one_line(f"  {node['name']} ({node['parallel']} at a time)")
             table.add_row(Text(name), "", str(node["trials"]), f"{node['rate_per_s']:.1f}")

@@ -38,6 +38,7 @@ class Noted(TypedDict, total=False):
         plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
         lag: by how many trials a sampler that learns is told late.
         origins: whether its sampler says where trials come from.
+        core: whether the simulator's compiled core is used; None where it has none.
         disturb: how often what disturbs its trials; None where nothing does.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
         kinds: of crashes, the most frequent first, where it collects them all.
@@ -55,6 +56,7 @@ class Noted(TypedDict, total=False):
     plain_origin: str | None
     lag: int | None
     origins: bool
+    core: str | None
     disturb: list[str] | None
     nodes: list[dict[str, Any]]
     kinds: list[KindData]

@@ -26,7 +26,7 @@ from crashhunt.hunts._preflight import Preflight, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
-from crashhunt.plans import disturber, sampler_of, with_settings
+from crashhunt.plans import core_of, disturber, sampler_of, with_settings
 from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
@@ -143,7 +143,7 @@ class Hunt:
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
-        lag = self._lag(before)
+        lag, alike = self._lag(before), not finished or draws_independently(before, settings)
         trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber)
         ledger.enter(
             "running",
@@ -154,10 +154,9 @@ class Hunt:
             planned=settings.trials,
             until=time.time() + settings.run.duration_s if settings.run.duration else None,
             hunt_seed=settings.seed,
-            independent=sampler.independent
-            and not settings.seeds
-            and (not finished or draws_independently(before, settings)),
+            independent=sampler.independent and not settings.seeds and alike,
             plain_origin=sampler.plain_origin or None,
+            core=core_of(self.scenario, settings.run),
             disturb=list(settings.disturb) or None,
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )

@@ -67,6 +67,7 @@ class HuntState:
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        core: whether the simulator's compiled core is used; None where it has none.
         nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
         kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
         newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
@@ -85,6 +86,7 @@ class HuntState:
     owner_alive: bool = False
     damaged: bool = False
     disturbed: int | None = None
+    core: str | None = None
     nodes: list[dict[str, Any]] | None = None
     kinds: list[KindData] | None = None
     newest_kind_s: float | None = None
@@ -99,6 +101,8 @@ class HuntState:
         data = asdict(self)
         if self.disturbed is None:
             del data["disturbed"]
+        if self.core is None:
+            del data["core"]
         if self.nodes is None:
             del data["nodes"]
         if self.kinds is None:
@@ -190,6 +194,7 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
         _seconds_left(facts, planned - run, rate) if state == "running" else None,
         alive,
         disturbed=_disturbed(directory) if facts.get("disturb") else None,
+        core=facts.get("core"),
         nodes=facts.get("nodes"),
         kinds=facts.get("kinds"),
         newest_kind_s=max(0.0, time.time() - newest) if (newest := facts.get("newest_kind")) is not None else None,

@@ -122,6 +122,14 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
         step_s = scene.time_s - previous.time_s
         further = 2 * reachable_m(max(scene.speeds) + _HARDEST * step_s, step_s)
     limit = (roster.touch_distance + further) ** 2
+    same = previous is not None and previous.roster is roster and not (scene.spines or previous.spines)
+    if scene.core is not None and previous is not None and same:
+        rows = scene.core.within_reach(
+            scene.points, scene.headings, scene.speeds, previous.points, previous.headings, previous.speeds,
+            roster.lengths, roster.widths, reaches, row, further, limit,
+        )  # fmt: skip
+        if rows is not None:
+            return rows
     moved = None
     found = []
     for squared, other in scene.neighbors(row):

@@ -9,6 +9,7 @@ from ._options import (
     hunt_options as hunt_options,
 )
 from ._plan import (
+    core_of as core_of,
     disturber as disturber,
     parse_crash_on as parse_crash_on,
     plan as plan,

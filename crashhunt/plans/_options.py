@@ -166,6 +166,11 @@ class RunOptions(_Options):
         help="run highway-env as it is; the accelerator changes no bit, and only the time it takes",
         flag="--no-accelerate",
     )  # fmt: skip
+    native: bool = option(
+        True, "use the compiled core of simulators where it is there, which changes no bit",
+        help="do without the compiled core, which changes no bit of SUMO's trials, and only the time they take",
+        flag="--no-native",
+    )  # fmt: skip
     recycle_after: int = option(
         1000, "trials after which a worker is replaced; 0 for never",
         help="replace a worker after so many trials; 0: never",

@@ -78,10 +78,20 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
-    """Tell whoever hunts where the accelerator does not know the simulator that it will not be fast."""
-    accelerator = scenario.backend.accelerator
-    note = accelerator.note(scenario) if accelerator is not None and run.accelerate else ""
-    return replace(scenario, notes=(*scenario.notes, note)) if note else scenario
+    """Tell whoever hunts what makes the simulator fast, and where that does not know it."""
+    accelerator, core = scenario.backend.accelerator, core_of(scenario, run)
+    notes = [accelerator.note(scenario) if accelerator is not None and run.accelerate else ""]
+    notes.append(f"the compiled core is {core}" if core is not None else "")
+    return replace(scenario, notes=(*scenario.notes, *filter(None, notes)))
+
+
+def core_of(scenario: Scenario, run: RunSettings) -> str | None:
+    """Return whether trials use the simulator's compiled core, in words; None where it has none."""
+    core = scenario.backend.core
+    if core is None:
+        return None
+    why_not = core.why_not(scenario) if run.native else "--no-native"
+    return f"not used: {why_not}" if why_not else "used"
 
 
 def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
@@ -94,6 +104,8 @@ def with_settings(scenario: Scenario, settings: HuntSettings) -> Scenario:
         )
     if scenario.backend.accelerator is not None and not settings.run.accelerate:
         scenario = scenario.backend.accelerator.switched_off(scenario)
+    if scenario.backend.core is not None and not settings.run.native:
+        scenario = scenario.backend.core.switched_off(scenario)
     if settings.events:
         scenario = replace(scenario, events={**scenario.events, **settings.events})
     if scenario.backend.actions:  # elsewhere than it was hunted, it may be another simulator's

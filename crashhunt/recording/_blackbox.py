@@ -183,19 +183,21 @@ class BlackBox:
             packer = self._steps[count] = struct.Struct(f"<BxHIqd{self._agents + 4 * count}d")
         if offset + packer.size > self._reserved:
             self._reserve(offset + packer.size)
-        packer.pack_into(
-            self._map,
-            offset,
-            _STEP,
-            0,
-            packer.size - 8,
-            step,
-            scene.time_s,
-            *rewards,
-            *chain.from_iterable(scene.points),
-            *scene.headings,
-            *scene.speeds,
-        )
+        core, columns = scene.core, (scene.points, scene.headings, scene.speeds)
+        if core is None or core.write_step(self._map, offset, _STEP, step, scene.time_s, rewards, *columns) is None:
+            packer.pack_into(
+                self._map,
+                offset,
+                _STEP,
+                0,
+                packer.size - 8,
+                step,
+                scene.time_s,
+                *rewards,
+                *chain.from_iterable(scene.points),
+                *scene.headings,
+                *scene.speeds,
+            )
         self._roster = scene.roster
         rest = scene if scene.heights or scene.spines else None
         self._trail.append((scene.roster, offset + packer.size - 32 * count, rest))

@@ -1,4 +1,9 @@
-from ._backend import Accelerator as Accelerator, Backend as Backend, Configuration as Configuration
+from ._backend import (
+    Accelerator as Accelerator,
+    Backend as Backend,
+    CompiledCore as CompiledCore,
+    Configuration as Configuration,
+)
 from ._digest import (
     as_in_file as as_in_file,
     as_plain_data as as_plain_data,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
 
-__all__ = ["Accelerator", "Backend", "Configuration"]
+__all__ = ["Accelerator", "Backend", "CompiledCore", "Configuration"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +55,19 @@ class Accelerator:
 
     switched_off: Callable[[Scenario], Scenario]
     note: Callable[[Scenario], str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompiledCore:
+    """A compiled part that may be missing, and changes no bit of what is computed.
+
+    Args:
+        switched_off: returns a scenario without it, as ``--no-native`` asks for.
+        why_not: returns why it is not used, in words that follow "not used: "; empty where it is.
+    """
+
+    switched_off: Callable[[Scenario], Scenario]
+    why_not: Callable[[Scenario], str]
 
 
 def _nothing(_scenario: Scenario) -> Iterable[str]:
@@ -103,6 +116,7 @@ class Backend:
         disturbances: the kinds of disturbances of the traffic that it can do; None where nobody knows.
         actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
         accelerator: where it has one.
+        core: its compiled part, where it has one.
         configurations: files of its own that are run as they are.
         explained: returns what is wrong with the scenario, from the message with which no episode could be set up and
             from what it printed; None where it is not to blame.
@@ -133,6 +147,7 @@ class Backend:
     disturbances: tuple[str, ...] | None = None
     actions: tuple[str, ...] = ()
     accelerator: Accelerator | None = None
+    core: CompiledCore | None = None
     configurations: tuple[Configuration, ...] = ()
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None

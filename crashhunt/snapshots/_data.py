@@ -27,7 +27,10 @@ class Manifest(TypedDict):
 
 
 class Environment(TypedDict):
-    """``environment.json``: what a result depends on besides code. ``git`` has the revision of each work tree."""
+    """``environment.json``: what a result depends on besides code. ``git`` has the revision of each work tree.
+
+    ``core`` is whether the simulator's compiled core was used, which makes no difference to results.
+    """
 
     schema: int
     python: str
@@ -39,4 +42,5 @@ class Environment(TypedDict):
     distributions: dict[str, str]
     loaded: list[str]
     variables: dict[str, str]
+    core: NotRequired[str]
     git: NotRequired[dict[str, str]]

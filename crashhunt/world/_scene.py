@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.native import Core
     from crashhunt.world._events import Event
 
 __all__ = [
@@ -112,6 +113,16 @@ class Roster:
         return np.array([(actor.length / 2, actor.width / 2) for actor in self.actors]).reshape(-1, 2)
 
     @cached_property
+    def lengths(self) -> list[float]:
+        """The length of each actor, in m."""
+        return [actor.length for actor in self.actors]
+
+    @cached_property
+    def widths(self) -> list[float]:
+        """The width of each actor, in m."""
+        return [actor.width for actor in self.actors]
+
+    @cached_property
     def reaches(self) -> list[float]:
         """How far the far corner of each outline is from the centre of its front bumper, in m."""
         return [math.hypot(actor.length, actor.width / 2) for actor in self.actors]
@@ -196,6 +207,7 @@ class Scene:
         spines: row to centre line, of the long vehicles that are bent.
         swept: whether everybody has driven here from the previous scene along the way that the headings say, so that
             contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
+        core: what computes with it faster, where there is such a thing; the results are the same.
 
     Attributes:
         events: what else happened in this step.
@@ -207,6 +219,7 @@ class Scene:
         "_neighbors",
         "agent_lanes",
         "contacts",
+        "core",
         "events",
         "grades",
         "headings",
@@ -237,6 +250,7 @@ class Scene:
         spines: Mapping[int, Spine] = _NO_SPINES,
         *,
         swept: bool = False,
+        core: Core | None = None,
     ) -> None:
         self.time_s = time_s
         self.roster = roster
@@ -250,6 +264,7 @@ class Scene:
         self.grades = grades
         self.spines = spines
         self.swept = swept
+        self.core = core
         self.events: tuple[Event, ...] = ()
         self.agent_lanes: dict[str, str] = {}
         self.previous: Scene | None = None

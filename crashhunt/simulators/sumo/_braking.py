@@ -100,7 +100,10 @@ class HardBraking:
         """Who braked harder than its limit in the last step, and how hard in m/s²."""
         rows: Iterable[tuple[Actor, float, float]]
         if scene.roster is last.roster:
-            if min(map(sub, scene.speeds, last.speeds), default=0.0) > -_LOOKED_INTO * self._dt:
+            least = scene.core.least_change(last.speeds, scene.speeds) if scene.core is not None else None
+            if least is None:
+                least = min(map(sub, scene.speeds, last.speeds), default=0.0)
+            if least > -_LOOKED_INTO * self._dt:
                 return []
             rows = zip(scene.roster.actors, last.speeds, scene.speeds, strict=True)
         else:

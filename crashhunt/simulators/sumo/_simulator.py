@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from functools import cache
 from typing import TYPE_CHECKING
 
 import libsumo
@@ -12,6 +13,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
+from crashhunt.native import core_for
 from crashhunt.scenario import ObservationSetup
 from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
@@ -22,6 +24,7 @@ from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._left_out import LeftOut
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
+from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
@@ -41,7 +44,9 @@ __all__ = ["SumoSimulator"]
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _SEEN_M = 150.0  # of the network, in a window that follows a vehicle
 _KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
+_DISTRUSTED = "the compiled core says something else than libsumo's own getters, and is not used"
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
+_keep_xml_ready = cache(keep_xml_ready)  # once a process
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
 
 
@@ -69,12 +74,17 @@ class SumoSimulator:
         options = scenario.table(SumoSetup).options
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
+        core = None
+        if scenario.table(SumoSetup).native is not False:
+            core = core_for(libsumo.__version__, sumo.__file__)
         self._sight = Sight(
             tuple(scenario.agents),
             scenario.step_length_s,
             lateral=self._lateral,
             speeds=self._disturbances.speeds,
+            core=core,
         )
+        self.notices: list[str] = []
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._lanes: list[Lane] | None = None
@@ -120,6 +130,7 @@ class SumoSimulator:
                 libsumo.load(command)
             else:
                 libsumo.start([*self._program, *command])
+                _keep_xml_ready()
             _current = weakref.ref(self)
             self._enter()
         except _TRACI_ERRORS as error:
@@ -132,7 +143,12 @@ class SumoSimulator:
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         self._look()
-        observations = {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
+        observations = self._observe_all()
+        if self._sight.core is not None and self._is_core_wrong(observations):
+            self._sight.distrust()
+            self.notices.append(_DISTRUSTED)
+            self._look()
+            observations = self._observe_all()
         self._events.begin(self._scene, self.agents, self._scenario.agents)
         return observations, {}
 
@@ -324,6 +340,17 @@ class SumoSimulator:
             found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
             self._closed_lanes[lane, vehicle_class] = found
         return found
+
+    def _is_core_wrong(self, observations: Observations) -> bool:
+        """Whether the compiled core says anything else than the Python that it stands for."""
+        core, self._scene.core = self._scene.core, None
+        plain = self._observe_all()
+        self._scene.core = core
+        same = all(plain[agent].tobytes() == observations[agent].tobytes() for agent in plain)
+        return not (same and self._sight.reads_right())
+
+    def _observe_all(self) -> Observations:
+        return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
 
     def _look(self) -> None:
         """Read the state of everybody in sight."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._backend import Backend, Configuration
+from crashhunt.scenario._backend import Backend, CompiledCore, Configuration
 from crashhunt.scenario.backends.sumo._options import INPUTS, canonical, writes
 from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.world import EVENT_WORDS
@@ -94,6 +96,18 @@ def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications
     return side_effect(scenario, values, specifications)
 
 
+def _without_core(scenario: Scenario) -> Scenario:
+    return scenario.with_table(replace(scenario.table(SumoSetup), native=False))
+
+
+def _why_no_core(scenario: Scenario) -> str:
+    from crashhunt.native import why_not
+
+    if scenario.table(SumoSetup).native is False:
+        return "the scenario says so"
+    return why_not(metadata.version("libsumo"))
+
+
 BACKEND = Backend(
     title="SUMO",
     table=SumoSetup,
@@ -111,6 +125,7 @@ BACKEND = Backend(
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale",)),),
+    core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     explained=_explained,
     side_effect=_side_effect,
 )

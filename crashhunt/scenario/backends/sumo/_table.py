@@ -18,6 +18,7 @@ class SumoSetup:
         options: further options of SUMO without their dashes, such as ``lateral-resolution``. Where there is no
             ``time-to-teleport``, it is -1: nobody is taken away, and a jam stays one. What they would have SUMO write
             is not written.
+        native: whether the compiled core may be used; it changes no bit.
         literal: whether ``${NAME}`` in a route or additional file is left as it is, instead of being filled in.
     """
 
@@ -26,3 +27,4 @@ class SumoSetup:
     additional: tuple[str, ...] = ()
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
     literal: bool | None = None
+    native: bool | None = None

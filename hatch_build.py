@@ -1,0 +1,78 @@
+"""Builds the compiled core into wheels and editable installations, where that can be done; crashhunt goes without it.
+
+CRASHHUNT_CORE=0 leaves it out; CRASHHUNT_CORE=1, for the wheels of a release, fails where it cannot be built.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+# Without contraction every expression rounds as Python's does; sine and cosine are the C library's, each by itself.
+FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
+         "-fno-builtin-sin", "-fno-builtin-cos", "-Wall", "-Wextra")  # fmt: skip
+INTERFACE = re.compile(r"^_INTERFACE = (\d+)$", re.MULTILINE)
+
+
+class CoreHook(BuildHookInterface):
+    """Adds the module ``_crashhunt_core`` beside the package."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Build it, and say that the wheel is for this Python and machine only."""
+        asked = os.environ.get("CRASHHUNT_CORE", "")
+        if self.target_name != "wheel" or asked == "0":
+            return
+        self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-core-"))
+        try:
+            built = build(Path(self.root), self._folder)
+        except (OSError, subprocess.SubprocessError, ValueError) as error:
+            if asked == "1":
+                raise
+            self.app.display_warning(f"crashhunt goes without its compiled core: {error}")
+            return
+        where = "force_include_editable" if version == "editable" else "force_include"
+        build_data[where][str(built)] = built.name
+        build_data["pure_python"] = False
+        build_data["infer_tag"] = True
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Remove what was built."""
+        shutil.rmtree(getattr(self, "_folder", ""), ignore_errors=True)
+
+
+def build(root: Path, folder: Path) -> Path:
+    """Compile the core into a folder; return the file.
+
+    Raises:
+        ValueError: it is for Linux and CPython only.
+        OSError: there is no compiler.
+        subprocess.SubprocessError: it fails, such as where Python's headers are missing.
+    """
+    if sys.platform != "linux" or sys.implementation.name != "cpython" or sys.byteorder != "little":
+        raise ValueError("it is for CPython on Linux")
+    compiler = os.environ.get("CXX") or next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    if not compiler:
+        raise FileNotFoundError("there is no C++ compiler")
+    source = root / "crashhunt" / "native"
+    match = INTERFACE.search((source / "_core.py").read_text())
+    if match is None:
+        raise ValueError("crashhunt/native/_core.py does not say which interface it has")
+    built = folder / f"_crashhunt_core{sysconfig.get_config_var('EXT_SUFFIX')}"
+    words = [*shlex.split(compiler), *FLAGS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
+    words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-I{sysconfig.get_path('include')}", str(source / "core.cpp")]
+    done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)
+    if done.returncode:
+        raise subprocess.SubprocessError(f"the compiler says: {done.stderr.strip()[-2000:]}")
+    return built

@@ -1,0 +1,235 @@
+"""The compiled core: every bit as without it, and out of the way where it cannot be trusted."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings, strategies as some
+
+from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.episode import run_episode
+from crashhunt.native import _core, core_for, why_not
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+from crashhunt.oracles._crashes import _within_reach
+from crashhunt.recording import BlackBox
+from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
+from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.simulators import Kinematics
+from crashhunt.trial import CRASHES, TrialSpec
+from crashhunt.world import Actor, Roster, Scene
+
+core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
+
+coordinates = some.floats(-60, 60) | some.sampled_from([0.0, -0.0, 5.0, 1e-9, 1e12])
+headings = some.floats(-7, 7) | some.sampled_from([0.0, math.pi / 2, math.pi, 1e6])
+sizes = some.floats(0.1, 20)
+vehicles = some.tuples(coordinates, coordinates, headings, some.floats(-5, 60), sizes, sizes)
+movements = some.tuples(some.floats(-4, 4), some.floats(-4, 4), some.floats(-0.5, 0.5), some.floats(-1, 1))
+
+
+@some.composite
+def two_scenes(draw):
+    first = draw(some.lists(vehicles, min_size=1, max_size=12))
+    moved = [draw(movements) for _ in first]
+    roster = Roster(tuple(Actor(str(row), "passenger", size[4], size[5]) for row, size in enumerate(first)))
+    pairs, found = list(zip(first, moved, strict=True)), []
+    for share in (0, 1):
+        rows = [[place + share * step for place, step in zip(one[:4], by, strict=True)] for one, by in pairs]
+        points, angles, speeds = [(x, y) for x, y, *_ in rows], [row[2] for row in rows], [row[3] for row in rows]
+        found.append(Scene(100.0 + share / 10, roster, points, angles, speeds, swept=True))
+    return found
+
+
+def both_ways(scene, call):
+    """What comes of a call with the core, and without."""
+    scene._neighbors.clear()
+    scene.core = core
+    with_it = call()
+    scene._neighbors.clear()
+    scene.core = None
+    return with_it, call()
+
+
+@settings(deadline=None, max_examples=60)
+@given(two_scenes(), some.integers(1, 10), some.floats(-1e4, 1e4))
+def test_an_observation_is_the_same_to_the_bit(scenes, rows, place):
+    kinematics = Kinematics(ObservationSetup(vehicles=rows))
+    where = {"distance": place, "from_left": place / 3, "lateral_speed": -place, "lanes": 2}
+    for row in range(len(scenes[1].points)):
+        ours, theirs = both_ways(scenes[1], lambda row=row: kinematics.observe(scenes[1], row, **where))
+        assert ours.tobytes() == theirs.tobytes()
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
+
+
+@settings(deadline=None, max_examples=60)
+@given(two_scenes())
+def test_the_same_are_within_reach(scenes):
+    previous, scene = scenes
+    for row in range(len(scene.points)):
+        ours, theirs = both_ways(scene, lambda row=row: _within_reach(scene, previous, row))
+        assert ours == theirs
+
+
+def test_somebody_is_within_reach():
+    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "abc"))
+    was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
+    now = Scene(0.1, roster, [(3.1, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0], core=core)
+    assert _within_reach(now, was, 0) == [1]
+
+
+@settings(deadline=None, max_examples=60)
+@given(two_scenes(), some.lists(some.floats(), max_size=3), some.integers(0, 2**40))
+def test_the_record_of_a_step_is_the_same(tmp_path_factory, scenes, rewards, step):
+    rewards, scene = tuple(rewards), scenes[0]
+
+    def record():
+        box = BlackBox(tmp_path_factory.getbasetemp() / "box.bin")
+        box.begin(pid=1, trial=0, started=0.0)
+        box.prologue(b"", len(rewards))
+        box.step(step, scene, rewards)
+        written, where = bytes(box.committed()), (box._offset, box._trail[0][1])
+        box.close()
+        return written, where
+
+    ours, theirs = both_ways(scene, record)
+    assert ours == theirs
+
+
+@given(some.lists(some.tuples(some.floats(-50, 50), some.floats(-50, 50)), max_size=20))
+def test_the_least_change(pairs):
+    earlier, later = [one for one, _ in pairs], [two for _, two in pairs]
+    expected = min((two - one for one, two in pairs), default=0.0)
+    assert core.least_change(earlier, later) == expected
+
+
+@pytest.mark.parametrize("odd", [math.nan, 1, None, "1", 10**400])
+def test_what_the_core_does_not_know_is_left_to_python(odd):
+    points, numbers = [(0.0, 0.0), (9.0, 0.0)], [1.0, 2.0]
+    assert core.least_change(numbers, [1.0, odd]) is None
+    assert core.observe([(0.0, 0.0), (odd, 0.0)], numbers, numbers, numbers, 0, 4, 1.0, 1.0, 0.0) is None
+    lists = (points, numbers, numbers)
+    reached = core.within_reach(*lists, [(0.0, odd), (0.0, 0.0)], *lists[1:], *[numbers] * 3, 0, 9.0, 1e9)
+    assert reached == ([] if odd is math.nan else None)
+    for rows in ([], numbers[:1], tuple(numbers)):
+        assert core.observe(points, rows, numbers, numbers, 0, 4, 1.0, 1.0, 0.0) is None
+    for row in (-1, 2):
+        assert core.observe(points, numbers, numbers, numbers, row, 4, 1.0, 1.0, 0.0) is None
+
+
+def test_what_is_too_large_for_single_precision_is_an_error_as_in_python():
+    assert core.observe([(0.0, 0.0)], [0.0], [0.0], [5.0], 0, 2, 1e39, 0.0, 0.0) is None
+    with pytest.raises(OverflowError):
+        struct.pack("<f", 1e39)
+
+
+def test_nothing_is_written_beyond_the_end():
+    for offset in (-1, 60, 2**62):
+        with pytest.raises(ValueError, match="beyond the end"):
+            core.write_step(bytearray(64), offset, 5, 0, 0.0, (), [(1.0, 1.0)], [0.0], [0.0])
+
+
+def test_it_is_used_only_where_it_is_known(monkeypatch):
+    assert why_not("1.28.0") == ""
+    assert "1.27.0" in why_not("1.27.0")
+    assert core_for("1.27.0", "/nowhere") is None
+    assert core_for("1.28.0", "/nowhere") is None  # libsumo is elsewhere
+    monkeypatch.setattr(_core, "_INTERFACE", -1)
+    assert "another version of crashhunt" in why_not("1.28.0")
+    monkeypatch.setattr(_core, "_MODULE", "_no_such_core")
+    _core._installed.cache_clear()
+    try:
+        assert why_not("1.28.0") == "it is not built"
+    finally:
+        _core._installed.cache_clear()
+
+
+class _Lies:
+    """A core with one function that says something else."""
+
+    def __init__(self, name, instead):
+        setattr(self, name, instead)
+
+    def __getattr__(self, name):
+        return getattr(core, name)
+
+
+def _nearly(observation):
+    return observation[:-1] + bytes([observation[-1] ^ 1])
+
+
+class _Moved:
+    def __init__(self, ids):
+        self._vehicles = core.Vehicles(ids)
+
+    def read(self):
+        points, angles, speeds = self._vehicles.read()
+        return points, [*angles[:-1], math.nextafter(angles[-1], 10.0)], speeds
+
+
+LIES = {
+    "nothing": None,
+    "observe": lambda *given: _nearly(core.observe(*given)),
+    "Vehicles": _Moved,
+    "is_coming_or_going": lambda: not core.is_coming_or_going(),
+}
+
+
+@pytest.fixture
+def run(tmp_path):
+    from crashhunt.simulators.sumo import SumoSimulator
+
+    def trial(scenario, *, native, steps=60, lie=None, speed=15.0, seed=5):
+        chosen = load_scenario(scenario)
+        chosen = chosen.with_table(replace(chosen.table(SumoSetup), native=native))
+        stage = tmp_path / f"stage-{native}-{lie}"
+        stage.mkdir()
+        simulator = SumoSimulator(chosen, stage)
+        assert (simulator._sight.core is core) == (native is None)
+        if lie is not None and LIES[lie] is not None:
+            simulator._sight.core = _Lies(lie, LIES[lie])
+        box = BlackBox(stage / "box.bin")
+        box.begin(pid=1, trial=0, started=0.0)
+        agents = {"make_agent": lambda *_: KeepLaneWithSpeed(speed), "crash_on": CRASHES}
+        spec = TrialSpec(0, seed, {}, argument_values(chosen), max_steps=steps)
+        oracles = [ReportedCollision(), Overlap(), OffRoad()]
+        result = run_episode(spec, simulator=simulator, box=box, oracles=oracles, **agents)
+        simulator.close()
+        box.close()
+        return replace(result, setup_s=0.0, wall_s=0.0), simulator
+
+    return trial
+
+
+@pytest.mark.parametrize("scenario", ["loop", "loop-two-agents"])
+def test_a_trial_is_the_same_to_the_bit(run, scenario):
+    steps = 250 if scenario == "loop" else 120
+    (ours, simulator), (theirs, _) = (run(scenario, native=native, steps=steps) for native in (None, False))
+    assert simulator._sight.core is core
+    assert not simulator.notices
+    assert ours == theirs
+    assert ours.steps > 30
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_core_that_is_wrong_is_found_out_before_the_first_step(run, lie):
+    result, simulator = run("loop", native=None, steps=3, lie=lie)
+    assert (simulator._sight.core is None) == (LIES[lie] is not None)
+    assert len(simulator.notices) == (LIES[lie] is not None)
+    assert result == run("loop", native=False, steps=3)[0]
+
+
+def test_a_vehicle_that_has_left_is_refused_as_by_libsumo(run):
+    import libsumo
+
+    _, simulator = run("loop", native=None, steps=3)
+    simulator.reset(seed=1, options={"arguments": argument_values(load_scenario("loop"))})
+    try:
+        assert core.Vehicles(("nobody",)).read() is None
+        assert core.Vehicles(()).read() == ([], [], [])
+        with pytest.raises(libsumo.TraCIException):
+            libsumo.vehicle.getSpeed("nobody")
+    finally:
+        simulator.close()

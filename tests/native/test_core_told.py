@@ -1,0 +1,23 @@
+"""Which of the two steps SUMO, the compiled core or Python: told at the start, by status and in environment.json."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from crashhunt.native import why_not
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_it_is_told(shell, native):
+    words = () if native else ("--no-native",)
+    done = shell.crashhunt("run", "h", "1", "1", "3", "--seed", "1", *words)
+    reason = why_not("1.28.0") if native else "--no-native"
+    told = f"not used: {reason}" if reason else "used"
+    assert f"the compiled core is {told}" in done.out
+    assert shell.crashhunt("status", "h", "--json").json["hunts"][0]["core"] == told
+    assert f"compiled core {told}" in shell.crashhunt("status", "h").out
+    (environment,) = (shell.folder / "h/snapshots").glob("*/environment.json")
+    assert json.loads(environment.read_text())["core"] == told
+    assert ("native = false" in (shell.folder / "h/hunt.toml").read_text()) == (not native)
