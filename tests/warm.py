@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
 _SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
-_OF_SIMULATORS = {"gym": "gymnasium", "highway": "highway_env", "sumo": "libsumo"}
+_OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _FREE = 500  # where a process has no files of its own
 
