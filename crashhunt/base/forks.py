@@ -91,6 +91,13 @@ class Watchdog:
         self.file = None
         faulthandler.cancel_dump_traceback_later()
 
+    def extend(self, wall_s: float) -> None:
+        """Count so much longer, in s."""
+        if self.file is not None:
+            left, file = self._until - time.monotonic() + wall_s, self.file
+            self.cancel()
+            self.arm(max(left, 1e-3), file)
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Count no further; whoever comes out of it goes on counting: this process alone, and no copy."""

@@ -31,6 +31,7 @@ __all__ = [
     "NOTICES",
     "PACKAGE",
     "PARAMS",
+    "PROBES",
     "REPLACED",
     "REPORT",
     "REQUEST",
@@ -54,6 +55,7 @@ REQUEST: Final = "request.json"
 SNAPSHOTS: Final = "snapshots"
 CRASHES: Final = "crashes"
 NEAR_MISSES: Final = "near-misses"
+PROBES: Final = "probes"
 TRIALS: Final = "trials"
 REPORT: Final = "report.html"
 

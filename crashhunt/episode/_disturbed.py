@@ -93,6 +93,20 @@ class Disturbed:
         self._next = 0  # the next step in which anything begins, goes on or ends
         self._before: Mapping[str, Array] = {}
 
+    def add(self, disturbance: Disturbance) -> None:
+        """Plan one more; not before the step after the next."""
+        waits = self._agent_waits if disturbance.what in OF_AGENT else self._traffic_waits
+        waits.append(disturbance)
+        waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
+        waits.sort(key=lambda one: one.step, reverse=True)
+
+    def took_place(self, planned: Disturbance) -> bool:
+        """Whether somebody was there for a disturbance that has begun."""
+        return any(
+            one.vehicle and (one.step, one.agent, one.what) == (planned.step, planned.agent, planned.what)
+            for one in self._told
+        )
+
     def first(self, observations: Observations) -> Observations:
         """Return what agents are shown in the first step."""
         return self._shown(observations)

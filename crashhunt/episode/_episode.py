@@ -244,6 +244,20 @@ class Episode:
         self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
         return copy
 
+    def disturb(self, disturbance: Disturbance) -> None:
+        """Have one more disturbance take place than was planned, not before the step after the next.
+
+        Raises:
+            RuntimeError: the episode was not made for it, with ``forks``.
+        """
+        if self._disturbed is None:
+            raise RuntimeError("only an episode of which there may be copies is disturbed while it goes on")
+        self._disturbed.add(disturbance)
+
+    def takes_place(self, disturbance: Disturbance) -> bool:
+        """Whether somebody was there for a disturbance that has begun."""
+        return self._disturbed is not None and self._disturbed.took_place(disturbance)
+
     def _look_away(self) -> None:
         """Tell nobody of anything from now on."""
         tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
@@ -276,7 +290,7 @@ class Episode:
                 tell(self)
             if self._forks:
                 self._held = held(shared_memory())
-            if spec.disturbances:
+            if spec.disturbances or self._forks:  # a copy may be disturbed, and then is as it would have been from here
                 self._disturb(Disturbed(spec, simulator, self._on_disturbance))
             for number, agent in enumerate(self.names):
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))

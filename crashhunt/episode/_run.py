@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from crashhunt.episode._episode import MakeAgent, Reset
     from crashhunt.episode._observer import Observer
+    from crashhunt.episode._probes import Prober
     from crashhunt.oracles import Oracle
     from crashhunt.recording import BlackBox
     from crashhunt.simulators import Simulator
@@ -38,6 +39,7 @@ def run_episode(
     crash_on: Sequence[Outcome] = CRASHES,
     observers: Sequence[Observer] = (),
     reset: Reset | None = None,
+    prober: Prober | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -50,6 +52,7 @@ def run_episode(
         crash_on: what ends the episode; a traffic crash or event of another kind is recorded, and the episode goes on.
         observers: who else is told; after the recorder.
         reset: what resets the simulator, where it is not the simulator itself.
+        prober: asks copies of it how little it would take for a crash.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -67,11 +70,16 @@ def run_episode(
         oracles=oracles,
         crash_on=crash_on,
         observers=everybody,
+        forks=prober is not None,
         reset=reset,
     ) as episode:
         result = episode.start()
         while result is None:
             result = episode.step()
+            if prober is not None and result is None and prober.is_due(episode):
+                prober.ask(episode)
+    if prober is not None:
+        result = prober.result(result)
     return replace(result, setup_s=episode.setup_s, wall_s=time.monotonic() - began)
 
 

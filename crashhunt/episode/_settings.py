@@ -50,6 +50,7 @@ class SettingsData(TypedDict):
     audit: NotRequired[float]
     hunt_seed: NotRequired[int]
     warm_copies: NotRequired[int]
+    probe_s: NotRequired[float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +73,8 @@ class WorkerSettings:
         audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
         hunt_seed: what decides which.
         warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
+        probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
+            for never.
     """
 
     scenario: Scenario
@@ -87,6 +90,7 @@ class WorkerSettings:
     audit: float = 0.0
     hunt_seed: int = 0
     warm_copies: int = 0
+    probe_s: float = 0.0
 
     def is_audited(self, result: TrialResult) -> bool:
         """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
@@ -120,6 +124,8 @@ class WorkerSettings:
         }
         if self.warm_copies:
             data["warm_copies"] = self.warm_copies
+        if self.probe_s:
+            data["probe_s"] = self.probe_s
         if requires:
             data["requires"] = requires
         return data
@@ -158,6 +164,7 @@ class WorkerSettings:
             audit=data.get("audit", 0.0),
             hunt_seed=data.get("hunt_seed", 0),
             warm_copies=data.get("warm_copies", 0),
+            probe_s=data.get("probe_s", 0.0),
         )
 
 

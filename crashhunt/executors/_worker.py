@@ -27,6 +27,7 @@ from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import (
     Braking,
     Parts,
+    Prober,
     WorkerSettings,
     generators,
     run_episode,
@@ -95,6 +96,7 @@ class Worker:
         self.used = False
         self._pid = os.getpid()
         self._is_copy = False
+        self._prober = Prober(settings.probe_s, settings.crash_on, self._delay) if settings.probe_s else None
         self._settings = settings
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
@@ -170,6 +172,7 @@ class Worker:
                 oracles=self._parts.oracles(),
                 crash_on=self._settings.crash_on,
                 reset=reset,
+                prober=self._prober,
             )
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
@@ -178,6 +181,8 @@ class Worker:
             watchdog.cancel()
             self.change = self._changed(simulator)
             self._tell(simulator)
+            if self._prober is not None and self._prober.why_not:
+                self._notice(f"probes are left out: {self._prober.why_not}")
             result = self._kept(result, simulator, folder)
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)
@@ -229,6 +234,12 @@ class Worker:
             self._noticed.add(notice)
             with (self._settings.scratch / layout.NOTICES).open("a", encoding="utf-8") as file:
                 file.write(f"{notice}\n")
+
+    def _delay(self, wall_s: float) -> None:
+        """Count the time of copies as not the trial's own."""
+        assert self._box is not None
+        self._box.delay(wall_s)
+        watchdog.extend(wall_s)
 
     def _stand_aside(self) -> None:
         """Keep the copy of this process that an agent forks from writing into the recording."""

@@ -15,7 +15,7 @@ from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioEr
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
-from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._directory import HuntDirectory
@@ -23,10 +23,12 @@ from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
 from crashhunt.hunts._preflight import Preflight, why_invalid
+from crashhunt.hunts._probed import look_at_probes
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
-from crashhunt.plans import core_of, disturber, sampler_of, with_settings
+from crashhunt.hunts._workers import settings_of_workers
+from crashhunt.plans import core_of, disturber, sampler_of
 from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
@@ -170,6 +172,7 @@ class Hunt:
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
         near = keep_near_misses(self._place, ledger, settings, progress.notes, self._parallel_here, self._stops)
+        probes = look_at_probes(self._place, ledger, settings, snapshot, self._disturber, self._stops)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         reason = ""
@@ -182,7 +185,7 @@ class Hunt:
             settings,
             stopped,
             ledger.outcomes(),
-            ledger.steps_total(),
+            ledger.steps_total() + (probes.steps if probes is not None else 0),
             time.monotonic() - progress.began,
             tuple(crashes),
             reason,
@@ -191,6 +194,7 @@ class Hunt:
             progress.audit,
             progress.about_kinds()[0],
             near,
+            probes,
         )
 
     def _hunt(
@@ -203,20 +207,7 @@ class Hunt:
         watch: Callable[[HuntStatus], None],
     ) -> StoppedBecause:
         settings, run = self.settings, self.settings.run
-        # The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
-        worker_settings = WorkerSettings(
-            scenario=with_settings(snapshot.scenario(), settings),
-            oracles=settings.oracles,
-            crash_on=settings.crash_on,
-            scratch=self._place.scratch,
-            code=snapshot.code,
-            argument_files=snapshot.argument_files,
-            timeout_s=run.timeout_s,
-            keep_trials=run.keep_trials,
-            warm_copies=run.warm_copies if settings.seeds else 0,
-            audit=run.audit,
-            hunt_seed=settings.seed,
-        )
+        worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         preflight = Preflight(

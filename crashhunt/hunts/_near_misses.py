@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import list_near_misses, write_bundle
-from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
-from crashhunt.plans import with_settings
+from crashhunt.hunts._workers import settings_again
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class _Again:
         """Make bundles of trials; return why some have none."""
         scratch, notes = self.place.scratch / layout.NEAR_MISSES, []
         scratch.mkdir(exist_ok=True)
-        executor = FreshProcessExecutor(self._worker(scratch), parallel=self.parallel)
+        executor = FreshProcessExecutor(settings_again(self.settings, self.snapshot, scratch), parallel=self.parallel)
         waiting = {result.spec.number: result for result in results}
         try:
             for result in results:
@@ -98,19 +98,6 @@ class _Again:
             executor.close()
             shutil.rmtree(scratch, ignore_errors=True)
         return notes
-
-    def _worker(self, scratch: Path) -> WorkerSettings:
-        settings, snapshot = self.settings, self.snapshot
-        return WorkerSettings(
-            scenario=with_settings(snapshot.scenario(), settings),
-            oracles=settings.oracles,
-            crash_on=settings.crash_on,
-            scratch=scratch,
-            code=snapshot.code,
-            argument_files=snapshot.argument_files,
-            timeout_s=settings.run.timeout_s,
-            keep_trials=True,
-        )
 
     def _write(self, result: TrialResult, scratch: Path) -> None:
         folder = scratch_of(scratch, result.spec.number)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._audit import AuditData, AuditReport
+    from crashhunt.hunts._probed import ProbeData, ProbeReport
     from crashhunt.plans import HuntSettings
     from crashhunt.triage import Group
 
@@ -44,6 +45,7 @@ class HuntReportData(TypedDict):
     audit: AuditData | None
     kinds: NotRequired[list[KindData]]
     near_misses: NotRequired[list[CrashSummary]]
+    probes: NotRequired[ProbeData]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class HuntReport:
         settings: what was asked.
         stopped_because: why it ended.
         outcomes: how the trials ended.
-        steps_total: steps of all trials.
+        steps_total: steps of all trials, and of the copies that were asked.
         wall_s: wall time of this run.
         crashes: what was found, the one with the fewest steps first.
         reason: in words, where not one trial was valid.
@@ -64,6 +66,7 @@ class HuntReport:
         audit: what came of running trials without a crash again; None where nobody asked for it.
         kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
         near_misses: that were kept, the most dangerous first.
+        probes: what came of asking copies of trials; None where nobody did.
     """
 
     directory: Path
@@ -79,6 +82,7 @@ class HuntReport:
     audit: AuditReport | None = None
     kinds: tuple[Group, ...] | None = None
     near_misses: tuple[Bundle, ...] = ()
+    probes: ProbeReport | None = None
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -96,6 +100,8 @@ class HuntReport:
             "notes": list(self.notes),
             "audit": self.audit.to_json() if self.audit is not None else None,
         }
+        if self.probes is not None:
+            found["probes"] = self.probes.to_json()
         if self.kinds is not None:
             found["kinds"] = list(map(kind_data, self.kinds))
         if self.settings.run.near_misses:

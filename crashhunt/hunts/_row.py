@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Outcome, ResultData, Value
     from crashhunt.world import ClosestData
 
-__all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "Cell", "TrialRow"]
+__all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "STRESS", "Cell", "TrialRow"]
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
@@ -26,6 +26,9 @@ ORIGINS = ("parent", "origin")
 
 DISTURBANCES = ("disturbances", "log_likelihood")
 """Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
+
+STRESS = ("stress_margin",)
+"""A further one, of hunts with probes: how little it would have taken, 0 to 1."""
 
 Cell: TypeAlias = "Value | None"
 """What a table has in one place; None where a trial has no such value."""
@@ -78,7 +81,8 @@ class TrialRow:
         """Return it as a row of a table that has some columns.
 
         Args:
-            columns: some of `FACTS`, `DISTURBANCES` and `ORIGINS`, ``AGENT.ARGUMENT`` and ``scenario.ARGUMENT``.
+            columns: some of `FACTS`, `DISTURBANCES`, `STRESS` and `ORIGINS`, ``AGENT.ARGUMENT`` and
+                ``scenario.ARGUMENT``.
         """
         data = self.data
         spec, closest, events = data["spec"], _closest(data), data.get("events")
@@ -98,6 +102,7 @@ class TrialRow:
             "origin": spec.get("origin", ""),
             "disturbances": len(data.get("disturbances", ())),
             "log_likelihood": data.get("log_likelihood"),
+            "stress_margin": data["stress"].get("margin") if data.get("stress") else None,
         }
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)

@@ -1,11 +1,12 @@
-"""``--for TIME``: how long a hunt may go on."""
+"""``--for TIME`` and ``--probe TIME``: how long a hunt may go on, how often something is done."""
 
 from __future__ import annotations
 
 import math
 import re
+import sys
 
-__all__ = ["check_duration", "seconds_of"]
+__all__ = ["check_duration", "check_probe", "seconds_of"]
 
 _UNITS = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
 _TIME = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")
@@ -34,3 +35,10 @@ def check_duration(text: str) -> str:
     except ValueError:
         return "give a time above 0, such as 90s, 30m, 2h or 1h30m"
     return ""
+
+
+def check_probe(text: str) -> str:
+    """Return what to give instead of how often copies are asked; empty where that is fine."""
+    if check_duration(text):
+        return "give a time above 0, such as 4s, or leave it out"
+    return "" if not text or sys.platform == "linux" else "leave it out: processes are copied on Linux only"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
-from crashhunt.plans._duration import check_duration
+from crashhunt.plans._duration import check_duration, check_probe
 from crashhunt.trial import CRASHES
 
 __all__ = [
@@ -123,6 +123,11 @@ class TrialOptions(_Options):
         "late_observation, noisy_observation, late_action or module:attribute; none for nothing at all",
         unset="as the scenario says, and nothing where it is silent",
         flag="--disturb", metavar="NAME=RATE,…", separator=",",
+    )  # fmt: skip
+    probe: str = option(
+        "", "how often copies of a trial are asked for the mildest disturbance with which it crashes, such as ``4s``",
+        help="every so many seconds of simulation, ask copies of the trial for the mildest disturbance with which it "
+        "crashes, such as 4s", unset="never", flag="--probe", metavar="TIME", check=check_probe,
     )  # fmt: skip
     seeds: int = option(
         0, "how many traffics there are, each used for many arguments; 0: every trial has its own",

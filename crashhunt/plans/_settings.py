@@ -114,6 +114,11 @@ class HuntSettings(TrialOptions):
     schema: Literal[1] = 1
 
     @property
+    def probe_s(self) -> float:
+        """How often copies of trials are asked, in s of simulation time; 0 for never."""
+        return seconds_of(self.probe) if self.probe else 0.0
+
+    @property
     def most_trials(self) -> int:
         """How many trials it may have; where there is no limit, more than anybody runs."""
         return self.trials or sys.maxsize

@@ -10,6 +10,7 @@ from crashhunt.base import layout
 from crashhunt.base.text import in_lines
 from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
 from crashhunt.report._groups import describe_groups
+from crashhunt.report._probes import describe_probes
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
@@ -53,6 +54,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
             else "No crash was found before the time was up."
         )
     lines += _describe_events(report)
+    lines += describe_probes(report)
     lines += describe_disturbances(report.crashes)
     if report.kinds and len(report.crashes) > 1:
         lines += ["", *describe_groups(report.kinds).splitlines()]

@@ -42,3 +42,4 @@ from ._space import (
     without_folder as without_folder,
 )
 from ._specification import EVERYBODY as EVERYBODY, Overruled as Overruled, TrialSpec as TrialSpec
+from ._stress import Stress as Stress

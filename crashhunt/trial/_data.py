@@ -22,6 +22,7 @@ __all__ = [
     "ResultData",
     "SpecData",
     "SpecExtras",
+    "StressData",
 ]
 
 
@@ -103,6 +104,18 @@ class EscapeData(TypedDict):
     how: str
 
 
+class StressData(TypedDict):
+    """Of a `Stress`."""
+
+    margin: float
+    probes: int
+    steps: int
+    left_out: int
+    disturbance: DisturbanceData | None
+    outcome: str
+    step: int
+
+
 class ResultData(TypedDict):
     """Of a `TrialResult`; ``category`` is that of an outcome which an oracle has brought."""
 
@@ -125,3 +138,4 @@ class ResultData(TypedDict):
     disturbances: NotRequired[list[DisturbanceData]]
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]
+    stress: NotRequired[StressData]

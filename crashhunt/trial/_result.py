@@ -10,6 +10,7 @@ from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
+from crashhunt.trial._stress import Stress
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class TrialResult:
         log_likelihood: that just these disturbances begin in these steps, and no others: the natural logarithm of the
             probability, as the hunt's models have it; None where the hunt has none.
         danger: how near to a crash it came, from 0 (nothing near) to 1 (touched); None where nobody measured it.
+        stress: how little it would have taken; None where nobody asked.
     """
 
     spec: TrialSpec
@@ -64,6 +66,7 @@ class TrialResult:
     disturbances: tuple[Disturbance, ...] = ()
     log_likelihood: float | None = None
     danger: float | None = None
+    stress: Stress | None = None
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -93,13 +96,15 @@ class TrialResult:
             data["log_likelihood"] = finite(self.log_likelihood)
         if self.danger is not None:
             data["danger"] = finite(self.danger)
+        if self.stress is not None:
+            data["stress"] = self.stress.to_json()
         return data
 
     @classmethod
     def from_json(cls, data: ResultData) -> TrialResult:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default."""
         hit, failure = data.get("collision"), data.get("failure")
-        event, escape = data.get("event"), data.get("escape")
+        event, escape, stress = data.get("event"), data.get("escape"), data.get("stress")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=outcome_of(data),
@@ -119,6 +124,7 @@ class TrialResult:
             disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
             log_likelihood=data.get("log_likelihood"),
             danger=data.get("danger"),
+            stress=Stress.from_json(stress) if stress else None,
         )
 
     @property

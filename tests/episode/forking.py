@@ -23,11 +23,11 @@ from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.plugins import locate
 from crashhunt.base.processes import children_of
-from crashhunt.episode import Episode, Nearness, Recorder, seed_everything
+from crashhunt.episode import Episode, Nearness, Prober, Recorder, run_episode, seed_everything
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
-from crashhunt.trial import Disturbance, TrialSpec
+from crashhunt.trial import CRASHES, Disturbance, TrialSpec
 
 STEPS, FIRST, SECOND = 60, 20, 35
 
@@ -188,8 +188,58 @@ def soak(stage, forks=10_000):
     return found
 
 
+def probes(stage):
+    """What copies of trials say, and whether the trials are as they were and crash as the copies did."""
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()})
+    simulator = locate("simulators", "toy")(scenario, stage)
+    box = BlackBox(stage / "blackbox.bin")
+    waited = []
+
+    def run(make, prober=None, **more):
+        box.begin(pid=os.getpid(), trial=0, started=0.0)
+        spec = TrialSpec(0, 4, {}, {"gap_m": 12.0, **more.pop("arguments", {})}, more.pop("steps", 60), **more)
+        oracles = [ReportedCollision(), Overlap()]
+        return run_episode(
+            spec, simulator=simulator, make_agent=make, box=box, oracles=oracles, prober=prober, reset=None
+        )
+
+    def starts_thread(*_):
+        agent = KeepLaneWithSpeed(9.0)
+        agent.thread = threading.Thread(target=threading.Event().wait, daemon=True)
+        agent.thread.start()
+        return agent
+
+    def drives(*_):
+        return KeepLaneWithSpeed(9.0)
+
+    prober = Prober(1.0, CRASHES, waited.append)
+    plain, asked, again = run(drives), run(drives, prober), run(drives, prober)
+    stress = asked.stress
+    milder = replace(stress.disturbance, how_strong=stress.disturbance.how_strong - 0.375)
+    crashed = run(drives, disturbances=(stress.disturbance,))
+    fine = run(drives, disturbances=(milder,), steps=milder.step + 50)
+    late = Prober(100.0, CRASHES, waited.append)
+    found = {
+        "outcomes": [str(one.outcome) for one in (plain, asked, again, crashed, fine)],
+        "same": plain.digest == asked.digest and asked.stress == again.stress and plain == replace(
+            asked, stress=None, wall_s=plain.wall_s, setup_s=plain.setup_s
+        ),
+        "stress": stress.to_json(),
+        "crashed": [str(crashed.outcome), crashed.steps],
+        "waited": len(waited) == stress.probes + again.stress.probes and min(waited) > 0,
+        "never": run(drives, late).stress,
+        "by itself": run(lambda *_: KeepLaneWithSpeed(20.0), prober).stress.to_json(),
+    }  # fmt: skip
+    found["thread"] = run(starts_thread, prober).stress, prober.why_not
+    return found
+
+
 if __name__ == "__main__":
     what, place = sys.argv[1], Path(sys.argv[2])
-    print(json.dumps({"refused": refused, "ends": ends, "soak": soak}.get(what, lambda _: same(what))(place)))
+    print(
+        json.dumps(
+            {"refused": refused, "ends": ends, "soak": soak, "probes": probes}.get(what, lambda _: same(what))(place)
+        )
+    )
     sys.stdout.flush()
     os._exit(0)

@@ -81,6 +81,25 @@ def test_copies_end_with_their_process_and_before_it_when_they_hang(ask):
         time.sleep(0.01)
 
 
+def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):
+    found = ask("probes")
+    assert found["outcomes"] == ["survived", "survived", "survived", "collision", "survived"]
+    assert found["same"]
+    stress = found["stress"]
+    assert 0 < stress["margin"] < 1
+    assert stress["disturbance"]["how_strong"] == 6.0 * stress["margin"]
+    assert found["crashed"] == ["collision", stress["step"]]  # from the start, as in the copy
+    assert stress["probes"] > 4
+    assert stress["steps"] < 8 * 60
+    assert stress["left_out"] > 0
+    assert found["waited"]
+    # Where nobody was asked, or it crashed anyway.
+    assert found["never"] is None
+    assert found["by itself"]["margin"] == 0.0
+    assert found["by itself"]["disturbance"] is None
+    assert found["thread"] == [None, "threads have no copy, and 1 runs besides the first"]
+
+
 @pytest.mark.nightly
 @pytest.mark.timeout(1000)
 def test_ten_thousand_copies_leave_nothing(ask):

@@ -1,0 +1,37 @@
+"""What is told of the probes of a hunt."""
+
+from __future__ import annotations
+
+import statistics
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from crashhunt.hunts import HuntReport
+
+__all__ = ["describe_probes"]
+
+
+def describe_probes(report: HuntReport) -> list[str]:
+    """Return how little it would have taken for trials to crash, and what has been run from the start of it."""
+    found = report.probes
+    if found is None or not found.margins:
+        return []
+    steps = report.steps_total - found.steps
+    safe = sum(margin == 1.0 for margin in found.margins)
+    least, median = min(found.margins), statistics.median(found.margins)
+    said = f"nothing plausible made {safe} of them crash"
+    enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
+    lines = [
+        f"Stress margin of {len(found.margins)} trials: least {least:.2f}, median {median:.2f}; {said}.",
+        f"  {found.probes} copies were asked, with {found.steps} steps beside {steps} of trials{enough}",
+    ]
+    if found.run_again:
+        lines.append(
+            f"  of the {found.run_again} mildest disturbances with which a trial crashed, {len(found.crashes)} made it "
+            "crash from the start as well:"
+        )
+    for bundle in found.crashes:
+        last = max(bundle.result.disturbances, key=lambda one: one.step, default=None)
+        what = f", {last.words}" if last is not None else ""
+        lines.append(f"  {bundle.path}: {bundle.result.summary}{what}")
+    return lines
