@@ -39,6 +39,7 @@ __all__ = [
     "SCENARIO",
     "SCENARIO_FILES",
     "SHOWN",
+    "SMALL",
     "SNAPSHOTS",
     "STACK",
     "TRIALS",
@@ -92,6 +93,9 @@ MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"
 JOB: Final = "job.json"
 ANSWER: Final = "answer.json"
+
+SMALL: Final = ".small"
+"""What the name of a bundle ends with that another one was made smaller to."""
 
 # What is not whole yet begins with a dot, and so does what only this process needs.
 SHOWN: Final = "[!.]*"

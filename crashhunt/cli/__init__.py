@@ -31,6 +31,7 @@ from crashhunt.cli._replay import add_replay
 from crashhunt.cli._report import add_report
 from crashhunt.cli._run import add_run
 from crashhunt.cli._show import add_show
+from crashhunt.cli._shrink import add_shrink
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
@@ -146,7 +147,7 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
+        add_crashes, add_judge, add_shrink, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

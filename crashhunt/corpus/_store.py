@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree
 from crashhunt.corpus._case import Case, read_case
 from crashhunt.recording import write_log
 from crashhunt.snapshots import Snapshot, without_code
 from crashhunt.triage import signature_of
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,7 +55,9 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
         BundleError: the crash is damaged.
         HuntDirectoryError: the folder cannot be written.
     """
-    name = f"{bundle.id}-{bundle.result.digest[:6]}"
+    if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
+        raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
+    name = f"{_id(bundle)}-{bundle.result.digest[:6]}"
     final, building = corpus / name, corpus / f".{name}.{os.getpid()}.part"
     try:
         corpus.mkdir(parents=True, exist_ok=True)
@@ -79,14 +83,18 @@ def _signature(bundle: Bundle) -> dict[str, str | bool]:
     return {name: value for name, value in parts.items() if isinstance(value, str | bool)}
 
 
+def _id(bundle: Bundle) -> str:
+    return bundle.id.removesuffix(layout.SMALL)  # it is the only one there
+
+
 def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     recording = bundle.recording()
-    crash = folder / layout.CRASHES / bundle.id
+    crash = folder / layout.CRASHES / _id(bundle)
     crash.mkdir(parents=True)
     shutil.copyfile(bundle.hunt / layout.HUNT, folder / layout.HUNT)
     snapshot = without_code(Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot), folder / layout.SNAPSHOTS)
     case.write(folder)
-    kept = replace(bundle, snapshot=snapshot.digest, files={})
+    kept = replace(bundle, path=crash, snapshot=snapshot.digest, files={})
     kept.write(into=crash)
     write_log(crash / layout.LOG, recording, views=False)
     if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > _MOST:

@@ -31,8 +31,9 @@ def list_near_misses(directory: Path) -> list[Bundle]:
 
 
 def _folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
-    """The folders of crashes, also of one that has lost its ``crash.json``."""
-    found = (path for path in (directory / place).glob(layout.SHOWN) if path.is_dir())
+    """The folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller."""
+    folders = (directory / place).glob(layout.SHOWN)
+    found = (path for path in folders if path.is_dir() and not path.name.endswith(layout.SMALL))
     return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
 
 
@@ -44,12 +45,16 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     Args:
         directory: of the hunt, or of the bundle itself.
         crash: its id or that of a near miss, the beginning of it, or its trial's number, with leading zeros or without.
+            One that was made smaller is only meant by its whole id.
 
     Raises:
         BundleError: there is no such crash.
     """
     if (directory / layout.CRASH).is_file() and not crash:
         return read_bundle(directory)
+    small = directory / layout.CRASHES / crash
+    if crash.endswith(layout.SMALL) and small.parent == directory / layout.CRASHES and small.is_dir():
+        return read_bundle(small)
     bundles = _readable(directory, crash) if crash else list_bundles(directory) or list_near_misses(directory)[:1]
     if not bundles:
         if not directory.is_dir():

@@ -342,7 +342,9 @@ def _compare(
     found: Checked, rows: dict[int, TrialResult], bundles: dict[str, Bundle], settings: HuntSettings | None
 ) -> None:
     """What the ledger and the bundles say about each other."""
-    by_trial = {bundle.result.spec.number: bundle for bundle in bundles.values()}
+    # One that was made smaller is another trial, of which the ledger knows nothing.
+    own = (bundle for name, bundle in bundles.items() if not name.endswith(layout.SMALL))
+    by_trial = {bundle.result.spec.number: bundle for bundle in own}
     damaged = {int(name.partition("-")[0]) for name in found.damaged_crashes if name.partition("-")[0].isdecimal()}
     for number, bundle in by_trial.items():
         where = str(bundle.path)

@@ -172,7 +172,8 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-    crashes = sum(1 for _ in (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}"))
+    found = (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}")
+    crashes = sum(not path.parent.name.endswith(layout.SMALL) for path in found)
     state: State = ("running" if alive else "killed") if said == "running" else _ENDED.get(said, "error")
     if state == "finished" and crashes:
         state = "crashed"

@@ -118,6 +118,7 @@ class Story:
         """Return words and table."""
         lines = [f"{self.bundle.id}  ({self.bundle.result.outcome.category})"]
         lines.append(f"  seed {self.bundle.result.spec.seed}, {format_arguments(self.bundle.result)}")
+        lines += _shrunk(self.bundle)
         lines += ["", *self.words(), "", *self.table()]
         return in_lines(lines)
 
@@ -325,6 +326,15 @@ def _words(action: Sequence[float] | None, names: Sequence[str]) -> str:
     if action is None:
         return "not recorded"
     return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, action, strict=False))
+
+
+def _shrunk(bundle: Bundle) -> list[str]:
+    """What it was before somebody made it smaller."""
+    told = bundle.added.get("shrunk")
+    if not isinstance(told, dict):
+        return []
+    gone, changed = (told.get(name) or {} for name in ("removed", "changed"))
+    return [f"  {told.get('of')} made smaller: {len(gone)} left out, {len(changed)} arguments plainer"]
 
 
 def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[StepRecord]:

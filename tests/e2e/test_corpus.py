@@ -185,9 +185,12 @@ def test_two_add_the_same_at_once(kept, monkeypatch):
 
 
 def test_ctrl_c_ends_all_and_tells_what_has_ended(kept):
-    drive(kept, DRIVER.replace("return", "import time; time.sleep(60); return"))
+    begun = kept.folder / "begun"
+    drive(kept, DRIVER.replace("return", f"import time; open({str(begun)!r}, 'w'); time.sleep(60); return"))
     running = kept.start("corpus", "run", "kept crashes", "--parallel", "1")
-    time.sleep(1.0)
+    deadline = time.monotonic() + 60
+    while not begun.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
     running.send_signal(signal.SIGINT)
     out, err = running.communicate(timeout=60)
     assert running.returncode == 130, err

@@ -1,0 +1,94 @@
+"""``crashhunt shrink``."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.base.text import in_lines
+from crashhunt.cli._common import add_crash, add_json, integer, say
+from crashhunt.cli._exit_codes import INTERRUPTED
+from crashhunt.cli._progress import shown_progress
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.shrinking import Shrunk
+
+__all__ = ["add_shrink"]
+
+_BUDGET = 500
+
+
+def add_shrink(commands: Commands) -> None:
+    """Add the command."""
+    shrink = commands.add_parser(
+        "shrink",
+        help="make a crash smaller while it stays the same kind of crash",
+        description="Make a crash smaller while it stays the same kind of crash: leave others out, drop disturbances, "
+        "bring arguments to their defaults and to round numbers. Each step is really run, by the code of the snapshot. "
+        "What is left is a crash of its own beside the first, ID.small. Interrupted, it leaves the best that it has, "
+        "and the same command goes on from there. Exits with 1 where the crash does not come again.",
+    )
+    add_crash(shrink)
+    shrink.add_argument(
+        "--budget", metavar="TRIALS", type=integer, default=_BUDGET,
+        help=f"how many trials may be run; default: {_BUDGET}",
+    )  # fmt: skip
+    shrink.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
+    add_json(shrink)
+    shrink.set_defaults(command=_shrink)
+
+
+def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.base.signals import stop_requests
+    from crashhunt.crashes import find_bundle
+    from crashhunt.shrinking import shrink
+
+    for name, value in (("--budget", options.budget - 1), ("--parallel", options.parallel)):
+        if value < 0:
+            raise UsageError(f"{name} is {vars(options)[name[2:]]}", fix="give at least 1")
+    if options.directory.is_file():
+        raise UsageError(
+            f"{str(options.directory)!r} is a file, and what is left would be written beside the crash",
+            fix="unpack it (it is a zip file), see whose code it has, and give the folder",
+        )
+    bundle = find_bundle(options.directory, options.crash)
+    with stop_requests() as asked, shown_progress(f"making {bundle.id} smaller", as_json=options.json) as watch:
+        found = shrink(
+            bundle, budget=options.budget, parallel=options.parallel, watch=watch, stopped=lambda: bool(asked)
+        )
+    say(_told(found), as_json=options.json)
+    if options.json:
+        print(json.dumps(found.to_json()))
+    if found.ended == "interrupted":
+        return INTERRUPTED
+    return 1 if found.verdict == "not_reproduced" else 0
+
+
+def _told(found: Shrunk) -> str:
+    was, small = found.bundle.result, found.small
+    lines = [f"{found.bundle.id}: {was.summary}"]
+    if small is None:
+        what = "it cannot be made smaller" if found.verdict == "not_reproduced" else "nothing could be taken away"
+        lines.append(f"  {what}: {found.why}" if found.why else f"  {what}")
+        return in_lines(lines)
+    (before, after), result = found.actors, small.result
+    lines += [
+        f"{small.id}: {result.summary}",
+        f"  {before} were seen, and {after} are left; {was.steps} steps, and now {result.steps}",
+        *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),
+        f"  {found.trials} trials"
+        + (f"; ended before it was done: {found.why or found.ended}" if _early(found) else ""),
+        f"  saved in {small.path}",
+        "  confirmed: a fresh process did the same to the bit"
+        if small.confirmed
+        else "  flaky: a fresh process did not do the same",
+    ]
+    return in_lines(lines)
+
+
+def _early(found: Shrunk) -> bool:
+    return found.ended != "done"

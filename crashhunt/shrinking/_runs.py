@@ -1,0 +1,243 @@
+"""Running candidates: on warm workers, several at a time, and what came of each is remembered."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.base.integrity import digest_of_data
+from crashhunt.crashes import write_bundle
+from crashhunt.episode import scratch_of
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
+from crashhunt.triage import signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.replays import Rerun
+    from crashhunt.triage import Signature
+    from crashhunt.trial import TrialResult, TrialSpec
+
+__all__ = ["Ran", "Runs", "StoppedError"]
+
+_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
+_FIRST = 10**6  # the numbers of candidates; no hunt has a trial of such
+
+
+class StoppedError(Exception):
+    """It was given up: the budget is used up, or somebody has asked for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ran:
+    """What came of a candidate.
+
+    Args:
+        same: whether it crashes in the same manner.
+        steps: after how many.
+        digest: of what was recorded.
+    """
+
+    same: bool
+    steps: int = 0
+    digest: str = ""
+
+
+class Runs:
+    """Runs candidates for a crash.
+
+    Args:
+        rerun: the crash.
+        signature: what must stay.
+        scratch: a folder for the workers.
+        memory: a file with what came of candidates when it was interrupted; written as it goes on.
+        parallel: trials at a time.
+        budget: how many may be run.
+        stopped: asked now and then whether to give up.
+        watch: called with how many have been run, and how many may be.
+
+    Attributes:
+        count: how many have been run, or are known from the last time.
+        most_steps: what takes longer to crash does not count as the same.
+    """
+
+    def __init__(
+        self,
+        rerun: Rerun,
+        signature: Signature,
+        scratch: Path,
+        memory: Path,
+        *,
+        parallel: int,
+        budget: int,
+        stopped: Callable[[], bool],
+        watch: Watch | None,
+    ) -> None:
+        self.count = 0
+        self.most_steps = max(1, rerun.bundle.result.steps_begun)
+        self._rerun, self._signature, self._memory_file = rerun, signature, memory
+        self._budget, self._stopped, self._watch = budget, stopped, watch
+        self._scratch = scratch
+        self._memory = _remembered(memory)
+        worker = replace(rerun.worker, scratch=scratch, keep_trials=False)
+        kind = PoolExecutor if _is_todays(rerun) else FreshProcessExecutor
+        self._executor = kind(worker, parallel=parallel)
+        self._next = _FIRST
+
+    def first(self, candidates: Sequence[TrialSpec]) -> int | None:
+        """Return the place of the first candidate that crashes in the same manner; None where none does.
+
+        Which it is does not depend on how many run at a time.
+
+        Raises:
+            StoppedError: it was given up before that was known.
+            CrashhuntError: no trial can be run at all.
+        """
+        found: dict[int, Ran] = {}
+        numbers: dict[int, int] = {}
+        for place, spec in enumerate(candidates):
+            if self.count + len(found) + len(numbers) >= self._budget:
+                break
+            if (known := self._memory.get(self._key(spec))) is not None:
+                found[place] = known
+                if known.same:
+                    break
+                continue
+            numbers[self._next] = place
+            self._executor.submit(self._numbered(spec))
+            self._next += 1
+        best = min((place for place, ran in found.items() if ran.same), default=len(candidates))
+        try:
+            while any(place < best for place in numbers.values()):
+                for result in self._executor.completed(_LOOK_EVERY_S):
+                    if result.spec.number not in numbers:
+                        continue  # of what has been given up
+                    place = numbers.pop(result.spec.number)
+                    found[place] = ran = self._judged(result)
+                    self._remember(candidates[place], ran)
+                    if ran.same and place < best:
+                        best = place
+                        self._give_up(numbers, best)
+                if self._stopped():
+                    raise StoppedError
+        finally:
+            self._give_up(numbers, -1)
+        self.count += sum(1 for place in found if place <= best)
+        if self._watch is not None:
+            self._watch(min(self.count, self._budget), self._budget)
+        if best < len(candidates):
+            return best
+        if len(found) < len(candidates):
+            raise StoppedError
+        return None
+
+    def entered(self, spec: TrialSpec) -> tuple[str, ...]:
+        """Return who has entered in a candidate of which that was asked; nobody where the simulator does not know.
+
+        Raises:
+            StoppedError: it was given up.
+        """
+        number = self._next
+        self._executor.submit(self._numbered(spec))
+        self._next += 1
+        self.count += 1
+        results: list[TrialResult] = []
+        while not results:
+            results = [one for one in self._executor.completed(_LOOK_EVERY_S) if one.spec.number == number]
+            if self._stopped():
+                raise StoppedError
+        folder = scratch_of(self._scratch, number)
+        names: list[str] = []
+        same = self._judged(results[0], keep=True).digest == self._rerun.bundle.result.digest
+        with suppress(OSError, ValueError):
+            names = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8")) if same else []
+        shutil.rmtree(folder, ignore_errors=True)
+        return tuple(dict.fromkeys(names))
+
+    def close(self) -> None:
+        """End every process."""
+        self._executor.close()
+
+    def _numbered(self, spec: TrialSpec) -> TrialSpec:
+        return replace(spec, number=self._next, max_steps=min(spec.max_steps, self.most_steps))
+
+    def _give_up(self, numbers: dict[int, int], above: int) -> None:
+        doomed = [number for number, place in numbers.items() if place > above]
+        if doomed:
+            self._executor.cancel(above=min(doomed) - 1)
+            for number in doomed:
+                del numbers[number]
+
+    def _judged(self, result: TrialResult, *, keep: bool = False) -> Ran:
+        """Say whether it is the same; of a collision, only where it may be, as that takes a while."""
+        was, folder = self._rerun.bundle.result, scratch_of(self._scratch, result.spec.number)
+        same = result.outcome is was.outcome
+        if was.collision is not None and result.collision is not None:
+            same = same and (was.collision.agent, was.collision.role) == (
+                result.collision.agent, result.collision.role,
+            )  # fmt: skip
+        if same:
+            same = self._signature_of(result, folder) == self._signature
+        if result.kept and not keep:  # else it is the worker's, which goes on in it
+            shutil.rmtree(folder, ignore_errors=True)
+        return Ran(same, result.steps, result.digest)
+
+    def _signature_of(self, result: TrialResult, folder: Path) -> Signature | None:
+        if result.collision is None and result.failure is not None:
+            return signature_of(replace(self._rerun.bundle, result=result))
+        try:
+            lanes = read_map(self._scratch, folder)
+            made = self._scratch / "made"
+            copy = Path(shutil.copytree(folder, self._scratch / "copy"))
+            bundle = write_bundle(made, result, copy, hunt_seed=0, snapshot="0", lanes=lanes)
+            return signature_of(bundle)
+        except BundleError:  # it died before it had recorded anything
+            return None
+        finally:
+            for made_here in ("made", "copy"):
+                shutil.rmtree(self._scratch / made_here, ignore_errors=True)
+
+    def _key(self, spec: TrialSpec) -> str:
+        return digest_of_data({**spec.to_json(), "number": 0, "most_steps": self.most_steps})
+
+    def _remember(self, spec: TrialSpec, ran: Ran) -> None:
+        key = self._key(spec)
+        self._memory[key] = ran
+        line = json.dumps({"key": key, "same": ran.same, "steps": ran.steps, "digest": ran.digest})
+        with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # a full disk is told in the end
+            file.write(f"{line}\n")
+
+
+def _remembered(file: Path) -> dict[str, Ran]:
+    found: dict[str, Ran] = {}
+    with suppress(OSError):
+        for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError, KeyError, TypeError):  # the last line may have been cut off
+                data = json.loads(line)
+                found[data["key"]] = Ran(bool(data["same"]), int(data["steps"]), str(data["digest"]))
+    return found
+
+
+def _is_todays(rerun: Rerun) -> bool:
+    """Whether the crashhunt that runs is this one, so that it is told of trials as this one tells its own."""
+    if not rerun.worker.code:
+        return True
+    files = rerun.snapshot.manifest["files"]
+    ours = {name: entry for name, entry in files.items() if f"/{layout.PACKAGE.name}/executors/" in name}
+    return bool(ours) and all(_is_ours(name, entry["size"]) for name, entry in ours.items())
+
+
+def _is_ours(name: str, size: int) -> bool:
+    path = layout.PACKAGE / name.partition(f"/{layout.PACKAGE.name}/")[2]
+    try:
+        return os.stat(path).st_size == size  # noqa: PTH116
+    except OSError:
+        return False

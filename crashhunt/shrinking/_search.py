@@ -1,0 +1,81 @@
+"""How a crash is made smaller: what is tried, in which order. Nothing here knows what a trial is.
+
+Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) for what there are
+several of; for a value, the plainest first, as Hypothesis does it. There is no chance in it: what is tried depends on
+what came of what was tried before, and not on how many run at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.trial import Value
+
+__all__ = ["Tried", "fewest", "plainest"]
+
+T = TypeVar("T")
+Tried = Callable[[Sequence[T]], int | None]
+"""Tries candidates; returns the place of the first that still crashes in the same manner, None where none does."""
+
+_DIGITS = (1, 2, 3, 4)
+
+
+def fewest(items: Sequence[T], tried: Tried[tuple[T, ...]], likely: Sequence[Sequence[T]] = ()) -> tuple[T, ...]:
+    """Return as few of some items as still do it: without any one of those that are left, it does not.
+
+    Args:
+        items: all of them, with which it is known to do it.
+        tried: tries some of them.
+        likely: what is tried first.
+    """
+    found = tuple(items)
+    if not found:
+        return found
+    if (first := tried([(), *map(tuple, likely)])) is not None:
+        found = ((), *map(tuple, likely))[first]
+    parts = 2
+    while len(found) > 1:
+        chunks = _chunks(found, min(parts, len(found)))
+        rests = [tuple(item for item in found if item not in chunk) for chunk in map(set, chunks)]
+        candidates = [*chunks, *rests] if len(chunks) > 2 else chunks
+        good = tried(candidates)
+        if good is None:
+            if len(chunks) == len(found):
+                break
+            parts = len(chunks) * 2
+        else:
+            found = candidates[good]
+            parts = 2 if good < len(chunks) else max(2, len(chunks) - 1)
+    return found
+
+
+def _chunks(items: tuple[T, ...], count: int) -> list[tuple[T, ...]]:
+    ends = [len(items) * number // count for number in range(count + 1)]
+    return [items[begin:end] for begin, end in pairwise(ends)]
+
+
+def plainest(value: Value, default: Value | None) -> list[Value]:
+    """Return what could stand for a value, the plainest first: its default, then rounder numbers.
+
+    Args:
+        value: of an argument.
+        default: of the argument; None where nobody knows.
+    """
+    found = list(_plainer(value, default))
+    return list(dict.fromkeys(found[: found.index(value)] if value in found else found))
+
+
+def _plainer(value: Value, default: Value | None) -> Iterator[Value]:
+    if default is not None and type(default) is type(value):
+        yield default
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return
+    for digits in _DIGITS:
+        rounded = float(f"{value:.{digits}g}")
+        yield round(rounded) if isinstance(value, int) else rounded
