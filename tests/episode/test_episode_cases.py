@@ -294,9 +294,35 @@ def test_what_nobody_asked_for_does_not_end_it(run):
     assert (first.outcome, first.event) == (Outcome.COLLISION, None)  # where it collides in the same step, it collided
 
 
+def test_an_oracle_that_wants_it_sees_the_map_before_it_looks(run):
+    class Looks:
+        name = "looks"
+
+        def __init__(self):
+            self.seen = []
+
+        def see_map(self, lanes):
+            self.seen.append(lanes)
+
+        def check(self, scene, agents):
+            self.seen.append(scene.time_s)
+            return []
+
+    class Mapped(Scripted):
+        def lanes(self):
+            return ["a lane"]
+
+    for simulator, expected in ((Mapped(), ["a lane"]), (Scripted(), ())):
+        looks = Looks()
+        run(simulator, oracles=(looks,), max_steps=2)
+        assert looks.seen == [expected, 0.0, 0.5, 1.0]
+
+
 def test_who_overlaps_before_the_first_step_was_never_on_the_road(run):
     result = run(Scripted({0: {"scene": {"xs": (0.0, 4.0, 20.0)}}}))
-    assert (result.outcome, result.steps, result.digest) == (Outcome.INVALID, 0, "")
+    assert (result.outcome, result.steps, result.digest, result.danger) == (Outcome.INVALID, 0, "", None)
+    assert run(Scripted({1: {"scene": {"xs": (0.0, 4.0, 20.0)}}})).danger == 1.0
+    assert 0.0 <= run(Scripted()).danger < 1.0
     assert (result.failure.kind, result.failure.message) == ("invalid", "ego and second overlap before the first step")
     assert result.collision is not None
     red = Event("red_light", "ego", "ego ran 'c'")

@@ -66,6 +66,7 @@ def check(ledger, frozen):
     assert ledger.outcomes() == {"collision": 3, "finished": 2, "invalid": 1, "survived": 3}
     assert ledger.steps_total() == 42
     assert ledger.nearest_miss().spec.number == 2
+    assert ledger.most_dangerous(3) == ([2, 4, 6] if frozen > 3 else [])
     assert ledger.snapshot_of(4) == "0123456789abcdef"
     assert ledger.traffic_events() == (
         {"running_a_red_light": (8, 2), "emergency_braking": (2, 2)} if frozen > 1 else {}
