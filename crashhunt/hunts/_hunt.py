@@ -320,8 +320,8 @@ class Hunt:
             return
         if result.outcome is Outcome.INVALID:
             progress.last_invalid = result
-        elif result.collision is None and result.failure is None:
-            progress.nearest = max(progress.nearest or result, result, key=lambda one: one.nearness)
+        else:
+            progress.take(result)
         if result.kept:
             write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
@@ -382,6 +382,7 @@ class Hunt:
             *progress.about_kinds(),
             progress.time_left_s,
             sum(crash.disturbed for crash in crashes) if self._disturber is not None else None,
+            progress.stressed,
         )
 
 

@@ -45,6 +45,8 @@ class HuntStatus:
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
         time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        stressed: the trial of this run for whose crash it would have taken the least; None where nobody asked, or where
+            nothing plausible would have done it.
     """
 
     phase: str
@@ -62,6 +64,7 @@ class HuntStatus:
     newest_kind_trials: int | None = None
     time_left_s: float = math.inf
     disturbed: int | None = None
+    stressed: TrialResult | None = None
 
 
 @dataclass(slots=True)
@@ -76,6 +79,7 @@ class Progress:
     crashes: list[Bundle] = field(default_factory=list)
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     nearest: TrialResult | None = None
+    stressed: TrialResult | None = None
     last_invalid: TrialResult | None = None
     notes: list[str] = field(default_factory=list)
     audit: AuditReport | None = None
@@ -87,6 +91,14 @@ class Progress:
         self.crashes = crashes
         if run.keep_going:
             self.kinds = Kinds(run.distinct, crashes, before.get("newest_kind"))
+
+    def take(self, result: TrialResult) -> None:
+        """Take note of a trial without a crash."""
+        if result.collision is None and result.failure is None:
+            self.nearest = max(self.nearest or result, result, key=lambda one: one.nearness)
+        if result.stress is not None and result.stress.disturbance is not None:
+            least = self.stressed.stress.margin if self.stressed is not None and self.stressed.stress else 1.0
+            self.stressed = result if result.stress.margin < least else self.stressed
 
     def save(self, bundle: Bundle) -> None:
         """Take in a crash that has been saved."""

@@ -68,6 +68,12 @@ class TrialRow:
         return self.data.get("danger")
 
     @property
+    def stress_margin(self) -> float | None:
+        """How little it would have taken, 0 to 1; None where nobody asked."""
+        stress = self.data.get("stress")
+        return stress.get("margin") if stress else None
+
+    @property
     def arguments(self) -> Mapping[str, Mapping[str, Value]]:
         """What its agents were given, by agent and name."""
         return self.data["spec"].get("arguments", {})
@@ -102,7 +108,7 @@ class TrialRow:
             "origin": spec.get("origin", ""),
             "disturbances": len(data.get("disturbances", ())),
             "log_likelihood": data.get("log_likelihood"),
-            "stress_margin": data["stress"].get("margin") if data.get("stress") else None,
+            "stress_margin": self.stress_margin,
         }
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)

@@ -125,15 +125,17 @@ def _trials(directory: Path) -> dict[str, object]:
     """Outcomes, and what was tried against how it went."""
     path = directory / layout.LEDGER
     if not has_begun(path):
-        return {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "thinned": False}
+        return {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "thinned": False}
     ledger = Ledger(path)
     try:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
         every = max(1, math.ceil(total / _DOTS))
-        trials = []
+        trials, stress = [], None
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
-            outcome = row.outcome
+            outcome, margin = row.outcome, row.stress_margin
+            if margin is not None and (stress is None or margin < stress["margin"]):
+                stress = {"margin": margin, "trial": row.number}
             if number % every == 0 or outcome.category != "no crash":
                 values = {
                     f"{agent}.{name}" if len(row.arguments) > 1 else name: value
@@ -155,6 +157,7 @@ def _trials(directory: Path) -> dict[str, object]:
             "categories": {name: Outcome(name).category for name in outcomes},
             "steps": ledger.steps_total(),
             "trials": trials,
+            "stress": stress,
             "thinned": every > 1,
         }
     finally:

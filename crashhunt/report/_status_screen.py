@@ -92,6 +92,9 @@ class Watcher:
                 near = Text(near.plain, no_wrap=True, overflow="ellipsis")
             left -= len(self._console.render_lines(near))
             rows.append(near)
+        if status.stressed is not None and len(status.workers) < left:
+            rows.append(Text(one_line(_stressed(status.stressed)), no_wrap=True, overflow="ellipsis"))
+            left -= 1
         nodes = _nodes(status, max(1, left // 2))
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 
@@ -221,6 +224,13 @@ def _done(status: HuntStatus) -> float:
     by_count = status.done / status.planned if status.planned else 0.0
     whole_s = status.elapsed_s + status.time_left_s
     return max(by_count, status.elapsed_s / whole_s if whole_s > 0 else 1.0)
+
+
+def _stressed(result: TrialResult) -> str:
+    stress = result.stress
+    assert stress is not None
+    what = stress.disturbance.words if stress.disturbance is not None else ""
+    return f"least stress margin: {stress.margin:.2f}, trial {result.spec.number}, {what}, {format_arguments(result)}"
 
 
 def _near(result: TrialResult) -> str:

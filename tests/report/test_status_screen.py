@@ -16,7 +16,7 @@ from crashhunt.hunts import HuntStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
 from crashhunt.report._status_screen import _line, describe_kinds
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 TITLE = "crashhunt: intersection-two-agents, crashhunt.agents:CarFollowing, crashhunt.agents:KeepLaneWithSpeed"
@@ -51,6 +51,18 @@ def test_every_worker_is_on_the_screen(width, height, workers):
     for number in range(120, 120 + workers):
         shown = "setting up" if number == 120 else f"step {number - 20}"
         assert any(str(number) in line and shown in line for line in lines), number
+
+
+def test_the_least_stress_margin_is_shown_where_there_is_room():
+    found = status(2)
+    brake = Disturbance(80, "ahead", "brake", 2.25, 3.0, "ego")
+    stressed = replace(found.nearest, stress=Stress(0.375, 20, 900, 0, brake, "collision", 120))
+    for height, shown in ((12, True), (6, False)):
+        console = Console(width=100, height=height, force_terminal=True, color_system=None)
+        with console.capture() as captured:
+            console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
+        line = "least stress margin: 0.38, trial 123, whoever is ahead of ego brakes with 2.25 m/s² for 3 s"
+        assert (line in captured.get()) is shown
 
 
 def test_kinds_of_crashes_and_when_the_last_new_one_came():
