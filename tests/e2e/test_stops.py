@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from conftest import mostly_nightly
 
 from crashhunt.base.processes import children_of
 
@@ -52,13 +53,16 @@ def left_in(folder: Path) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("everybody", [True, False], ids=["every process", "the group"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, everybody):
+STOPS = [(number, whom) for number in (signal.SIGTERM, signal.SIGHUP) for whom in ("every process", "the group")]
+BY_DAY = [(signal.SIGTERM, "every process"), (signal.SIGHUP, "the group")]  # both of each
+
+
+@pytest.mark.parametrize(("number", "whom"), mostly_nightly(STOPS, BY_DAY))
+def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     words = ("run", "h", "2", "8", "30", *FINE, *SLOW, "--json")
     process = toy.start(*words, start_new_session=True)
     wait_for(lambda: len(rows(toy.folder / "h")) >= 2)
-    if everybody:  # as systemd and SLURM do; the workers come first
+    if whom == "every process":  # as systemd and SLURM do; the workers come first
         for pid in reversed(tree(process.pid)):
             os.kill(pid, number)
     else:  # as timeout does: the process, and then its group, so that the process is told twice
