@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.episode._observer import Observer
 from crashhunt.trial import Outcome
-from crashhunt.world import ApproachMeter, danger_of
+from crashhunt.world import ApproachMeter, DangerMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ _EVERY = 256
 
 
 class Nearness(Observer):
-    """Measures the closest approach, and adds it to the result.
+    """Measures the closest approach and the danger, and adds them to the result.
 
     Args:
         take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
@@ -33,27 +33,35 @@ class Nearness(Observer):
     def __init__(self, take_frames: Callable[[], Sequence[Frame]]) -> None:
         self._take_frames = take_frames
         self._meter = ApproachMeter(())
+        self._dangers = DangerMeter((), 1.0)
 
     @property
     def closest(self) -> ClosestApproach:
         """The closest approach so far, up to the last complete step."""
-        self._meter.measure(self._take_frames())
+        self._measure()
         return self._meter.closest
 
     def begin(self, episode: Episode) -> None:
         """Note who is controlled."""
         self._meter = ApproachMeter(episode.names)
+        self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Measure, now and then."""
         if step and step % _EVERY == 0:
-            self._meter.measure(self._take_frames())
+            self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Add the closest approach."""
+        """Add the closest approach and the danger."""
         closest = self.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
         if result.outcome is Outcome.INVALID:
             return replace(result, closest=closest)
-        return replace(result, closest=closest, danger=1.0 if result.outcome.is_traffic_crash else danger_of(closest))
+        touched = result.outcome.is_traffic_crash or closest.gap_m <= 0.0
+        return replace(result, closest=closest, danger=1.0 if touched else self._dangers.danger)
+
+    def _measure(self) -> None:
+        frames = self._take_frames()
+        self._meter.measure(frames)
+        self._dangers.add(frames)

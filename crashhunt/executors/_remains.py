@@ -13,7 +13,7 @@ from crashhunt.episode import scratch_of
 from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
 from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, closest_approach, danger_of
+from crashhunt.world import ClosestApproach, DangerMeter, closest_approach
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -108,6 +108,7 @@ def _result(
     output = read_tail(folder / layout.RUN_LOG)
     stack = read_tail(folder / layout.STACK)
     agent, steps, sim_time_s, digest, closest = "", 0, 0.0, "", ClosestApproach()
+    danger: float | None = None
     phase = header.phase if header is not None else Phase.SETUP
     try:
         recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
@@ -119,6 +120,9 @@ def _result(
     else:
         steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
         closest = closest_approach(scenes, recording.agents)
+        meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
+        meter.add([scene.frame for scene in scenes])
+        danger = meter.danger
         if outcome is Outcome.AGENT_ERROR:
             agent = recording.agents[0] if len(recording.agents) == 1 else ""
         elif header is not None and phase == Phase.ACT:
@@ -135,7 +139,7 @@ def _result(
         sim_time_s=sim_time_s,
         digest=digest,
         closest=closest,
-        danger=None if outcome is Outcome.INVALID else danger_of(closest),
+        danger=danger,
         failure=failure,
         wall_s=wall_s,
         worker=header.pid if header is not None else 0,

@@ -1,7 +1,7 @@
 from ._approach import ApproachMeter as ApproachMeter, approaches as approaches, closest_approach as closest_approach
 from ._closest import ClosestApproach as ClosestApproach, ClosestData as ClosestData
 from ._contact import Touch as Touch, first_contact as first_contact, reachable_m as reachable_m
-from ._danger import danger_of as danger_of
+from ._danger import DangerMeter as DangerMeter, DangerousMoment as DangerousMoment, dangers as dangers
 from ._events import (
     EVENT_WORDS as EVENT_WORDS,
     LIMITS as LIMITS,

@@ -1,0 +1,209 @@
+"""The danger of steps and of trials, on ways that can be calculated, and against a search that knows nothing of it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from crashhunt.world import Actor, DangerMeter, Frame, Roster, dangers, outlines_overlap
+
+LENGTH, WIDTH = 5.0, 2.0
+
+
+def frame(*ways, names=("ego", "other", "third"), step_s=0.1):
+    """Each way is (x, y, heading) of a front at each step."""
+    arrays = [np.array(way, float) for way in ways]
+    roster = Roster(tuple(Actor(name, "car", LENGTH, WIDTH) for name, _ in zip(names, arrays, strict=False)))
+    places = np.stack([array[:, :2] for array in arrays], axis=1).reshape(len(arrays[0]), -1)
+    headings = np.stack([array[:, 2] for array in arrays], axis=1)
+    moved = [np.hypot(*np.gradient(array[:, :2], step_s, axis=0).T) for array in arrays]
+    return Frame(roster, np.hstack((places, headings, np.stack(moved, axis=1))))
+
+
+def straight(x, y, heading, speed, steps=100, step_s=0.1):
+    far = speed * step_s * np.arange(steps)
+    return np.stack((x + far * math.cos(heading), y + far * math.sin(heading), np.full(steps, heading)), axis=1)
+
+
+def round_a_bend(radius, speed, steps=100, *, start=0.0, way=1):
+    """To the left of a circle's middle for 1, against that for -1."""
+    angle = start + way * speed * 0.1 / radius * np.arange(steps)
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle), angle + way * math.pi / 2), axis=1)
+
+
+def level(*ways, agents=("ego",), step_s=0.1):
+    return dangers([frame(*ways, step_s=step_s)], agents, step_s)
+
+
+def test_in_a_queue_it_is_the_time_gap():
+    steps, most = level(straight(0, 0, 0, 10), straight(15, 0, 0, 10))  # 10 m between them, at 10 m/s
+    assert steps[:60] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+    assert (most.agent, most.other) == ("ego", "other")
+    assert level(straight(0, 0, 0, 10), straight(25, 0, 0, 10))[0].max() == pytest.approx(math.exp(-2 / 1.2), abs=0.02)
+
+
+def test_who_follows_is_in_danger_and_not_who_is_followed():
+    ways = straight(0, 0, 0, 10), straight(15, 0, 0, 10)
+    assert level(*ways, agents=("other",))[0].max() == 0.0
+    steps, most = level(*ways, agents=("other", "ego"))
+    assert most.agent == "ego"
+    assert steps.max() == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+
+
+def test_oncoming_traffic_in_a_bend_is_no_danger():
+    steps, _ = level(round_a_bend(50, 12), round_a_bend(54, 12, start=1.5, way=-1))
+    assert steps.max() == 0.0
+    meets, _ = level(round_a_bend(50, 12), round_a_bend(51, 12, start=3.6, way=-1))  # in the same lane, soon
+    assert meets.max() > 0.4
+
+
+@pytest.mark.parametrize("late_s", [0.6, 1.4])
+@pytest.mark.parametrize("first", [True, False])
+def test_where_ways_cross_it_is_the_time_between_the_two(late_s, first):
+    """Both pass the same place at 10 m/s; a car takes (5 + 2) m / (10 m/s) to leave the way of the other."""
+    ego = straight(-50, 0, 0, 10)
+    other = straight(0, -50 - (1 if first else -1) * 10 * (late_s + 0.7), math.pi / 2, 10)
+    steps, _ = level(ego, other)
+    # Samples are 0.3 s apart, and the place that both share is met at its edge.
+    assert late_s - 0.3 < -1.2 * math.log(steps.max()) < late_s + 0.65
+
+
+def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there():
+    def stop(braking):
+        time = 0.1 * np.arange(120)
+        left = np.minimum(np.maximum(time - 3, 0), 15 / braking)
+        x = 15 * np.minimum(time, 3) + 15 * left - braking * left**2 / 2
+        return np.stack((x, 0 * x, 0 * x), axis=1)
+
+    for braking in (3.0, 8.0):
+        standing = 45 + 225 / (2 * braking) + 1 + LENGTH
+        steps, most = level(stop(braking), straight(standing, 0, 0, 0, 120))
+        assert steps.max() == pytest.approx(braking / 12, rel=0.2), braking
+        assert most.other == "other"
+        assert most.step > 20
+
+
+def test_nobody_near_is_no_danger_and_nobody_there_is_unknown():
+    far = frame(straight(0, 0, 0, 10), straight(0, 300, 0, 10))
+    steps, most = dangers([far], ("ego",), 0.1)
+    assert (steps.max(), most.danger, most.other) == (0.0, 0.0, "")
+    for names, danger in ((("ego",), 0.0), (("nobody",), None), ((), None)):
+        meter = DangerMeter(names, 0.1)
+        meter.add([far])
+        assert meter.danger == danger
+    assert DangerMeter(("ego",), 0.1).danger is None
+
+
+def test_that_of_a_trial_grows_with_time_and_is_that_of_the_agent_in_the_greatest():
+    queue = [straight(0, 0, 0, 10, 1000), straight(15, 0, 0, 10, 1000), straight(45, 0, 0, 10, 1000)]
+
+    def danger(steps, agents=("ego",)):
+        meter = DangerMeter(agents, 0.1)
+        meter.add([frame(*(way[:steps] for way in queue))])
+        return meter.danger
+
+    whole = math.exp(-1 / 1.2) * 100
+    assert danger(1000) == pytest.approx(whole / (whole + 10), rel=0.02)
+    assert 0 < danger(100) < danger(300) < danger(1000) < 1
+    assert danger(300, ("ego", "other", "third")) == danger(300)
+    assert danger(300, ("other",)) < danger(300)
+
+
+def test_it_does_not_matter_how_scenes_come_in():
+    generator = np.random.default_rng(3)
+    ways = [straight(0, 0, 0, 8, 900), straight(20, 0, 0, 8, 900) + generator.normal(0, 0.05, (900, 3))]
+    whole = frame(*ways)
+    at_once, in_parts = DangerMeter(("ego",), 0.1), DangerMeter(("ego",), 0.1)
+    at_once.add([whole])
+    for first in range(0, 900, 7):
+        in_parts.add([whole._replace(columns=whole.columns[first : first + 7])])
+    assert in_parts.danger == at_once.danger
+
+
+def test_a_long_episode_is_measured_in_parts_that_add_up(monkeypatch):
+    from crashhunt.world import _danger
+
+    whole = frame(straight(0, 0, 0, 8, 2000), straight(20, 0, 0, 8, 2000))
+    at_once, in_parts = DangerMeter(("ego",), 0.1), DangerMeter(("ego",), 0.1)
+    at_once.add([whole])
+    monkeypatch.setattr(_danger, "_WINDOW", 600)
+    for first in range(0, 2000, 256):
+        in_parts.add([whole._replace(columns=whole.columns[first : first + 256])])
+    assert sum(len(part.columns) for part in in_parts._frames) < 1100
+    assert in_parts.danger == pytest.approx(at_once.danger, rel=0.02)
+
+
+def test_long_steps_are_filled_in():
+    """A car that crosses between two scenes is seen, and a queue is as dangerous as with short steps."""
+    ego, leader = straight(0, 0, 0, 10, 12, 1.0), straight(15, 0, 0, 10, 12, 1.0)
+    steps, _ = level(ego, leader, step_s=1.0)
+    assert steps[:8] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+    crossing = straight(34, -84, math.pi / 2, 20, 12, 1.0)  # on the ego's way at 4.2 s, which is there at 3.4 s
+    steps, _ = level(ego, crossing, step_s=1.0)
+    assert steps.max() > math.exp(-1.2 / 1.2)
+
+
+def test_a_bridge_is_no_crossing():
+    under = frame(straight(-50, 0, 0, 10), straight(0, -58, math.pi / 2, 10))
+    assert dangers([under], ("ego",), 0.1)[1].danger > 0.3
+    heights = np.zeros((100, 4))
+    heights[:, 1] = 6.0
+    assert dangers([under._replace(heights=heights)], ("ego",), 0.1)[1].danger == 0.0
+
+
+places = st.floats(-40, 40)
+others = st.tuples(places, places, st.floats(-3.1, 3.1), st.floats(2, 20), st.floats(-0.3, 0.3))
+
+
+@settings(max_examples=12, deadline=None)
+@given(bend=st.floats(-0.03, 0.03), speed=st.floats(4, 14), ways=st.lists(others, min_size=1, max_size=2))
+def test_it_is_what_a_search_over_time_shifts_finds(bend, speed, ways):
+    """By brute force: the agent is moved along its own way in time until it overlaps the other one.
+
+    Two cars that overlap by a hair's breadth may or may not be seen, so that the answer lies between those for whole
+    cars, and for the inner part of cars.
+    """
+    steps = 60
+    angle = bend * speed * 0.1 * np.arange(steps)
+    moves = speed * 0.1 * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    ego = np.column_stack((np.cumsum(moves, axis=0), angle))
+    theirs = []
+    for x, y, heading, pace, turning in ways:
+        way = heading + turning * 0.1 * np.arange(steps)
+        far = pace * 0.1 * np.stack((np.cos(way), np.sin(way)), axis=1)
+        theirs.append(np.column_stack((np.array((x, y)) + np.cumsum(far, axis=0), way)))
+    if any(np.hypot(*(ego - other)[:, :2].T).min() < 8 for other in theirs):
+        return  # they touch in earnest, or all but
+    measured, _ = level(ego, *theirs)
+    whole, inner = (searched(ego, theirs, *size) for size in ((LENGTH, WIDTH), (1.0, 0.8)))
+    found = -1.2 * np.log(np.maximum(measured, 1e-9))
+    sampled = np.arange(0, steps, 3)
+    # The way ends; nobody knows what is beyond.
+    known = found[sampled] < 0.1 * (steps - 1 - sampled) - 0.3
+    assert np.all(found[sampled][known] > whole[sampled][known] - 0.15)
+    assert np.all(found[sampled] < inner[sampled] + 0.15)
+
+
+def searched(ego, theirs, length, width):
+    """The least shift in time, in s, with which an overlap comes about at each step."""
+    steps = len(ego)
+    nearest = np.full(steps, np.inf)
+
+    def outline(place):
+        x, y, heading = place
+        out = (LENGTH - length) / 2
+        return x - out * math.cos(heading), y - out * math.sin(heading), heading, length, width
+
+    for step in range(0, steps, 3):
+        for other in theirs:
+            for at in range(steps):
+                lag = 0.1 * abs(at - step)
+                if lag >= nearest[step] or math.dist(ego[at][:2], other[step][:2]) > 12:
+                    continue
+                follows = at < step and math.cos(ego[at][2] - other[step][2]) >= math.cos(math.pi / 6)
+                if not follows and outlines_overlap(outline(ego[at]), outline(other[step])):
+                    nearest[step] = lag
+    return nearest
