@@ -90,7 +90,7 @@ def child_step(scenario: str) -> dict[str, float]:
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.simulators.sumo import SumoSimulator
     from crashhunt.trial import TrialSpec
-    from crashhunt.world import ApproachMeter
+    from crashhunt.world import ApproachMeter, DangerMeter
 
     steps, speed = 1000, 10.0
     clock = time.process_time  # what others do on this machine costs nothing
@@ -156,6 +156,7 @@ def child_step(scenario: str) -> dict[str, float]:
             (Recorder, "scene", "record"),
             (KeepLaneWithSpeed, "act", "agent"),
             (ApproachMeter, "measure", "closest approach"),
+            (DangerMeter, "_summed", "danger"),
         ):
             timed(owner, name, label)
         total = whole() * steps

@@ -107,6 +107,7 @@ class Fast(Remembers):
 def test_one_that_is_another_trial_in_a_fresh_process_is_not_kept(toy):
     (toy.folder / "fast.py").write_text(REMEMBERS)
     words = ("run", "h", "1", "3", "30", "--scenario", "toy", "--seed", "4", "--agent", "fast:Fast")
+    words += ("--set", "gap_m=25", "--crash-on", "hang")
     done = toy.crashhunt(*words, "--near-misses", "3", "--json").json
     assert all("a near miss, is another one in a fresh process" in note for note in done["notes"])
     assert len(done["near_misses"]) + len(done["notes"]) == 3
