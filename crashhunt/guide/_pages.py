@@ -24,8 +24,8 @@ SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference
 
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "judge", "film", "hand-over", "suites",
-    "cluster", "compare", "train",
+    "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "judge", "fault", "film", "hand-over",
+    "suites", "cluster", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip

@@ -163,10 +163,8 @@ class Hunt:
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         stopped: StoppedBecause
-        if progress.crashes and not settings.run.keep_going:
-            stopped = "crash"
-        elif progress.last_wanted is not None:
-            stopped = "distinct"
+        if progress.is_done:
+            stopped = "distinct" if settings.run.keep_going else "crash"
         else:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         watch(self._status(progress, "confirming"))
@@ -195,6 +193,7 @@ class Hunt:
             progress.about_kinds()[0],
             near,
             probes,
+            progress.kinds.at_fault if progress.kinds is not None else None,
         )
 
     def _hunt(
@@ -258,7 +257,7 @@ class Hunt:
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.last_wanted is not None:
-                return "crash" if progress.found else "distinct"
+                return "distinct" if run.keep_going else "crash"
         except CrashhuntError as error:  # of which file is for somebody who wants to mend it
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
@@ -313,7 +312,7 @@ class Hunt:
         progress.ended_here += 1
         progress.outcomes[str(result.outcome)] += 1
         if result.outcome in settings.crash_on:
-            if settings.run.keep_going:
+            if progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
             else:
                 progress.found[result.spec.number] = result

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base.errors import BundleError
-from crashhunt.triage import Group, groups_of, signature_of
+from crashhunt.triage import Group, fault_of, groups_of, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,9 +43,19 @@ class Kinds:
         wanted: how many kinds are enough; 0 for never.
         crashes: that were saved before.
         newest: when the last new kind came, in s since the epoch; None where nobody knows.
+        only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
     """
 
-    def __init__(self, wanted: int, crashes: Sequence[Bundle] = (), newest: float | None = None) -> None:
+    def __init__(
+        self,
+        wanted: int,
+        crashes: Sequence[Bundle] = (),
+        newest: float | None = None,
+        *,
+        only_at_fault: bool = False,
+    ) -> None:
+        self._only_at_fault = only_at_fault
+        self._at_fault: set[int] = set()
         self._wanted = wanted
         self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
         self._groups: tuple[Group, ...] | None = None
@@ -78,6 +88,11 @@ class Kinds:
         """The least number of a trial up to which there are enough kinds; None where there are not."""
         return self._until
 
+    @property
+    def at_fault(self) -> tuple[int, ...] | None:
+        """The trials whose crashes are the agent's own fault; None where that was not asked."""
+        return tuple(sorted(self._at_fault)) if self._only_at_fault else None
+
     def refresh(self, crashes: Sequence[Bundle]) -> None:
         """Take the crashes as they are now: they have been confirmed."""
         for bundle in crashes:
@@ -89,12 +104,15 @@ class Kinds:
     def _sign(self, bundle: Bundle) -> Signature | None:
         try:
             signature = signature_of(bundle)
+            if self._only_at_fault and fault_of(bundle).is_egos:
+                self._at_fault.add(bundle.result.spec.number)
         except BundleError:
             return None  # which is of no kind, and which crashhunt check tells of
         self._signed[bundle.result.spec.number] = signature, bundle
         self._groups = None
         seen: set[Signature] = set()
-        for number in sorted(self._signed) if self._wanted else ():
+        counted = self._at_fault if self._only_at_fault else self._signed
+        for number in sorted(counted) if self._wanted else ():
             seen.add(self._signed[number][0])
             if len(seen) >= self._wanted:
                 self._until = number

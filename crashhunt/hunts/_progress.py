@@ -89,8 +89,10 @@ class Progress:
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
         self.crashes = crashes
-        if run.keep_going:
-            self.kinds = Kinds(run.distinct, crashes, before.get("newest_kind"))
+        if run.keep_going or run.only_at_fault:
+            wanted = run.distinct if run.keep_going else 1
+            newest = before.get("newest_kind")
+            self.kinds = Kinds(wanted, crashes, newest, only_at_fault=run.only_at_fault)
 
     def take(self, result: TrialResult) -> None:
         """Take note of a trial without a crash."""
@@ -116,6 +118,11 @@ class Progress:
     def last_wanted(self) -> int | None:
         """The number of the trial with which the hunt has found what it is after; None where it goes on."""
         return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the hunt had found what it is after before it began."""
+        return bool(self.crashes) if self.kinds is None else self.kinds.until is not None
 
     @property
     def all_crashes(self) -> tuple[TrialResult, ...]:

@@ -46,6 +46,7 @@ class HuntReportData(TypedDict):
     kinds: NotRequired[list[KindData]]
     near_misses: NotRequired[list[CrashSummary]]
     probes: NotRequired[ProbeData]
+    at_fault: NotRequired[list[int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,7 @@ class HuntReport:
         kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
         near_misses: that were kept, the most dangerous first.
         probes: what came of asking copies of trials; None where nobody did.
+        at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
     """
 
     directory: Path
@@ -83,6 +85,7 @@ class HuntReport:
     kinds: tuple[Group, ...] | None = None
     near_misses: tuple[Bundle, ...] = ()
     probes: ProbeReport | None = None
+    at_fault: tuple[int, ...] | None = None
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -106,4 +109,6 @@ class HuntReport:
             found["kinds"] = list(map(kind_data, self.kinds))
         if self.settings.run.near_misses:
             found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
+        if self.at_fault is not None:
+            found["at_fault"] = list(self.at_fault)
         return found

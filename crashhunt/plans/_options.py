@@ -155,6 +155,12 @@ class RunOptions(_Options):
         "apart; 0: never stop for that",
         flag="--distinct", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
+    only_at_fault: bool = option(
+        False, "stop for crashes only that are the agent's own fault; the others are kept, and the hunt goes on",
+        help="hunt for crashes that are the agent's own fault, as rules with names tell it; others, and those of which "
+        "nobody can tell, are kept and do not end the hunt",
+        flag="--only-at-fault",
+    )  # fmt: skip
     deterministic: bool = option(
         False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",
         flag="--deterministic",

@@ -17,11 +17,20 @@ def describe_groups(groups: Sequence[Group]) -> str:
     if not groups:
         return "No crash was saved."
     hunts = {bundle.hunt for group in groups for bundle in group.bundles}
-    rows = [["crashes", "kind", "shortest", "steps"]]
+    faults = any(group.fault for group in groups)
+    rows = [["crashes", "kind", *(["at fault"] if faults else []), "shortest", "steps"]]
     for group in groups:
         shortest = group.shortest
         name = shortest.id if len(hunts) == 1 else str(shortest.path)
-        rows.append([str(len(group.bundles)), str(group.signature), name, str(shortest.result.steps)])
+        rows.append(
+            [
+                str(len(group.bundles)),
+                str(group.signature),
+                *([group.fault] if faults else []),
+                name,
+                str(shortest.result.steps),
+            ]
+        )
     count = sum(len(group.bundles) for group in groups)
     words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'kind' if len(groups) == 1 else 'kinds'}"
     return "\n".join([f"{words}:", "", *_lines(rows)])
@@ -31,6 +40,9 @@ def _lines(rows: list[list[str]]) -> list[str]:
     """Numbers to the right, words to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
-        f"{count:>{widths[0]}}  {kind:<{widths[1]}}  {name:<{widths[2]}}  {steps:>{widths[3]}}"
-        for count, kind, name, steps in rows
+        "  ".join(
+            cell.rjust(width) if place in (0, len(row) - 1) else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
     ]

@@ -178,6 +178,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "seed": str(result.spec.seed),
             "steps": str(result.steps),
             "simulation time": f"{result.sim_time_s:.1f} s",
+            **({"at fault": story.fault.verdict} if story.encounter is not None else {}),
             "digest": result.digest,
             "snapshot": bundle.snapshot,
             **_disturbances(result),

@@ -13,6 +13,7 @@ from crashhunt.report._events import about_events
 from crashhunt.report._judgement import about_judgement
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.triage import fault_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -59,6 +60,7 @@ class Story:
         self.other = hit.other if hit else ""
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.judgement = judgement_of(bundle)
+        self.fault = fault_of(bundle, self.recording)
         tried = bundle.result.escape
         self.escape = tried.step if tried is not None else None
         if braking is not None:
@@ -83,6 +85,7 @@ class Story:
                 "too_late_step": tried.too_late if tried and not self._braking else None,
             },
             "judged": self.judgement.to_json() if self.judgement is not None else None,
+            "fault": self.fault.to_json(),
             "moments": [
                 {
                     name: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -104,6 +107,7 @@ class Story:
         sentences += about_disturbances(recording, result, self._first_step())
         if self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
+            sentences += self._about_fault()
         sentences += about_events(recording, self._first_step(), besides=result.event)
         hit = result.collision
         if result.event is not None or (hit is not None and hit.role == "alone"):
@@ -194,6 +198,15 @@ class Story:
             step, side = changed
             sentences.append(f"{agent} decided to change lanes to the {side} at step {step}.")
         return [*sentences, *self._about_escape()]
+
+    def _about_fault(self) -> list[str]:
+        """Whose fault it was, and by which rule."""
+        verdict, found = self.fault.verdict, self.fault.findings
+        if verdict == "nobody can tell":
+            return [f"At fault: {verdict}{', as rules contradict each other' if found else ''}."]
+        who = {"ego": self.agent, "the other": self.other, "both": f"both {self.agent} and {self.other}"}[verdict]
+        rules = "; and ".join(f"by the rule {one.rule!r}: {one.words} ({one.source})" for one in found)
+        return [f"At fault: {who}, {rules}."]
 
     def _about_escape(self) -> list[str]:
         """Until when braking would have helped; nothing where nobody knows."""

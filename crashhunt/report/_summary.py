@@ -56,6 +56,10 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += _describe_events(report)
     lines += describe_probes(report)
     lines += describe_disturbances(report.crashes)
+    if report.at_fault is not None and report.crashes:
+        all_of_them = len(report.crashes)
+        what = "crash is" if all_of_them == 1 else "crashes are"
+        lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
     if report.kinds and len(report.crashes) > 1:
         lines += ["", *describe_groups(report.kinds).splitlines()]
     crashes = by_likelihood(report.crashes)

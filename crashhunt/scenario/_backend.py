@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from crashhunt.base.errors import ScenarioError
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
+    from crashhunt.world import RightOfWay
 
 __all__ = ["Accelerator", "Backend", "CompiledCore", "Configuration"]
 
@@ -123,6 +124,7 @@ class Backend:
         side_effect: of a stranger's scenario, returns what it would do besides simulating, in words that follow "the
             crash is a stranger's, and"; empty where it does nothing else. It is given the values of the trial's
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
+        right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
         watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
             is not used again.
     """
@@ -151,6 +153,7 @@ class Backend:
     configurations: tuple[Configuration, ...] = ()
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
+    right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
     watched: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -1,3 +1,4 @@
+from ._fault import Fault as Fault, FaultData as FaultData, Verdict as Verdict, fault_of as fault_of
 from ._groups import (
     Group as Group,
     GroupData as GroupData,

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base.errors import BundleError
+from crashhunt.crashes import judgement_of
+from crashhunt.triage._fault import fault_of
 from crashhunt.triage._signature import Signature, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from crashhunt.crashes import Bundle
+    from crashhunt.triage._fault import Verdict
     from crashhunt.triage._signature import SignatureData
 
 __all__ = ["Group", "GroupData", "Groups", "group_crashes", "groups_of"]
@@ -25,6 +29,8 @@ class GroupData(TypedDict):
     count: int
     outcome: str
     manner: str
+    fault: str
+    avoidable: bool | None
     first: str
     shortest: str
     members: list[str]
@@ -37,10 +43,24 @@ class Group:
     Args:
         signature: of all of them.
         bundles: in the order in which they were given; at least one.
+        faults: whose fault each was; empty where that was not asked.
     """
 
     signature: Signature
     bundles: tuple[Bundle, ...]
+    faults: tuple[Verdict, ...] = ()
+
+    @property
+    def fault(self) -> str:
+        """Whose fault they were: one of `Verdict`, or ``mixed``; empty where that was not asked."""
+        said = set(self.faults)
+        return "mixed" if len(said) > 1 else next(iter(said), "")
+
+    @property
+    def avoidable(self) -> bool | None:
+        """Whether runs have avoided all of them, or none; None where that differs, or is not known of all."""
+        said = {_avoidable(bundle) for bundle in self.bundles}
+        return said.pop() if len(said) == 1 else None
 
     @property
     def first(self) -> Bundle:
@@ -60,6 +80,8 @@ class Group:
             "count": len(self.bundles),
             "outcome": self.signature.outcome,
             "manner": self.signature.manner,
+            "fault": self.fault,
+            "avoidable": self.avoidable,
             "first": str(self.first.path),
             "shortest": str(self.shortest.path),
             "members": [str(bundle.path) for bundle in self.bundles],
@@ -86,12 +108,26 @@ def group_crashes(bundles: Iterable[Bundle]) -> Groups:
         bundles: of one hunt or several; the log of each is read.
     """
     signed, left_out = [], []
+    faults: dict[Path, Verdict] = {}
     for bundle in bundles:
         try:
-            signed.append((signature_of(bundle), bundle))
+            recording = bundle.recording() if bundle.result.collision is not None else None
+            signed.append((signature_of(bundle, recording), bundle))
+            faults[bundle.path] = fault_of(bundle, recording).verdict
         except BundleError as error:
             left_out.append(str(error))
-    return Groups(groups_of(signed), tuple(left_out))
+    groups = (
+        replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles)) for group in groups_of(signed)
+    )
+    return Groups(tuple(groups), tuple(left_out))
+
+
+def _avoidable(bundle: Bundle) -> bool | None:
+    """What was run of one: by `judge`, or by the hunt that found it."""
+    judgement, escape = judgement_of(bundle), bundle.result.escape
+    if judgement is not None and judgement.avoidable is not None:
+        return judgement.avoidable
+    return True if escape is not None and escape.step is not None else None
 
 
 def groups_of(signed: Iterable[tuple[Signature, Bundle]]) -> tuple[Group, ...]:

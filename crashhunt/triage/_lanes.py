@@ -21,6 +21,8 @@ __all__ = ["LaneMap"]
 _NEAR_M = 60.0  # around where it happens; a town has thousands of lanes further away
 _ALONG = math.radians(30)  # a vehicle within so much of a lane's direction drives along it
 _CROSSES = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
+_MOVED_M = 0.4  # sideways; less is drifting within a lane
+_OVER_M = 0.1
 _END_M = 0.5  # who is nearer to the end of a lane leaves it ahead, not sideways
 
 
@@ -101,16 +103,49 @@ class LaneMap:
 
         Who drives on where its lane ends, or turns off from it, does not.
         """
-        poses = [
-            (np.array(scene.points[row]), scene.headings[row])
-            for scene in scenes
-            if (row := scene.roster.index.get(actor)) is not None
-        ]
-        return any(
-            self._has_left(lane, after)
-            for before, after in pairwise(poses)
-            if (lane := self._driven(before)) is not None
+        return self.left_sideways(scenes, actor) is not None
+
+    def left_sideways(self, scenes: Sequence[Scene], actor: str) -> int | None:
+        """Return the place of the last scene before which an actor left a lane over its side; None if it did not."""
+        poses = _poses(scenes, actor)
+        return next(
+            (
+                place
+                for (_, before), (place, after) in reversed(list(pairwise(poses)))
+                if (lane := self._driven(before)) is not None and self._has_left(lane, after)
+            ),
+            None,
         )
+
+    def reaches_over(self, scenes: Sequence[Scene], actor: str) -> bool:
+        """Whether an actor in the end reaches into the lane beside its own, having moved towards it."""
+        poses = _poses(scenes, actor)
+        if not poses:
+            return False
+        last_place, (point, heading) = poses[-1]
+        row = scenes[last_place].roster.index[actor]
+        half_width = scenes[last_place].roster.actors[row].width / 2
+        for _, before in poses:
+            lane = self._driven(before)
+            if lane is None:
+                continue
+            end = lane.place(point)
+            if not end.inside or abs(math.remainder(end.heading - heading, math.tau)) >= _ALONG:
+                continue  # that lane has ended by now, or it turned off
+            moved = (end.aside_m - lane.place(before[0]).aside_m) * (1 if end.aside_m > 0 else -1)
+            if moved < _MOVED_M or abs(end.aside_m) + half_width - lane.half_width < _OVER_M:
+                return False
+            edge = point + math.copysign(half_width, end.aside_m) * np.array(
+                [-math.sin(end.heading), math.cos(end.heading)]
+            )
+            return any(
+                abs(other.aside_m) <= beside.half_width
+                and abs(math.remainder(other.heading - end.heading, math.tau)) < _ALONG
+                for beside in self._lanes
+                if beside is not lane
+                for other in (beside.place(edge),)
+            )
+        return False
 
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
         """The lane along which it drives: of several that lie over each other, the one whose middle is nearest."""
@@ -138,3 +173,12 @@ class LaneMap:
             if beside is not lane
             for other in (beside.place(point),)
         )
+
+
+def _poses(scenes: Sequence[Scene], actor: str) -> list[tuple[int, tuple[NDArray[np.float64], float]]]:
+    """Where an actor was and how it was turned, each with the place of its scene."""
+    return [
+        (place, (np.array(scene.points[row]), scene.headings[row]))
+        for place, scene in enumerate(scenes)
+        if (row := scene.roster.index.get(actor)) is not None
+    ]

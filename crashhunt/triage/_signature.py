@@ -134,8 +134,14 @@ def _of_a_collision(
     if not hit.other:
         return Signature(outcome, hit.role, "off road", place=place)
     changes = [lanes.leaves_sideways(scenes, actor) for actor in (hit.agent, hit.other)]
+    manner = _manner(recording, hit)
+    if manner in ("side swipe", "rear end") and not any(changes):  # they touched before half a lane had been crossed
+        late = [scene for scene in scenes if scene.time_s >= scenes[-1].time_s - _BEFORE_S / 2]
+        changes = [
+            lanes.reaches_over(scenes, actor) or lanes.reaches_over(late, actor) for actor in (hit.agent, hit.other)
+        ]
     lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
-    return Signature(outcome, hit.role, _manner(recording, hit), lane_change, place)
+    return Signature(outcome, hit.role, manner, lane_change, place)
 
 
 def _manner(recording: Recording, hit: Collision) -> str:

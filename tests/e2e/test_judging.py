@@ -14,7 +14,10 @@ HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 
 
 def test_what_is_found_is_kept_and_told(toy):
-    toy.crashhunt("run", "h", "1", "1", "300", *HUNT)
+    found = toy.crashhunt("run", "h", "1", "2", "300", *HUNT, "--only-at-fault", "--json").json
+    assert (found["stopped_because"], found["trials_run"], found["at_fault"]) == ("crash", 1, [0])
+    (group,) = toy.crashhunt("crashes", "h", "--json").json["groups"]
+    assert (group["fault"], group["avoidable"]) == ("ego", True)  # the hunt has run the brakes
     before = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
     found = toy.crashhunt("judge", "h", "--runs", "9", "--parallel", "2", "--json")
     (judged,) = found.json["judged"]
@@ -29,6 +32,7 @@ def test_what_is_found_is_kept_and_told(toy):
         name: value for name, value in before.items() if name != "integrity"
     }
     assert "by braking (at up to 8.0 m/s²); that was run" in toy.crashhunt("show", "h").out
+    assert "At fault: ego, by the rule 'rear end': ego drove into the back of leader" in toy.crashhunt("show", "h").out
     assert toy.crashhunt("show", "h", "--json").json["judged"] == {
         name: value for name, value in judged.items() if name != "crash"
     }

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import UsageError
+from crashhunt.hunts import _kinds
 from crashhunt.hunts._kinds import Kinds, kind_data
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
@@ -54,3 +55,16 @@ def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
     assert not RunSettings().checked().keep_going
     with pytest.raises(UsageError, match="--distinct is -1"):
         RunSettings(distinct=-1).checked()
+
+
+def test_only_the_agents_own_crashes_count_where_that_was_asked(monkeypatch):
+    monkeypatch.setattr(_kinds, "fault_of", lambda bundle: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
+    kinds = Kinds(1, only_at_fault=True)
+    kinds.add(crash(3, "KeyError"), 1)
+    assert (kinds.until, kinds.at_fault) == (None, ())
+    kinds.add(crash(6, "KeyError"), 2)
+    assert (kinds.until, kinds.at_fault) == (6, (6,))
+    kinds.add(crash(4, "IndexError"), 3)
+    assert (kinds.until, kinds.at_fault) == (4, (4, 6))
+    assert len(kinds.groups()) == 2  # all are shown
+    assert Kinds(2, [crash(3, "KeyError")]).at_fault is None

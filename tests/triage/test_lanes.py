@@ -50,6 +50,21 @@ def test_who_changes_to_the_lane_beside_is_seen_wherever_the_road_lies(angle, x,
     assert not lanes.leaves_sideways(scenes, "nobody")
 
 
+@pytest.mark.parametrize("goes_over", [True, False])
+@pytest.mark.parametrize("side", [1, -1])
+def test_who_touches_before_half_a_lane_is_crossed_reaches_over(goes_over, side):
+    lanes = LaneMap([lane(*[(x, y * side) for x, y in points]) for points in TWO], (100.0, 0.0))
+    aside = np.linspace(0, 1.2 if goes_over else 0.5, 20) * side
+    scenes = drive([(80 + k, y, 0.06 * side) for k, y in enumerate(aside)])
+    assert lanes.reaches_over(scenes, "ego") is goes_over
+    assert not lanes.leaves_sideways(scenes, "ego")
+    assert not lanes.reaches_over(scenes, "nobody")
+    beyond = drive([(80 + k, -y, 0.06 * side) for k, y in enumerate(aside)])  # there is no lane on that side
+    assert not lanes.reaches_over(beyond, "ego")
+    still = drive([(80 + k, 1.2 * side, 0.0) for k in range(20)])  # it drives so all the time
+    assert not lanes.reaches_over(still, "ego")
+
+
 def test_a_bend_is_no_change_of_lanes():
     lanes = LaneMap([lane(*arc(20, 0, 2)), lane(*arc(23.2, 0, 2))], (15, 10))
     way = [(x, y, a) for (x, y), a in zip(arc(20, 0.1, 1.9), np.linspace(0.1, 1.9, 60), strict=True)]

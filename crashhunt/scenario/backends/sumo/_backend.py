@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from crashhunt.base.errors import ScenarioError
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
+    from crashhunt.world import RightOfWay
 
 __all__ = ["BACKEND"]
 
@@ -90,6 +91,12 @@ def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError |
     return explained(message, output, scenario)
 
 
+def _right_of_way(scenario: Scenario) -> RightOfWay | None:
+    from crashhunt.scenario.backends.sumo._right_of_way import right_of_way
+
+    return right_of_way(scenario)
+
+
 def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications: Iterable[str]) -> str:
     from crashhunt.scenario.backends.sumo._side_effects import side_effect
 
@@ -128,4 +135,5 @@ BACKEND = Backend(
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     explained=_explained,
     side_effect=_side_effect,
+    right_of_way=_right_of_way,
 )

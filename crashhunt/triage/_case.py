@@ -1,0 +1,256 @@
+"""What the rules about fault look at: the last seconds of two actors, their lanes, and what happened in the traffic."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.triage._lanes import LaneMap
+    from crashhunt.world import Event, RightOfWay, Scene
+
+__all__ = ["SAME_WAY", "Case", "Way"]
+
+_WINDOW_S = 4.0  # what was longer ago has not led to it
+SAME_WAY = math.radians(45)
+_LATELY_S = 1.5
+_BEFORE_S = 1.0  # as long as the first half of a lane change takes
+_SIDEWAYS_M = 0.3  # less is drifting
+_BESIDE_M = 1.2  # of the path that another one drives; less is in its way
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How an actor moved: before the crash, a row a scene.
+
+    Args:
+        id: of the actor.
+        points: x and y of its front bumper, shape (n, 2), in m.
+        headings: shape (n,), in rad.
+        speeds: shape (n,), in m/s.
+        length: in m.
+        width: in m.
+    """
+
+    id: str
+    points: NDArray[np.float64]
+    headings: NDArray[np.float64]
+    speeds: NDArray[np.float64]
+    length: float
+    width: float
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """The centre of its outline, shape (n, 2), in m."""
+        return self.points - self.length / 2 * np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A collision of two.
+
+    Args:
+        agent: the controlled vehicle.
+        other: whom it collided with.
+        scenes: to the end of the step in which they touched.
+        time_s: of the first contact.
+        began_s: when the episode began.
+        lanes: around the place.
+        events: of the last seconds, each with its simulation time.
+        right_of_way: of the map, where it says.
+        lane: where the agent was in the end; empty where nobody knows.
+    """
+
+    agent: str
+    other: str
+    scenes: Sequence[Scene]
+    time_s: float
+    began_s: float
+    lanes: LaneMap
+    events: tuple[tuple[float, Event], ...] = ()
+    right_of_way: RightOfWay | None = None
+    lane: str = ""
+
+    @cached_property
+    def before(self) -> list[Scene]:
+        """The last scenes before the contact in which both were there."""
+        found = [
+            scene
+            for scene in self.scenes
+            if self.time_s - _WINDOW_S - 1e-6 <= scene.time_s < self.time_s - 1e-6
+            and self.agent in scene.roster.index
+            and self.other in scene.roster.index
+        ]
+        return found or list(self.scenes[-1:])
+
+    @cached_property
+    def through(self) -> list[Scene]:
+        """The same and the scene after the contact."""
+        last = self.scenes[-1]
+        there = self.agent in last.roster.index and self.other in last.roster.index
+        return [*self.before, last] if there and last is not self.before[-1] else self.before
+
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """Of the scenes before, in s before the contact; the first one is the longest ago."""
+        return np.array([self.time_s - scene.time_s for scene in self.before])
+
+    def way(self, actor: str) -> Way:
+        """Return how one of them moved before the contact."""
+        return self._ways[actor]
+
+    @cached_property
+    def _ways(self) -> dict[str, Way]:
+        return {actor: self._way(actor) for actor in (self.agent, self.other)}
+
+    def _way(self, actor: str) -> Way:
+        rows = [(scene, scene.roster.index[actor]) for scene in self.before]
+        scene, row = rows[-1]
+        known = scene.roster.actors[row]
+        return Way(
+            actor,
+            np.array([scene.points[row] for scene, row in rows]),
+            np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
+            np.array([scene.speeds[row] for scene, row in rows]),
+            known.length,
+            known.width,
+        )
+
+    def partner(self, actor: str) -> str:
+        """Return the other one of the two."""
+        return self.other if actor == self.agent else self.agent
+
+    @cached_property
+    def turn(self) -> float:
+        """The angle between their headings just before, in rad, within 0 and pi."""
+        own, other = self.way(self.agent), self.way(self.other)
+        return abs(math.remainder(own.headings[-1] - other.headings[-1], math.tau))
+
+    @property
+    def same_way(self) -> bool:
+        """Whether they drove the same way just before."""
+        return self.turn < SAME_WAY
+
+    def turned(self, since_s: float) -> float:
+        """The greatest angle between their headings from so many s before the contact on, in rad."""
+        own, other = self.way(self.agent), self.way(self.other)
+        turns = np.abs((own.headings - other.headings + math.pi) % math.tau - math.pi)
+        return float(turns[self.times <= since_s + 1e-6].max(initial=self.turn))
+
+    def ahead_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's centre is ahead of the other's, along the other's heading, in m."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        dx, dy = own.centers[back] - other.centers[back]
+        return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
+
+    def gap_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's rear is ahead of the other's front, along the other's heading, in m; at that scene."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        return self.ahead_m(actor, back) - (own.length + other.length) / 2
+
+    def aside_m(self, actor: str, back: int = -1) -> float:
+        """How far an actor's centre is to the left of the other's, across the other's heading, in m."""
+        own, other = self.way(actor), self.way(self.partner(actor))
+        dx, dy = own.centers[back] - other.centers[back]
+        return float(dy * math.cos(other.headings[back]) - dx * math.sin(other.headings[back]))
+
+    @cached_property
+    def follower(self) -> str:
+        """Who was behind the other when they touched, along one path; empty where nobody was, or they were abreast."""
+        for leader in (self.agent, self.other):
+            follower = self.partner(leader)
+            own, its = self.way(leader), self.way(follower)
+            touch = self.ahead_m(leader) > 0.6 * (own.length + its.length) / 2
+            if self.same_way and touch and abs(self.aside_m(leader)) < 0.5 * (own.width + its.width) + 0.3:
+                return follower
+        return ""
+
+    def in_its_way_s(self, leader: str) -> float:
+        """For how long a leader had been in the follower's way, in s: the follower drove over where it had been."""
+        lead, follow = self.way(leader), self.way(self.partner(leader))
+        straight = np.array([math.cos(follow.headings[-1]), math.sin(follow.headings[-1])])
+        path = np.vstack((follow.centers, follow.centers[-1] + straight * np.array([[5.0], [60.0]])))
+        found = 0.0
+        for back in range(len(self.before) - 1, -1, -1):
+            if _distance(path[back:], lead.centers[back]) > _BESIDE_M:
+                break
+            found = float(self.times[back])
+        return found
+
+    def changed_s(self, actor: str) -> float | None:
+        """How long before the contact an actor last came from one lane into the next, or was about to; None if not."""
+        return self._changes[actor]
+
+    @cached_property
+    def _changes(self) -> dict[str, float | None]:
+        return {actor: self._changed_s(actor) for actor in (self.agent, self.other)}
+
+    def _changed_s(self, actor: str) -> float | None:
+        left = self.lanes.left_sideways(self.before, actor)
+        since = left or 0
+        if self.lanes.left_sideways(self.through[since:], actor) or any(
+            self.lanes.reaches_over(scenes[since:], actor) for scenes in (self.through, self.before)
+        ):
+            return float(self.times[-1])
+        return None if left is None else float(self.times[left])
+
+    def drifted(self, actor: str) -> bool:
+        """Whether an actor was moving over the side of its lane when they touched, or had done so before."""
+        return self.changed_s(actor) is not None
+
+    def meets_sideways(self, actor: str) -> bool:
+        """Whether an actor moved towards the other's side."""
+        last = self.through[-1]
+        own, its = (last.centers[last.roster.index[name]] for name in (actor, self.partner(actor)))
+        heading = last.headings[last.roster.index[self.partner(actor)]]
+        aside = (own[1] - its[1]) * math.cos(heading) - (own[0] - its[0]) * math.sin(heading)
+        lately = [abs(self.aside_m(actor, back)) for back, time_s in enumerate(self.times) if time_s <= _LATELY_S]
+        return max(lately, default=0.0) - abs(float(aside)) > _SIDEWAYS_M
+
+    def was_beside(self, actor: str, back: int) -> bool:
+        """Whether an actor was beside the way of the other just before a scene."""
+        return any(
+            abs(self.aside_m(actor, place)) > _BESIDE_M
+            for place in range(back + 1)
+            if self.times[place] - self.times[back] <= _BEFORE_S
+        )
+
+    def slowed(self, actor: str, since_s: float) -> float:
+        """How hard an actor braked on average, from so many s before the contact on, in m/s²."""
+        way = self.way(actor)
+        back = int(np.argmin(np.abs(self.times - since_s)))
+        took = float(self.times[back] - self.times[-1])
+        return float(way.speeds[back] - way.speeds[-1]) / took if took > 0 else 0.0
+
+    def hardest_braking(self, actor: str) -> float:
+        """The greatest deceleration of an actor between two scenes, in m/s²."""
+        way = self.way(actor)
+        steps = -np.diff(self.times)
+        return float((-np.diff(way.speeds) / np.maximum(steps, 1e-9)).max(initial=0.0))
+
+    def links(self, actor: str) -> tuple[int, ...]:
+        """The places of the ways across a junction that an actor may have been on."""
+        assert self.right_of_way is not None
+        lanes = [
+            scene.lanes[scene.roster.index[actor]]
+            for scene in self.scenes
+            if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - 3 * _WINDOW_S
+        ]
+        if actor == self.agent and self.lane:
+            lanes.append(self.lane)
+        x, y = self.way(actor).points[-1].tolist()
+        return self.right_of_way.places(tuple(lane for lane in lanes if lane), x, y)
+
+
+def _distance(path: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+    start, leg = path[:-1], np.diff(path, axis=0)
+    along = np.clip(np.einsum("ij,ij->i", point - start, leg) / np.maximum((leg**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    return float(np.hypot(*(point - start - along[:, None] * leg).T).min())

@@ -1,0 +1,199 @@
+"""The rules by which a collision is somebody's fault. A rule is right, or it is silent.
+
+A rule looks at a `Case` and returns a finding, or None where it has nothing to say. Names of sources: *Vienna* is the
+Convention on Road Traffic of 1968; *StVO* the German traffic code; *RSS* is S. Shalev-Shwartz, S. Shammah and
+A. Shashua, On a formal model of safe and scalable self-driving cars, 2017, with parameters like ad-rss-lib's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from crashhunt.triage._case import SAME_WAY
+from crashhunt.world import is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.triage._case import Case
+
+__all__ = ["RULES", "Blame", "Finding", "safe_gap_m"]
+
+Blame = Literal["ego", "other", "both"]
+
+_RESPONSE_S = 1.0  # RSS: until somebody reacts
+_SPEEDS_UP = 3.5  # m/s², RSS: at most, until then
+_BRAKES = 4.0  # m/s², RSS: at least, from then on
+_BRAKES_HARD = 8.0  # m/s², RSS: at most, who is ahead
+_MERGES = math.radians(30)  # who meets at a smaller angle follows, or changes lanes
+_IMPOSSIBLE = 10.0  # m/s²; who stops faster has not braked
+_FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
+_CHANGE_S = 3.0  # a lane change that began longer ago is over
+_AT_ONCE_S = 1.5  # nobody who drives behind can do anything about what comes so late
+_TOGETHER_S = 0.5  # of each other: neither was there first
+_STANDS = 0.1  # m/s
+_STANDS_S = 1.0
+_RED_S = 8.0  # after a red light, a junction is left by then
+_EARLY_S = 1.0  # what crashes so soon was put there
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a rule says.
+
+    Args:
+        rule: its name.
+        blames: whom.
+        words: the evidence, a clause.
+        source: where the rule is from.
+    """
+
+    rule: str
+    blames: Blame
+    words: str
+    source: str
+
+
+def safe_gap_m(speed: float, ahead: float) -> float:
+    """Return the gap to who is ahead that RSS calls safe, in m; speeds in m/s (RSS, lemma 2)."""
+    then = speed + _RESPONSE_S * _SPEEDS_UP
+    driven = speed * _RESPONSE_S + _SPEEDS_UP * _RESPONSE_S**2 / 2
+    return float(max(0.0, driven + then * then / (2 * _BRAKES) - ahead * ahead / (2 * _BRAKES_HARD)))
+
+
+def _who(case: Case, actor: str) -> Blame:
+    return "ego" if actor == case.agent else "other"
+
+
+def _red_light(case: Case) -> Finding | None:
+    """Who ran a red light and meets somebody who comes from another side."""
+    if case.same_way:
+        return None
+    for time_s, event in reversed(case.events):
+        if event.kind == "red_light" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
+            words = f"{event.what}, {case.time_s - time_s:.1f} s before"
+            return Finding("red light", _who(case, event.agent), words, "Vienna, article 23; StVO § 37")
+    return None
+
+
+def _wrong_way(case: Case) -> Finding | None:
+    """Who drove against the direction of its lane."""
+    for time_s, event in reversed(case.events):
+        if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
+            return Finding("wrong way", _who(case, event.agent), event.what, "Vienna, article 10; StVO § 2")
+    return None
+
+
+def _lane_change(case: Case) -> Finding | None:
+    """Who changed lanes into a gap that was taken, or too short for who came behind."""
+    if not case.lanes or not case.same_way:
+        return None
+    changed = {actor: case.changed_s(actor) for actor in (case.agent, case.other)}
+    changers = [actor for actor, before in changed.items() if before is not None and before <= _CHANGE_S]
+    source = "Vienna, articles 11 and 14; StVO § 7 (5)"
+    if len(changers) == 2:
+        times = [before for before in changed.values() if before is not None]
+        at_once = abs(times[0] - times[1]) <= _TOGETHER_S
+        if case.follower or not at_once or not all(case.meets_sideways(actor) for actor in changers):
+            return None  # the one may have been there when the other came
+        return Finding("lane change", "both", "both moved sideways into each other", source)
+    if len(changers) != 1:
+        return None
+    changer = changers[0]
+    other, before = case.partner(changer), changed[changer]
+    assert before is not None
+    if case.drifted(other) or case.turned(before) > SAME_WAY:
+        return None  # in a bend or a roundabout, lanes lead apart and together
+    if not case.follower:
+        if not case.meets_sideways(changer):
+            return None
+        words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
+        return Finding("lane change", _who(case, changer), words, source)
+    if case.follower == changer:
+        if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
+            return None
+        words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
+        return Finding("lane change", _who(case, changer), words, source)
+    return _cut_in(case, changer, before, source)
+
+
+def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | None:
+    """Who came in front of somebody, by how much, and what that one could do."""
+    other = case.partner(changer)
+    back = int(np.argmin(np.abs(case.times - before)))
+    if not case.was_beside(changer, back):
+        return None  # it was ahead, and left
+    gap = case.gap_m(changer, back)
+    safe = safe_gap_m(float(case.way(other).speeds[back]), float(case.way(changer).speeds[back]))
+    words = f"{changer} changed lanes {before:.1f} s before, {max(0.0, gap):.1f} m ahead of {other}"
+    if gap >= safe:
+        return None
+    if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _BRAKES:
+        return None  # who drove behind had the time, and did not use it
+    return Finding("lane change", _who(case, changer), f"{words}; {safe:.1f} m would have been safe (RSS)", source)
+
+
+def _rear_end(case: Case) -> Finding | None:
+    """Who drove into the back of somebody who had been ahead for long."""
+    follower = case.follower
+    if not follower or is_person(case.partner(follower)):
+        return None
+    leader = case.partner(follower)
+    ahead_s = case.in_its_way_s(leader)
+    if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE:
+        return None
+    lead, follow = case.way(leader), case.way(follower)
+    if lead.speeds[-1] < -_STANDS:
+        return None  # it reversed
+    back = int(np.argmin(np.abs(case.times - min(ahead_s, _FOLLOWS_S))))
+    gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
+    words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
+    words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
+    return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
+
+
+def _standing(case: Case) -> Finding | None:
+    """Who drove into somebody who had stood for longer than stopping takes."""
+    for actor in (case.agent, case.other):
+        mover = case.partner(actor)
+        own, its = case.way(actor), case.way(mover)
+        speed = float(its.speeds[0])
+        needs = max(_STANDS_S, _RESPONSE_S + speed / _BRAKES)
+        stood = case.times[0] if bool((own.speeds < _STANDS).all()) else 0.0
+        if stood >= needs and bool((its.speeds > _STANDS).all()) and not is_person(mover):
+            words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
+            return Finding("standing", _who(case, mover), words, "Vienna, article 13 (1); StVO § 3 (1)")
+    return None
+
+
+def _right_of_way(case: Case) -> Finding | None:
+    """Who had to give way, as the map says it, where no traffic light decides."""
+    rights = case.right_of_way
+    if rights is None or case.turn < _MERGES or not case.before:
+        return None
+    places = {actor: case.links(actor) for actor in (case.agent, case.other)}
+    if not all(places.values()):
+        return None
+    links = [rights.links[place] for found in places.values() for place in found]
+    if len({link.junction for link in links}) != 1 or any(link.signalised for link in links):
+        return None
+    pairs = [(one, two) for one in places[case.agent] for two in places[case.other]]
+    gives = {(pair in rights.gives_way, pair[::-1] in rights.gives_way) for pair in pairs}
+    if gives not in ({(True, False)}, {(False, True)}):
+        return None  # both, neither, or it depends on where they were going
+    yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
+    if float(case.way(goes).speeds.min()) < _STANDS or case.drifted(yields) or case.drifted(goes):
+        return None  # who had stood in the junction may have been let through
+    words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
+    return Finding("right of way", _who(case, yields), words, "the map of the scenario; Vienna, article 18; StVO § 8")
+
+
+RULES: tuple[Callable[[Case], Finding | None], ...] = (
+    _red_light, _wrong_way, _lane_change, _rear_end, _standing, _right_of_way,
+)  # fmt: skip
+"""All rules. Where two of them blame different parties, nobody can tell, but that a red light and the wrong way come
+before the right of way."""

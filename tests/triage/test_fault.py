@@ -1,0 +1,199 @@
+"""Whose fault a collision was: hand-labelled cases of real hunts, and cases that are made to fit one rule each."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crashhunt.scenario import load_scenario
+from crashhunt.triage._case import Case
+from crashhunt.triage._fault import fault_in
+from crashhunt.triage._fault_rules import safe_gap_m
+from crashhunt.triage._lanes import LaneMap
+from crashhunt.world import Actor, Event, Link, RightOfWay, Roster, Scene
+
+CASES = Path(__file__).with_name("fault_cases.json.gz")
+"""Of hunts on ten shipped scenarios, with agents in which defects were planted and with others that err: the last
+seconds of two actors, the lanes around them, and whose fault a person said it was who looked at where they were."""
+
+
+@cache
+def cases():
+    return json.loads(gzip.decompress(CASES.read_bytes()))
+
+
+def case_of(data):
+    roster = Roster(tuple(Actor(name, "passenger", length, width) for name, length, width in data["actors"]))
+    scenes = [
+        Scene(time_s, roster, [(row[0], row[1]), (row[4], row[5])], [row[2], row[6]], [row[3], row[7]])
+        for time_s, *row in data["rows"]
+    ]
+    lanes = [Scene(time_s, roster, [(0, 0)] * 2, [0, 0], [0, 0], lanes=both) for time_s, *both in data["lanes"]]
+    started = [scene for scene in lanes if scene.time_s < scenes[0].time_s]
+    by_time = {scene.time_s: scene.lanes for scene in lanes}
+    for scene in scenes:
+        scene.lanes = tuple(by_time.get(scene.time_s, ()))
+    borders = [(np.array(right), np.array(left)) for right, left in data["borders"]]
+    links = tuple(
+        Link(junction, source, target, tuple(inside), signalised, tuple(map(tuple, shape)))
+        for junction, source, target, inside, signalised, shape in data["links"]
+    )
+    return Case(
+        data["actors"][0][0],
+        data["actors"][1][0],
+        [*started, *scenes],
+        data["time_s"],
+        data["began_s"],
+        LaneMap(borders, scenes[-1].points[0]),
+        tuple((time_s, Event(kind, agent, what)) for time_s, kind, agent, what in data["events"]),
+        RightOfWay(links, frozenset(map(tuple, data["gives_way"]))) if links else None,
+        lane=data["lane"],
+    )
+
+
+def test_what_is_said_is_what_a_person_says_or_nothing():
+    said = [(data, fault_in(case_of(data))) for data in cases()]
+    wrong = [
+        (data["name"], data["label"], fault.to_json())
+        for data, fault in said
+        if fault.verdict not in (data["label"], "nobody can tell")
+    ]
+    assert wrong == []
+    known = [(data, fault) for data, fault in said if data["label"] != "nobody can tell"]
+    assert len(said) >= 100
+    assert sum(fault.verdict == data["label"] for data, fault in known) >= 0.8 * len(known)
+    rules = Counter(finding.rule for _, fault in known for finding in fault.findings)
+    assert min(rules[name] for name in ("rear end", "lane change", "right of way")) >= 8
+
+
+LANES = LaneMap(
+    [(np.array([[-200.0, y - 2], [400.0, y - 2]]), np.array([[-200.0, y + 2], [400.0, y + 2]])) for y in (-4, 0, 4)],
+    (0.0, 0.0),
+)
+
+
+def drive(ego, other, *, seconds=5.0, dt=0.1, began_s=-20.0, **more):
+    """A case from functions of the time before the contact: x, y, heading and speed."""
+    roster = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor(more.pop("name", "other"), "passenger", 5.0, 2.0)))
+    scenes = []
+    for step in range(round(seconds / dt), -1, -1):
+        poses = [way(step * dt) for way in (ego, other)]
+        scenes.append(
+            Scene(-step * dt, roster, [pose[:2] for pose in poses], [pose[2] for pose in poses],
+                  [pose[3] for pose in poses])
+        )  # fmt: skip
+    return Case("ego", roster.actors[1].id, scenes, 0.0, began_s, more.pop("lanes", LANES), **more)
+
+
+def straight(speed, at=0.0, y=0.0, *, before=None, since=0.0):
+    """Drives along the x axis, where ``before`` in another lane until so many s before the contact."""
+    return lambda t: (at - speed * t, y if before is None or t <= since else before, 0.0, speed)
+
+
+def verdict(case):
+    return fault_in(case).verdict
+
+
+def test_who_drives_into_the_back_of_who_was_long_ahead():
+    assert verdict(drive(straight(20), straight(10, 5))) == "ego"
+    assert verdict(drive(straight(10, 5), straight(20))) == "the other"
+    found = fault_in(drive(straight(20), straight(10, 5))).findings[0]
+    assert found.rule == "rear end"
+    assert "3.5 s before, the gap was 35.0 m, and 84.5 m is safe (RSS)" in found.words
+    # Too short to know, not one behind the other, or who was ahead cannot have braked so.
+    assert verdict(drive(straight(20), straight(10, 5), seconds=2.0)) == "nobody can tell"
+    assert verdict(drive(straight(20), straight(10, 5), began_s=-0.5)) == "nobody can tell"
+    assert verdict(drive(straight(20), straight(10, 5, 2.5))) == "nobody can tell"
+    wall = drive(straight(20), lambda t: (5 - 20 * max(0.0, t - 1), 0, 0, 20.0 if t > 1 else 0.0))
+    assert verdict(wall) == "nobody can tell"
+    assert verdict(drive(straight(20), straight(1, 5), name="person 1")) == "nobody can tell"
+
+
+def test_who_changes_lanes_into_a_gap_that_is_too_short():
+    cuts_in = straight(15, 5, before=4.0, since=0.8)
+    found = fault_in(drive(straight(25), cuts_in))
+    assert (found.verdict, found.findings[0].rule) == ("the other", "lane change")
+    assert verdict(drive(cuts_in, straight(25))) == "ego"
+    # Who drives behind had the time, or the gap was safe: it is not the lane change.
+    assert verdict(drive(straight(25), straight(15, 5, before=4.0, since=2.9))) == "nobody can tell"
+    away = straight(15, 5, before=0.0, since=0.1, y=4.0)
+    assert verdict(drive(straight(25), away)) != "the other"
+    assert verdict(drive(straight(25), cuts_in, lanes=LaneMap([], (0.0, 0.0)))) == "nobody can tell"
+
+
+def test_who_moves_sideways_into_who_is_beside():
+    def moves(t):
+        return 0.0 - 20 * t, 1.9 + min(2.1, 2 * t), -0.1, 20.0
+
+    assert verdict(drive(moves, straight(20, 1))) == "ego"
+    assert verdict(drive(straight(20, 1), moves)) == "the other"
+
+    def left(t):
+        return 1.0 - 20 * t, -1.0 - min(3.0, 2 * t), 0.1, 20.0
+
+    def right(t):
+        return 0.0 - 20 * t, 1.0 + min(3.0, 2 * t), -0.1, 20.0
+
+    assert verdict(drive(right, left)) == "both"
+
+
+def crossing(speed):
+    return lambda t: (0.0, -speed * t, math.pi / 2, speed)
+
+
+def test_a_red_light_the_wrong_way_and_who_stands():
+    red = Event("red_light", "ego", "ego ran a red light")
+    assert verdict(drive(straight(10), crossing(8))) == "nobody can tell"
+    assert verdict(drive(straight(10), crossing(8), events=((-3.0, red),))) == "ego"
+    assert verdict(drive(straight(10), crossing(8), events=((-9.0, red),))) == "nobody can tell"
+    wrong = Event("wrong_way", "ego", "ego drove the wrong way")
+    assert verdict(drive(straight(10), lambda t: (10 + 9 * t, 0, math.pi, 9.0), events=((-3.0, wrong),))) == "ego"
+    assert verdict(drive(straight(5), lambda t: (5.0, 0.0, math.pi / 2, 0.0))) == "ego"
+    # It has stood for less than stopping takes.
+    assert verdict(drive(straight(15), lambda t: (5.0, 0.0, math.pi / 2, 0.0), seconds=3.0)) == "nobody can tell"
+
+
+def test_the_right_of_way_is_that_of_the_map():
+    scenario = load_scenario("intersection")
+    rights = scenario.backend.right_of_way(scenario)
+    place = {(link.source, link.target): number for number, link in enumerate(rights.links)}
+    major, minor = place["from-west_0", "to-east_0"], place["from-south_0", "to-north_0"]
+    assert (minor, major) in rights.gives_way
+    assert (major, minor) not in rights.gives_way
+    left = place["from-east_1", "to-south_0"]  # across the oncoming traffic, by way of an internal junction
+    assert len(rights.links[left].inside) == 2
+    assert (left, major) in rights.gives_way
+    assert rights.places(("from-south_0", rights.links[minor].inside[0]), 0.0, 0.0) == (minor,)
+    assert rights.places(("from-south_0",), 500.0, 0.0) == ()
+    assert not any(link.signalised for link in rights.links)
+
+
+def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
+    ways = [
+        Link("c", "w", "e", (":c_0",), False, ((-5.0, 0.0), (5.0, 0.0))),
+        Link("c", "s", "n", (":c_1",), False, ((0.0, -5.0), (0.0, 5.0))),
+    ]
+
+    def said(gives, links, lanes=("w", "s")):
+        case = drive(straight(10), crossing(8), right_of_way=RightOfWay(tuple(links), frozenset(gives)))
+        case.scenes[-10].lanes = lanes
+        return verdict(case)
+
+    assert said({(1, 0)}, ways) == "the other"
+    assert said({(0, 1)}, ways) == "ego"
+    assert said({(0, 1), (1, 0)}, ways) == "nobody can tell"
+    assert said({(1, 0)}, ways, ("", "s")) == "nobody can tell"
+    lights = [Link(*(ways[0].junction, "w", "e"), ways[0].inside, signalised=True, shape=ways[0].shape), ways[1]]
+    assert said({(1, 0)}, lights) == "nobody can tell"
+
+
+def test_the_safe_gap_is_that_of_rss():
+    assert safe_gap_m(20, 20) == pytest.approx(20 + 1.75 + 23.5**2 / 8 - 20**2 / 16)
+    assert safe_gap_m(0, 30) == 0
