@@ -1,4 +1,4 @@
-"""Contract suites: what every simulator, sampler, executor and agent must do, for yours too.
+"""For tests: `assert_survives`, and contract suites, which say what every simulator, sampler and so on must do.
 
 Subclass a suite in a test module, give it its fixture, and let pytest collect it::
 
@@ -7,7 +7,7 @@ Subclass a suite in a test module, give it its fixture, and let pytest collect i
         def make(self, tmp_path):
             return lambda: MySimulator(scenario, tmp_path)
 
-Needs pytest.
+The suites need pytest.
 """
 
 import lazy_loader

@@ -6,3 +6,4 @@ from ._executors import ExecutorContract as ExecutorContract
 from ._oracles import OracleContract as OracleContract, drive as drive
 from ._samplers import SamplerContract as SamplerContract
 from ._simulators import SimulatorContract as SimulatorContract
+from ._survives import Example as Example, assert_survives as assert_survives

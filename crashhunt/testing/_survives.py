@@ -1,0 +1,166 @@
+"""A test of somebody's own suite that an agent does not crash, with a crash told so that it can be pasted."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.api import run
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.text import visible
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import PoolExecutor
+from crashhunt.plans import HuntOptions, plan, request_of
+from crashhunt.shrinking import shrink
+from crashhunt.trial import Outcome, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.plans import Driver, Spec
+    from crashhunt.trial import TrialResult, Value
+
+__all__ = ["Example", "assert_survives"]
+
+
+class Example(TypedDict, total=False):
+    """One trial, as a failure of `assert_survives` prints it.
+
+    Args:
+        seed: of the trial.
+        arguments: of the agents, by their ids.
+        scenario_arguments: of the scenario.
+        only: which of the others take part; all where it is missing.
+    """
+
+    seed: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    only: Sequence[str]
+
+
+def assert_survives(
+    agent: Driver,
+    scenario: Path | str = "loop",
+    *,
+    trials: int = 20,
+    max_steps: int = 500,
+    seed: int = 0,
+    arguments: Mapping[str, Spec] | None = None,
+    scenario_arguments: Mapping[str, Spec] | None = None,
+    example: Example | None = None,
+    budget: int = 100,
+    parallel: int = 0,
+    directory: Path | str | None = None,
+) -> None:
+    """Fail where an agent crashes in one of some trials, with the smallest such crash that was found.
+
+    The same seed makes the same trials. What is printed can be pasted: with ``example`` that one trial is run, and no
+    other.
+
+    Args:
+        agent: a class or function of a module, or ``module:attribute``.
+        scenario: a shipped name, or a path.
+        trials: how many.
+        max_steps: the bound on each, in steps.
+        seed: of all of them.
+        arguments: of the agent, as `crashhunt.run` takes them: values or what to try.
+        scenario_arguments: the same of the scenario.
+        example: the one trial to run.
+        budget: how many further trials may be run to make a crash smaller; 0 for none.
+        parallel: trials at a time; 0 for one per core.
+        directory: where to keep the hunt, such as pytest's ``tmp_path``; without, it is removed.
+
+    Raises:
+        AssertionError: it crashes.
+        CrashhuntError: nothing could be run.
+    """
+    __tracebackhide__ = True  # of pytest
+    options = HuntOptions(
+        agent=agent, scenario=scenario, arguments=arguments, scenario_arguments=scenario_arguments, seed=seed
+    )
+    call = f"{_word(agent)}, {str(scenario)!r}, max_steps={max_steps}"
+    if example is not None:
+        result = _run_one(options, example, max_steps)
+        if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
+            raise AssertionError(_told(result, call, ""))
+        return
+    with ExitStack() as stack:
+        place = directory or stack.enter_context(tempfile.TemporaryDirectory(prefix="crashhunt-survives-"))
+        report = run(
+            place, parallel, trials, max_steps, deterministic=True, agent=agent, scenario=scenario,
+            arguments=arguments, scenario_arguments=scenario_arguments, seed=seed,
+        )  # fmt: skip
+        if report.stopped_because == "interrupted":
+            raise KeyboardInterrupt
+        if report.stopped_because == "no_valid_trial":
+            raise CrashhuntError(f"not one trial was valid: {report.reason}", fix="see to what the scenario needs")
+        if report.crashes:
+            bundle = _smaller(report.crashes[0], budget, parallel)
+            look = f"look at it: crashhunt show {place} --crash {bundle.id}" if directory else ""
+            raise AssertionError(_told(bundle.result, call, look))
+
+
+def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
+    if budget < 1:
+        return bundle
+    try:
+        return shrink(bundle, budget=budget, parallel=parallel).small or bundle
+    except CrashhuntError:  # it is told as it is
+        return bundle
+
+
+def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialResult:
+    scenario, settings = plan(request_of(options, trials=1, max_steps=max_steps).checked())
+    only = example.get("only")
+    spec = TrialSpec(
+        0,
+        example.get("seed", 0),
+        example.get("arguments", {}),
+        example.get("scenario_arguments", {}),
+        max_steps,
+        only=None if only is None else tuple(only),
+    )
+    with tempfile.TemporaryDirectory(prefix="crashhunt-survives-") as folder:
+        worker = WorkerSettings(
+            scenario=scenario, oracles=settings.oracles, crash_on=settings.crash_on, scratch=Path(folder),
+            timeout_s=settings.run.timeout_s,
+        )  # fmt: skip
+        executor = PoolExecutor(worker)
+        try:
+            executor.submit(spec)
+            found: list[TrialResult] = []
+            while not found:
+                found = list(executor.completed(1.0))
+        finally:
+            executor.close()
+    result = found[0]
+    if result.outcome is Outcome.INVALID:
+        raise CrashhuntError(f"the example could not be set up: {result.summary}", fix="see to what the scenario needs")
+    return replace(result, spec=spec)
+
+
+def _told(result: TrialResult, call: str, look: str) -> str:
+    spec = result.spec
+    example: Example = {
+        "seed": spec.seed,
+        "arguments": {agent: dict(values) for agent, values in spec.arguments.items()},
+        "scenario_arguments": dict(spec.scenario_arguments),
+    }
+    if spec.only is not None:
+        example["only"] = list(spec.only)
+    lines = [
+        "",
+        result.summary,
+        "This call runs that trial alone:",
+        f"    assert_survives({call}, example={example!r})",
+    ]
+    return visible("\n".join([*lines, look] if look else lines))
+
+
+def _word(agent: Driver) -> str:
+    return repr(agent) if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
