@@ -11,7 +11,7 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict, final
+from typing import TYPE_CHECKING, TypedDict, cast, final
 
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
@@ -23,11 +23,13 @@ from crashhunt.executors import fresh_environment
 from crashhunt.panels import labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
+from crashhunt.replays._backwards import Backwards, OneLine
 from crashhunt.simulators import HasMeanings, HasWindow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from typing import TextIO
 
     import numpy as np
     from numpy.typing import NDArray
@@ -136,14 +138,19 @@ class _Stop(Observer):
     def __init__(self, name: str, step: int) -> None:
         self._name = name
         self._step = step
+        self.backwards: Backwards | None = None
 
     def begin(self, episode: Episode) -> None:
         self._episode = episode
 
+    def stop_at(self, step: int) -> None:
+        """Stop in another step."""
+        self._step = step
+
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         agents = self._episode.agents
         if step + 1 == self._step and self._name in agents:
-            agents[self._name] = _Stopped(agents[self._name], self._name, self._step, scene)
+            agents[self._name] = _Stopped(agents[self._name], self._name, self._step, scene, self.backwards)
         elif step == self._step and isinstance(stopped := agents.get(self._name), _Stopped):
             agents[self._name] = stopped.agent
 
@@ -161,9 +168,11 @@ class _Stopped:
         name: of the vehicle.
         step: which one it is.
         scene: before it.
+        backwards: goes back.
     """
 
-    def __init__(self, agent: Agent, name: str, step: int, scene: Scene) -> None:
+    def __init__(self, agent: Agent, name: str, step: int, scene: Scene, backwards: Backwards | None) -> None:
+        self._backwards = backwards
         self.agent = agent
         self._name = name
         self._step = step
@@ -179,7 +188,9 @@ class _Stopped:
         ):  # fmt: skip
             setattr(builtins, name, value)
         print(f"step {self._step}, {self._name}: at hand are agent, observation, scene and step", flush=True)
-        return _Debugger().runcall(self.agent.act, observation)
+        debugger = _Debugger()
+        debugger.step, debugger.backwards = self._step, self._backwards
+        return debugger.runcall(self.agent.act, observation)
 
 
 class _Panels(Observer):
@@ -294,6 +305,17 @@ class _Window(Observer):
 
 
 class _Debugger(pdb.Pdb):
+    step = 0
+    backwards: Backwards | None = None
+
+    def do_back(self, arg: str) -> None:
+        """Go back by so many steps of the simulation, or one: ``back 5``."""
+        steps = int(arg) if arg.strip().isdecimal() else 1
+        why_not = (
+            self.backwards.go(self.step - max(1, steps)) if self.backwards is not None else "nobody has left a copy"
+        )
+        print(f"*** {why_not}", flush=True)
+
     def set_quit(self) -> None:
         """Leave the process: whoever quits does not want a verdict."""
         print(flush=True)
@@ -315,7 +337,11 @@ def main() -> None:
         seal(settings)
         parts = Parts(settings)
         simulator = parts.simulator()
-        observers: list[Observer] = [_Stop(job["agent"], job["stop_at"])]
+        stop = _Stop(job["agent"], job["stop_at"])
+        stop.backwards = Backwards(stop, job["stop_at"], folder)
+        observers: list[Observer] = [stop.backwards, stop] if job["stop_at"] and job["window"] is None else [stop]
+        if job["stop_at"] and not sys.stdin.isatty():
+            sys.stdin = cast("TextIO", OneLine())
         if job["panels"] is not None:
             observers.append(_Panels(job["panels"][0], Path(job["panels"][1])))
         window = _opened(simulator, job) if job["window"] is not None else None

@@ -38,6 +38,19 @@ def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
     assert "reproduced: 19 of 29 steps" in out
 
 
+def test_backwards_and_on_from_there_to_the_same_bits(crash):
+    asked = "p 'at', step, self.step, scene.time_s\n"
+    out = typed(crash, f"{asked}back 5\n{asked}back\n{asked}back 99\nc\n", "--pdb")
+    (first, self_first, time_s), *others = [
+        eval(line.removeprefix("(Pdb) "))[1:] for line in out.splitlines() if line.startswith("(Pdb) ('at'")
+    ]
+    assert (first, self_first) == (30, 29)
+    assert [one[:2] for one in others] == [(25, 24), (24, 23)]
+    assert others[1][2] == pytest.approx(time_s - 0.6)
+    assert "*** it goes back to step 1 at most" in out
+    assert "reproduced: 29 of 29 steps" in out
+
+
 def test_quitting_the_debugger_is_no_crash_of_ours(crash):
     done = subprocess.run(
         [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.environment, input="q\n",
