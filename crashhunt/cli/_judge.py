@@ -66,7 +66,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _unjudged(options: argparse.Namespace) -> list[Bundle]:
-    from crashhunt.crashes import judgement_of, list_bundles
+    from crashhunt.crashes import INTERRUPTED, judgement_of, list_bundles
     from crashhunt.hunts import find_hunts
     from crashhunt.trial import Outcome
 
@@ -79,12 +79,12 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
         if bundle.result.outcome is Outcome.COLLISION
         and bundle.result.collision is not None
         and bundle.result.collision.other
-        and judgement_of(bundle) is None
+        and ((known := judgement_of(bundle)) is None or known.why_not == INTERRUPTED)
     ]
 
 
 def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *, write: bool) -> dict[str, object]:
-    from crashhunt.crashes import with_judgement
+    from crashhunt.crashes import judgement_of, with_judgement
     from crashhunt.replays import ReplayOptions, judge
     from crashhunt.report import Story
 
@@ -97,8 +97,9 @@ def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *,
             watch=watch,
             stopped=lambda: bool(stops),
         )
+    known = judgement_of(bundle)
     bundle = with_judgement(bundle, found)
-    if write and (found.runs or found.why_not) and not stops:
+    if write and found.runs and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()
     story = Story(bundle)
     say(

@@ -23,6 +23,7 @@ from ._find import (
     list_near_misses as list_near_misses,
 )
 from ._judgement import (
+    INTERRUPTED as INTERRUPTED,
     Attempt as Attempt,
     AttemptData as AttemptData,
     Judgement as Judgement,

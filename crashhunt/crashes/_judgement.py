@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from crashhunt.crashes._bundle import Bundle
     from crashhunt.crashes._escape import Ending
 
-__all__ = ["Attempt", "AttemptData", "Judgement", "JudgementData", "judgement_of", "with_judgement"]
+__all__ = ["INTERRUPTED", "Attempt", "AttemptData", "Judgement", "JudgementData", "judgement_of", "with_judgement"]
+
+INTERRUPTED = "it was interrupted"
+"""Why there is no whole answer where somebody has stopped it."""
 
 _KEY = "judged"
 

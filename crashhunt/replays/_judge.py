@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError, UsageError
-from crashhunt.crashes import ending_of, last_escape, overruled_trial, slowing
+from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import Recording, read_black_box
@@ -78,7 +78,7 @@ def judge(
         try:
             search.all()
         except _StoppedError:
-            search.why_not = "it was interrupted"
+            search.why_not = INTERRUPTED
         finally:
             executor.close()
     return search.judgement()
