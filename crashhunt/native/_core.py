@@ -13,7 +13,7 @@ __all__ = ["Core", "Vehicles", "core_for", "why_not"]
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 1
+_INTERFACE = 2
 """Raised whenever a function of the core changes; a core of another version is not used. hatch_build.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
@@ -58,6 +58,24 @@ class Core(Protocol):
         lengths: list[float], widths: list[float], reaches: list[float], row: int, further: float, limit: float, /,
     ) -> list[int] | None:  # fmt: skip
         """Return the rows that the oracle ``overlap`` looks at, nearest first."""
+
+    def may_be_near(
+        self, columns: object, actors: int, row: int, lengths: list[float], widths: list[float], gap: float,
+        horizon: float, /,
+    ) -> bytes | None:  # fmt: skip
+        """Return who has a part in the closest approach, and perhaps some who have not: int64, scene * actors + row.
+
+        In each scene that has anybody, the agent comes first.
+
+        Args:
+            columns: of a `Frame`.
+            actors: how many.
+            row: the agent.
+            lengths: of each, in m.
+            widths: likewise.
+            gap: what is further apart does not count, in m.
+            horizon: what touches later does not count, in s.
+        """
 
     def least_change(self, earlier: Sequence[float], later: Sequence[float], /) -> float | None:
         """Return the least difference between two lists of numbers; 0 for empty ones."""

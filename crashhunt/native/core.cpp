@@ -438,6 +438,87 @@ PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return PyFloat_FromDouble(least);
 }
 
+// ------------------------------------------------------------------------------------------------ the closest approach
+
+const double SLACK = 1e-6; // m, and relative: what NumPy rounds otherwise is far less
+
+// may_be_near(columns, actors, row, lengths, widths, gap, horizon) -> bytes | None
+// The conditions of `approaches` in crashhunt/world/_approach.py with some slack: who fulfils them there does so here.
+PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    if (count != 7) {
+        PyErr_SetString(PyExc_TypeError, "may_be_near takes seven arguments");
+        return nullptr;
+    }
+    const Py_ssize_t all = PyLong_AsSsize_t(given[1]), asked = PyLong_AsSsize_t(given[2]);
+    const double gap = PyFloat_AsDouble(given[5]), horizon = PyFloat_AsDouble(given[6]);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    if (!numbers(given[3], lengths) || !numbers(given[4], widths) || all < 1 || asked < 0 || asked >= all ||
+        lengths.size() != static_cast<size_t>(all) || widths.size() != static_cast<size_t>(all)) {
+        Py_RETURN_NONE;
+    }
+    Py_buffer buffer;
+    if (PyObject_GetBuffer(given[0], &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+        return nullptr;
+    }
+    const size_t actors = static_cast<size_t>(all), own = static_cast<size_t>(asked), width = 4 * actors;
+    const size_t scenes = static_cast<size_t>(buffer.len) / (8 * width);
+    if (buffer.itemsize != 8 || !buffer.format || !strchr(buffer.format, 'd') ||
+        static_cast<size_t>(buffer.len) != scenes * 8 * width) {
+        PyBuffer_Release(&buffer);
+        Py_RETURN_NONE;
+    }
+    struct Body {
+        double x, y, vx, vy, reach, apart;
+    };
+    static std::vector<Body> bodies;
+    static std::vector<int64_t> kept;
+    bodies.resize(actors);
+    kept.clear();
+    for (size_t scene = 0; scene < scenes; scene++) {
+        const double *line = static_cast<const double *>(buffer.buf) + scene * width;
+        for (size_t actor = 0; actor < actors; actor++) {
+            const double heading = line[2 * actors + actor], speed = line[3 * actors + actor];
+            const double c = cos(heading), s = sin(heading), half = lengths[actor] / 2;
+            bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s,
+                             std::hypot(half, widths[actor] / 2), 0.0};
+        }
+        const Body me = bodies[own];
+        double best = HUGE_VAL;
+        for (size_t actor = 0; actor < actors; actor++) {
+            Body &body = bodies[actor];
+            body.apart = std::hypot(body.x - me.x, body.y - me.y);
+            if (actor != own && body.apart - me.reach - body.reach < gap) {
+                best = std::min(best, body.apart - widths[actor] / 2 - widths[own] / 2);
+            }
+        }
+        const size_t before = kept.size();
+        for (size_t actor = 0; actor < actors; actor++) {
+            if (actor == own) {
+                continue;
+            }
+            const Body &body = bodies[actor];
+            const double dx = body.x - me.x, dy = body.y - me.y, vx = body.vx - me.vx, vy = body.vy - me.vy;
+            const double reach = me.reach + body.reach, bound = body.apart - reach, slack = SLACK * (1 + body.apart);
+            const double speed = sqrt(vx * vx + vy * vy), scale = SLACK * (1 + body.apart) * (1 + speed);
+            // Said in the negative: what is not a number is kept, and left to Python.
+            const bool far = bound > gap + slack || bound > best + slack;
+            const bool harmless = (-(dx * vx + dy * vy) < -scale && body.apart > reach + slack) ||
+                                  fabs(dx * vy - dy * vx) > reach * speed + scale || bound > horizon * speed + scale;
+            if (!(far && harmless)) {
+                if (kept.size() == before) {
+                    kept.push_back(static_cast<int64_t>(scene * actors + own));
+                }
+                kept.push_back(static_cast<int64_t>(scene * actors + actor));
+            }
+        }
+    }
+    PyBuffer_Release(&buffer);
+    return PyBytes_FromStringAndSize(reinterpret_cast<const char *>(kept.data()),
+                                     static_cast<Py_ssize_t>(kept.size() * sizeof(int64_t)));
+}
+
 // ---------------------------------------------------------------------------------------------------- the black box
 
 // write_step(buffer, offset, tag, step, time_s, rewards, points, headings, speeds) -> end | None
@@ -519,6 +600,7 @@ PyMethodDef functions[] = {
     {"observe", FAST(observe), "Return an observation as bytes."},
     {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
     {"least_change", FAST(least_change), "Return the least difference between two lists of numbers."},
+    {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach, as int64."},
     {"write_step", FAST(write_step), "Write the record of a step; return where it ends."},
     {nullptr, nullptr, 0, nullptr},
 };

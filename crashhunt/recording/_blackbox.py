@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from crashhunt.native import Core
     from crashhunt.world import Frame, Roster, Scene
 
 __all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
@@ -106,6 +107,7 @@ class BlackBox:
         self._step = 0
         self._agents = 0
         self._roster: object = None
+        self._core: Core | None = None
         self._steps: dict[int, struct.Struct] = {}
         self._trail: list[tuple[Roster, int, Scene | None]] = []
         self._aside: list[tuple[int, int]] = []
@@ -198,7 +200,7 @@ class BlackBox:
                 *scene.headings,
                 *scene.speeds,
             )
-        self._roster = scene.roster
+        self._roster, self._core = scene.roster, core
         rest = scene if scene.heights or scene.spines else None
         self._trail.append((scene.roster, offset + packer.size - 32 * count, rest))
         self._offset = offset + packer.size
@@ -217,7 +219,7 @@ class BlackBox:
             size = 32 * len(roster)
             data = b"".join([self._map[offset : offset + size] for _, offset, _ in run])
             columns = np.frombuffer(data, "<f8").reshape(len(run), 4 * len(roster))
-            frames.append(joined_frame(roster, columns, [scene for *_, scene in run]))
+            frames.append(joined_frame(roster, columns, [scene for *_, scene in run], self._core))
         self._trail.clear()
         return frames
 

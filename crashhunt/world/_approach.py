@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["ApproachMeter", "approaches", "closest_approach"]
 
 _CHUNK = 256  # scenes at a time, which costs a tenth of one at a time
+_GAP_M = 50.0  # what is further away is not near
 _HORIZON_S = 10.0  # a collision course further ahead than this says nothing
 
 
@@ -79,7 +80,7 @@ def approaches(
     for frame in frames:
         row = frame.roster.index.get(agent)
         if row is not None:
-            for block in [_block(frame, row)] if frame.spines is None else _bent_blocks(frame, row):
+            for block in _blocks(frame, row):
                 blocks.append(block.moved(step, first))
                 first += len(block.x)
         step += len(frame.columns)
@@ -105,7 +106,7 @@ def approaches(
                   for v in (offset, relative)]  # fmt: skip
         return turned[0], turned[1], heading[rows] - heading[own[rows]], half[own[rows]], half[rows]
 
-    near = np.flatnonzero(others & (distance - reach < 50.0))
+    near = np.flatnonzero(others & (distance - reach < _GAP_M))
     if len(near):
         # The circles around both outlines bound the gap from below; only who could be the nearest is measured.
         bound = distance[near] - reach[near]
@@ -151,6 +152,36 @@ class _Block(NamedTuple):
     def moved(self, step: int, first: int) -> _Block:
         """The same, counted on from a step and a rectangle."""
         return self._replace(step=self.step + step, own=self.own + first)
+
+
+def _blocks(frame: Frame, row: int) -> list[_Block]:
+    if frame.spines is not None:
+        return _bent_blocks(frame, row)
+    if frame.core is not None and frame.heights is None:
+        roster = frame.roster
+        found = frame.core.may_be_near(
+            frame.columns, len(roster), row, roster.lengths, roster.widths, _GAP_M, _HORIZON_S
+        )  # fmt: skip
+        if found is not None:
+            return [_sparse_block(frame, row, np.frombuffer(found, np.int64))] if found else []
+    return [_block(frame, row)]
+
+
+def _sparse_block(frame: Frame, row: int, places: NDArray[np.int64]) -> _Block:
+    """A block of those only who may be near, in which the agent comes first in each scene."""
+    columns, actors = frame.columns, len(frame.roster)
+    step, actor = np.divmod(places, actors)
+    number, flat = np.arange(len(places)), np.zeros(len(places))
+    return _Block(
+        columns[step, 2 * actor],
+        columns[step, 2 * actor + 1],
+        columns[step, 2 * actors + actor],
+        columns[step, 3 * actors + actor],
+        frame.roster.half_sizes[actor],
+        step,
+        np.maximum.accumulate(np.where(actor == row, number, 0)),
+        flat, flat, flat,
+    )  # fmt: skip
 
 
 def _block(frame: Frame, row: int) -> _Block:

@@ -147,12 +147,14 @@ class Frame(NamedTuple):
         columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
         heights: float64, shape (scenes, 2 n): all heights, then all grades; None where the map is flat.
         spines: of each scene; None where no long vehicle is in a bend.
+        core: what computes with it faster, where there is such a thing; the results are the same.
     """
 
     roster: Roster
     columns: NDArray[np.float64]
     heights: NDArray[np.float64] | None = None
     spines: tuple[Mapping[int, Spine], ...] | None = None
+    core: Core | None = None
 
     def scene(self, number: int) -> Scene:
         """Return one of the scenes, without its time."""
@@ -172,13 +174,16 @@ class Frame(NamedTuple):
         )
 
 
-def joined_frame(roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None]) -> Frame:
+def joined_frame(
+    roster: Roster, columns: NDArray[np.float64], scenes: Sequence[Scene | None], core: Core | None = None
+) -> Frame:
     """Return scenes of one roster as a frame.
 
     Args:
         roster: of all of them.
         columns: as in `Frame`.
         scenes: each one; None where nobody is high or bent.
+        core: what computes with it faster.
     """
     heights = spines = None
     if any(scene is not None and scene.heights for scene in scenes):
@@ -187,7 +192,7 @@ def joined_frame(roster: Roster, columns: NDArray[np.float64], scenes: Sequence[
         heights = np.array(rows).reshape(len(scenes), 2 * len(roster))
     if any(scene is not None and scene.spines for scene in scenes):
         spines = tuple(scene.spines if scene is not None else _NO_SPINES for scene in scenes)
-    return Frame(roster, columns, heights, spines)
+    return Frame(roster, columns, heights, spines, core)
 
 
 class Scene:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as some
 
@@ -19,7 +21,7 @@ from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators import Kinematics
 from crashhunt.trial import CRASHES, TrialSpec
-from crashhunt.world import Actor, Roster, Scene
+from crashhunt.world import Actor, Roster, Scene, approaches, joined_frame
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
@@ -78,6 +80,28 @@ def test_somebody_is_within_reach():
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
     now = Scene(0.1, roster, [(3.1, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0], core=core)
     assert _within_reach(now, was, 0) == [1]
+
+
+@settings(deadline=None, max_examples=80)
+@given(some.lists(two_scenes(), min_size=1, max_size=3))
+def test_the_closest_approach_is_the_same_to_the_bit(episodes):
+    for scene in itertools.chain(*episodes):  # as if many were one: rosters differ
+        scene.points[0] = (scene.points[0][0] % 100, scene.points[0][1] % 100)
+    agent = "0"
+    frames = [joined_frame(one.roster, np.concatenate([one.frame.columns, two.frame.columns]), [None] * 2)
+              for one, two in episodes]  # fmt: skip
+    ours, theirs = approaches([frame._replace(core=core) for frame in frames], agent), approaches(frames, agent)
+    for mine, reference in zip(ours, theirs, strict=True):
+        assert mine.tobytes() == reference.tobytes()
+
+
+def test_of_many_far_away_nobody_is_looked_at():
+    near = [(0.0, 0.0), (30.0, 0.0), (400.0, 3.0), (90.0, 60.0)]
+    frame = np.array([[*itertools.chain(*near), 0.0, 0.0, 0.0, 0.0, 20.0, 5.0, 20.0, 20.0]])
+    found = core.may_be_near(frame, 4, 0, [5.0] * 4, [2.0] * 4, 50.0, 10.0)
+    assert np.frombuffer(found, np.int64).tolist() == [0, 1]
+    assert core.may_be_near(frame, 4, 2, [5.0] * 4, [2.0] * 4, 50.0, 10.0) == b""
+    assert core.may_be_near(frame.astype(np.float32), 4, 0, [5.0] * 4, [2.0] * 4, 50.0, 10.0) is None
 
 
 @settings(deadline=None, max_examples=60)
