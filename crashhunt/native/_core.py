@@ -13,7 +13,7 @@ __all__ = ["Core", "Vehicles", "core_for", "why_not"]
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 2
+_INTERFACE = 3
 """Raised whenever a function of the core changes; a core of another version is not used. hatch_build.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
@@ -45,6 +45,14 @@ class Core(Protocol):
 
     def is_coming_or_going(self) -> bool | None:
         """Whether a vehicle has entered or left in the last step."""
+
+    def in_sight(self, controlled: object, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
+        """Return the ids of all vehicles near some, and where these are; None where libsumo refuses.
+
+        Args:
+            controlled: `Vehicles`; those that are not there are left out.
+            squared: the distance below which somebody is near, squared, in m².
+        """
 
     def observe(
         self, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], lengths: list[float],

@@ -37,11 +37,13 @@ static_assert(sizeof(Position) == 32, "a pointer and three numbers");
 typedef Position (*PositionOf)(const std::string &, bool);
 typedef double (*NumberOf)(const std::string &);
 typedef int (*Count)();
+typedef std::vector<std::string> (*Names)();
 
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
     Count departed, arrived, vanishing, appearing;
+    Names everybody;
     bool bound;
 };
 Sumo sumo = {};
@@ -71,6 +73,7 @@ PyObject *bind(PyObject *, PyObject *path) {
     bool whole = find(library, "_ZN7libsumo7Vehicle11getPositionE" STRING "b", found.position) &&
                  find(library, "_ZN7libsumo7Vehicle8getAngleE" STRING, found.angle) &&
                  find(library, "_ZN7libsumo7Vehicle8getSpeedE" STRING, found.speed) &&
+                 find(library, "_ZN7libsumo7Vehicle9getIDListB5cxx11Ev", found.everybody) &&
                  find(library, "_ZN7libsumo10Simulation17getDepartedNumberEv", found.departed) &&
                  find(library, "_ZN7libsumo10Simulation16getArrivedNumberEv", found.arrived) &&
                  find(library, "_ZN7libsumo10Simulation25getStartingTeleportNumberEv", found.vanishing) &&
@@ -119,13 +122,14 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     }
     self->ids = new std::vector<std::string>();
     for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(names); row++) {
-        Py_ssize_t size;
-        const char *text = PyUnicode_AsUTF8AndSize(PyTuple_GET_ITEM(names, row), &size);
+        // As libsumo's own getters take names.
+        PyObject *text = PyUnicode_AsEncodedString(PyTuple_GET_ITEM(names, row), "utf-8", "surrogateescape");
         if (!text) {
             Py_DECREF(self);
             return nullptr;
         }
-        self->ids->emplace_back(text, size);
+        self->ids->emplace_back(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
+        Py_DECREF(text);
     }
     return reinterpret_cast<PyObject *>(self);
 }
@@ -176,6 +180,65 @@ PyObject *vehicles_read(PyObject *object, PyObject *) {
     if (!ours) {
         Py_RETURN_NONE;
     }
+    return found;
+}
+
+// in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
+// As Sight._look_around of crashhunt/simulators/sumo/_sight.py: who is near one of the controlled vehicles, and where
+// these are.
+PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    if (count != 2 || strcmp(Py_TYPE(given[0])->tp_name, "_crashhunt_core.Vehicles") != 0) {
+        PyErr_SetString(PyExc_TypeError, "in_sight takes vehicles and a number");
+        return nullptr;
+    }
+    const double within = PyFloat_AsDouble(given[1]);
+    if (unbound() || PyErr_Occurred()) {
+        return nullptr;
+    }
+    static std::vector<std::string> names;
+    static std::vector<double> places;
+    std::vector<size_t> eyes;
+    places.clear();
+    try {
+        names = sumo.everybody();
+        for (const std::string &name : names) {
+            const Position place = sumo.position(name, false);
+            places.push_back(place.x);
+            places.push_back(place.y);
+        }
+    } catch (...) {
+        Py_RETURN_NONE;
+    }
+    for (const std::string &eye : *reinterpret_cast<Vehicles *>(given[0])->ids) {
+        const size_t row = static_cast<size_t>(std::find(names.begin(), names.end(), eye) - names.begin());
+        if (row < names.size()) {
+            eyes.push_back(row);
+        }
+    }
+    PyObject *ids = PyList_New(0), *points = PyList_New(0);
+    bool good = ids && points;
+    for (size_t eye : eyes) {
+        PyObject *point = good ? Py_BuildValue("(dd)", places[2 * eye], places[2 * eye + 1]) : nullptr;
+        good = point && PyList_Append(points, point) == 0;
+        Py_XDECREF(point);
+    }
+    for (size_t row = 0; good && row < names.size(); row++) {
+        for (size_t eye : eyes) {
+            const double dx = places[2 * row] - places[2 * eye], dy = places[2 * row + 1] - places[2 * eye + 1];
+            if (dx * dx + dy * dy < within) {
+                PyObject *id = PyUnicode_DecodeUTF8(names[row].data(), static_cast<Py_ssize_t>(names[row].size()),
+                                                    "surrogateescape");
+                good = id && PyList_Append(ids, id) == 0;
+                Py_XDECREF(id);
+                break;
+            }
+        }
+    }
+    PyObject *whole = good ? PyList_AsTuple(ids) : nullptr;
+    PyObject *found = whole ? PyTuple_Pack(2, whole, points) : nullptr;
+    Py_XDECREF(whole);
+    Py_XDECREF(ids);
+    Py_XDECREF(points);
     return found;
 }
 
@@ -597,6 +660,7 @@ PyType_Spec vehicles_spec = {"_crashhunt_core.Vehicles", sizeof(Vehicles), 0, Py
 PyMethodDef functions[] = {
     {"bind", bind, METH_O, "Find libsumo's functions in its library, given by its path."},
     {"is_coming_or_going", is_coming_or_going, METH_NOARGS, "Whether a vehicle has entered or left in the last step."},
+    {"in_sight", FAST(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
     {"observe", FAST(observe), "Return an observation as bytes."},
     {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
     {"least_change", FAST(least_change), "Return the least difference between two lists of numbers."},

@@ -36,6 +36,10 @@ class SpeedAndLaneChange:
         """Return float64, shape (2,)."""
         try:
             speed, lane_change = action
+            # What most agents return, in every step.
+            usual = action.__class__ is tuple and speed.__class__ is float and lane_change.__class__ is int
+            if usual and 0.0 <= speed <= MAX_TARGET_SPEED and -1 <= lane_change <= 1:
+                return np.array(action)
             # NaN fails both comparisons, as does what is masked. Of a dictionary it would be the keys.
             if (
                 not isinstance(action, dict | set | frozenset)

@@ -193,7 +193,13 @@ class _Moved:
         return points, [*angles[:-1], math.nextafter(angles[-1], 10.0)], speeds
 
 
+def _blind(eyes, squared):
+    ids, points = core.in_sight(eyes, squared)
+    return ids[:-1], points
+
+
 LIES = {
+    "in_sight": _blind,
     "nothing": None,
     "observe": lambda *given: _nearly(core.observe(*given)),
     "Vehicles": _Moved,
@@ -253,6 +259,12 @@ def test_a_vehicle_that_has_left_is_refused_as_by_libsumo(run):
     try:
         assert core.Vehicles(("nobody",)).read() is None
         assert core.Vehicles(()).read() == ([], [], [])
+        eyes = core.Vehicles(("nobody", "ego"))
+        ids, (point,) = core.in_sight(eyes, 1e-9)
+        assert (ids, point) == (("ego",), libsumo.vehicle.getPosition("ego"))
+        assert set(core.in_sight(eyes, math.inf)[0]) == set(libsumo.vehicle.getIDList())
+        with pytest.raises(TypeError, match="in_sight"):
+            core.in_sight("ego", 1.0)
         with pytest.raises(libsumo.TraCIException):
             libsumo.vehicle.getSpeed("nobody")
     finally:

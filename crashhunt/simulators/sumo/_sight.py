@@ -62,6 +62,7 @@ class Sight:
     ) -> None:
         self.core = core
         self._controlled = tuple(controlled)
+        self._eyes: Vehicles | None = core.Vehicles(self._controlled) if core is not None else None
         self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
         self._speeds = speeds
         self._high: bool | None = None
@@ -123,8 +124,11 @@ class Sight:
         """Whether the core reads what libsumo's getters return, to the bit."""
         if self.core is None or self._vehicles is None:
             return True
-        read = self._vehicles.read(), self.core.is_coming_or_going()
-        return repr(read) == repr((self._columns(), _is_coming_or_going()))  # all digits of each number
+        seen = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self._eyes is not None else self._in_sight()
+        read = self._vehicles.read(), self.core.is_coming_or_going(), seen
+        return repr(read) == repr(
+            (self._columns(), _is_coming_or_going(), self._in_sight())
+        )  # all digits of each number
 
     def distrust(self) -> None:
         """Do without the core from now on, and forget the episode."""
@@ -160,10 +164,8 @@ class Sight:
 
     def _look_around(self) -> None:
         """Choose who is in sight: those near a controlled vehicle, and the controlled ones themselves."""
-        everybody = sumo.vehicle_getIDList()
-        points = list(map(sumo.vehicle_getPosition, everybody))
-        eyes = [points[everybody.index(eye)] for eye in self._controlled if eye in everybody]
-        ids = _near(everybody, points, eyes)
+        found = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self.core is not None and self._eyes else None
+        ids, eyes = found or self._in_sight()
         persons: tuple[str, ...] = ()
         if self._persons_count and (sumo.person_getIDCount() or self._all_persons):
             self._all_persons = sumo.person_getIDList()
@@ -175,6 +177,13 @@ class Sight:
             self._roster = Roster((*map(self._actor, ids), *map(self._person, persons)))
             actors = self._roster.actors[: len(ids)]
             self._long = [row for row, actor in enumerate(actors) if is_articulated(actor)]
+
+    def _in_sight(self) -> tuple[tuple[str, ...], list[tuple[float, float]]]:
+        """The vehicles in sight, and where the controlled ones are that are there."""
+        everybody = sumo.vehicle_getIDList()
+        points = list(map(sumo.vehicle_getPosition, everybody))
+        eyes = [points[everybody.index(eye)] for eye in self._controlled if eye in everybody]
+        return _near(everybody, points, eyes), eyes
 
     def _actor(self, vehicle: str) -> Actor:
         found = self._known.get(vehicle)
