@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from crashhunt.base.faculties import offers
 from crashhunt.episode._observer import Observer
+from crashhunt.simulators import NamesDanger
 from crashhunt.trial import Outcome
 from crashhunt.world import ApproachMeter, DangerMeter
 
@@ -34,6 +36,7 @@ class Nearness(Observer):
         self._take_frames = take_frames
         self._meter = ApproachMeter(())
         self._dangers = DangerMeter((), 1.0)
+        self._names_it: NamesDanger | None = None
 
     @property
     def closest(self) -> ClosestApproach:
@@ -44,6 +47,7 @@ class Nearness(Observer):
     def begin(self, episode: Episode) -> None:
         """Note who is controlled."""
         self._meter = ApproachMeter(episode.names)
+        self._names_it = episode.simulator if offers(episode.simulator, NamesDanger) else None
         self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -59,7 +63,10 @@ class Nearness(Observer):
         if result.outcome is Outcome.INVALID:
             return replace(result, closest=closest)
         touched = result.outcome.is_traffic_crash or closest.gap_m <= 0.0
-        return replace(result, closest=closest, danger=1.0 if touched else self._dangers.danger)
+        danger = 1.0 if touched else self._dangers.danger
+        if danger is None and self._names_it is not None:
+            danger = self._names_it.named_danger
+        return replace(result, closest=closest, danger=danger)
 
     def _measure(self) -> None:
         frames = self._take_frames()

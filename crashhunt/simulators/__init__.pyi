@@ -19,6 +19,7 @@ from ._protocol import (
     HasWindow as HasWindow,
     Info as Info,
     LeavesOut as LeavesOut,
+    NamesDanger as NamesDanger,
     NamesObservations as NamesObservations,
     Observations as Observations,
     Options as Options,

@@ -30,6 +30,7 @@ __all__ = [
     "HasWindow",
     "Info",
     "LeavesOut",
+    "NamesDanger",
     "NamesObservations",
     "Observations",
     "Options",
@@ -186,6 +187,14 @@ class TellsEvents(Protocol):
         """The kinds that it looks for: of those and no others, a result says how often they happened."""
 
 
+class NamesDanger(Protocol):
+    """A simulator without scenes that says itself how near to a crash an episode came."""
+
+    @property
+    def named_danger(self) -> float | None:
+        """The greatest danger so far, from 0 (nothing near) to 1 (touched); None where nobody knows."""
+
+
 class HasMap(Protocol):
     """A simulator whose actors drive on lanes."""
 
@@ -292,6 +301,7 @@ class HasMeanings(Protocol):
 FACULTIES: tuple[type, ...] = (
     TellsNotices,
     FlattensObservations,
+    NamesDanger,
     NamesObservations,
     TellsEvents,
     HasMap,

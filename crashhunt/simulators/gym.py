@@ -56,6 +56,8 @@ class GymSimulator:
         self.step_length_s = scenario.step_length_s
         self._factory = self._find()
         self._rule = _Rule(self._setup.crash)
+        self._near, _, self._key = self._setup.danger.partition("info.")
+        self.named_danger: float | None = None
         self.agents: list[str] = []
         self.notices: dict[str, None] = {}
         try:
@@ -79,6 +81,7 @@ class GymSimulator:
         self.agents = [self._agent]
         self._steps = 0
         self._crashed = False
+        self.named_danger = None
         self._look("")
         return {self._agent: self._shown(observation)}, {self._agent: info}
 
@@ -88,6 +91,8 @@ class GymSimulator:
         observation, reward, terminated, truncated, info = self._env.step(action)
         self._steps += 1
         self._look(self._rule(observation, float(reward), bool(terminated), bool(truncated), info))
+        if self._key and self._key in info:
+            self._take_danger(info[self._key])
         over = bool(terminated or truncated) or self._crashed
         if over:
             self.agents = []
@@ -149,6 +154,15 @@ class GymSimulator:
         self.observation_spaces = {self._agent: self._form.space}
         self.shown_spaces = {self._agent: self._form.original} if self._form.flattened else {}
         self.actions: dict[str, ActionForm] = {self._agent: action_form(env.action_space)}
+
+    def _take_danger(self, said: Any) -> None:
+        try:
+            value = float(said)
+        except (TypeError, ValueError):
+            raise self._mistake(f"gym.danger = {self._setup.danger!r} is {said!r:.80}, and no number") from None
+        if not np.isnan(value):
+            found = 1 / (1 + max(0.0, value)) if self._near else min(1.0, max(0.0, value))
+            self.named_danger = max(found, self.named_danger or 0.0)
 
     def _look(self, what: str) -> None:
         contacts: tuple[Contact, ...] = ()

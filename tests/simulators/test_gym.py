@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -12,7 +14,7 @@ from gymnasium import spaces
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
-from crashhunt.scenario.backends.gym import CrashRule, GymSetup
+from crashhunt.scenario.backends.gym import BACKEND, CrashRule, GymSetup
 from crashhunt.simulators.gym import GymSimulator
 from crashhunt.testing import SimulatorContract
 
@@ -263,3 +265,43 @@ def test_a_hunt_tells_it_in_its_summary(shell):
     assert done.json["outcomes"] == {"survived": 2}
     assert sum("(NaN)" in note for note in done.json["notes"]) == 1
     assert "Note: the environment 'straying:make_straying' shows its agent an observation outside" in done.err
+
+
+class Near(Tray):
+    def step(self, action):
+        *rest, info = super().step(action)
+        left = self.size - abs(self.ball).max()
+        return *rest, {
+            **info,
+            "left": left if self.steps != 2 else math.nan,
+            "share": 1 - left / self.size,
+            "word": "far",
+        }
+
+
+gymnasium.register("Near-v0", entry_point=Near)
+
+
+@pytest.mark.parametrize(("danger", "most"), [("-info.left", 1 / 1.25), ("info.share", 0.875), ("info.other", None)])
+def test_where_no_scene_says_it_the_environment_names_its_danger(tmp_path, danger, most):
+    scenario = scenario_of("Near-v0")
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), tmp_path)
+    for _ in range(2):  # of an episode, nothing is left in the next
+        simulator.reset(seed=1)
+        assert simulator.named_danger is None
+        simulator._env.unwrapped.ball[:] = 1.55
+        for tilt in (1.0, -1.0, -1.0):
+            action = simulator.actions["ball"].encode({"tilt": np.full(2, tilt, np.float32), "kick": 0})
+            simulator.step({"ball": action})
+        assert simulator.named_danger == (most and pytest.approx(most))
+
+
+def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
+    scenario = scenario_of("Near-v0")
+    for danger in ("distance", "info.", "-reward"):
+        with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' names nothing"):
+            BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")
+    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger="info.word")), tmp_path)
+    simulator.reset(seed=1)
+    with pytest.raises(ScenarioError, match=r"gym\.danger = 'info\.word' is 'far', and no number"):
+        simulator.step({"ball": simulator.actions["ball"].encode({"tilt": np.zeros(2, np.float32), "kick": 0})})

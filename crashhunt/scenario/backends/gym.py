@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -43,11 +44,15 @@ class GymSetup:
         id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
         kwargs: of the environment.
         crash: what counts as a crash.
+        danger: how dangerous a step is, where no scene says it: ``info.KEY``, a number of the info from 0 to 1, or
+            ``-info.KEY`` of one that is less the more dangerous it is, such as a distance of x: 1 / (1 + x). A trial
+            has the greatest of its steps. Empty for nobody knows.
     """
 
     id: str
     kwargs: dict[str, object] = field(default_factory=dict)
     crash: CrashRule = field(default_factory=CrashRule)
+    danger: str = ""
 
 
 def _check(scenario: Scenario, where: str) -> None:
@@ -57,6 +62,11 @@ def _check(scenario: Scenario, where: str) -> None:
     if scenario.observation is not None:
         message = "observation = '' is not for Gymnasium environments, which show what they show"
         raise ScenarioError(message, fix="remove it", where=where)
+
+    danger = scenario.table(GymSetup).danger
+    if danger and not re.fullmatch(r"-?info\..+", danger):
+        fix = "write info.KEY, or -info.KEY of a number that is less the more dangerous it is"
+        raise ScenarioError(f"gym.danger = {danger!r} names nothing", fix=fix, where=where)
 
 
 def _modules(scenario: Scenario) -> Iterable[str]:
