@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
+from crashhunt.cli._bisect import add_bisect
 from crashhunt.cli._check import add_check
 from crashhunt.cli._common import Parser
 from crashhunt.cli._compare import add_compare
@@ -147,7 +148,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_shrink, add_corpus, add_check, add_compare, add_lists, add_guide, add_completion,
+        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_check, add_compare, add_lists,
+        add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -1,3 +1,4 @@
+from ._bisect import Bisected as Bisected, BisectedData as BisectedData, bisect as bisect
 from ._case import (
     Case as Case,
     CaseData as CaseData,
@@ -5,5 +6,5 @@ from ._case import (
     find_cases as find_cases,
     read_case as read_case,
 )
-from ._run import CaseReport as CaseReport, ReportData as ReportData, run_cases as run_cases
+from ._run import CaseReport as CaseReport, Got as Got, ReportData as ReportData, run_cases as run_cases
 from ._store import Added as Added, add_case as add_case

@@ -1,0 +1,56 @@
+"""``crashhunt bisect``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.text import in_lines
+from crashhunt.cli._common import add_crash, add_json, say
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.corpus import Got
+
+__all__ = ["add_bisect"]
+
+
+def add_bisect(commands: Commands) -> None:
+    """Add the command."""
+    bisect = commands.add_parser(
+        "bisect",
+        help="find the commit with which a crash came",
+        description="Find the commit of the agent's repository with which a crash came: git bisect, with the crash as "
+        "the test. Revisions are checked out in a work tree of their own; yours is left alone. Revisions that cannot "
+        "run, or crash in another way, are skipped. Exits with 1 where these are in the way of an answer.",
+    )
+    add_crash(bisect)
+    bisect.add_argument("--good", metavar="REV", required=True, help="a revision in which it does not crash")
+    bisect.add_argument("--bad", metavar="REV", default="HEAD", help="one in which it does; default: HEAD")
+    bisect.add_argument(
+        "--from", metavar="FOLDER", type=Path, dest="folder",
+        help="of the repository, from which the agent is imported; default: the current one",
+    )  # fmt: skip
+    add_json(bisect)
+    bisect.set_defaults(command=_bisect)
+
+
+def _bisect(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.corpus import bisect
+    from crashhunt.crashes import find_bundle
+
+    def tell(revision: str, got: Got) -> None:
+        say(f"{revision[:12]}  {got.replace('_', ' ')}", as_json=options.json)
+
+    bundle = find_bundle(options.directory, options.crash)
+    found = bisect(bundle, options.good, bad=options.bad, folder=options.folder, watch=tell)
+    if found.commit:
+        say(in_lines([f"{found.commit[:12]} is the first in which it crashes: {found.subject}"]), as_json=options.json)
+    else:
+        say(f"it is one of {', '.join(one[:12] for one in found.candidates)}", as_json=options.json)
+    if options.json:
+        print(json.dumps(found.to_json()))
+    return 0 if found.commit else 1

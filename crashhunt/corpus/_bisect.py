@@ -1,0 +1,172 @@
+"""Which commit brought a crash: git bisect, in a work tree of its own, with the crash as the test."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.corpus._store import add_case
+from crashhunt.plans import read_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.corpus._run import Got
+    from crashhunt.crashes import Bundle
+
+__all__ = ["Bisected", "BisectedData", "bisect"]
+
+_WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
+_FOUND = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
+_ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
+
+
+class BisectedData(TypedDict):
+    """What ``bisect --json`` prints."""
+
+    commit: str | None
+    subject: str
+    candidates: list[str]
+    tried: dict[str, Got]
+
+
+@dataclass(frozen=True, slots=True)
+class Bisected:
+    """What came of it.
+
+    Args:
+        commit: the first in which it crashes; empty where revisions that cannot run are in the way.
+        subject: of its message.
+        candidates: those among which it is, where they are several.
+        tried: revisions, and what the crash did in each.
+    """
+
+    commit: str
+    subject: str
+    candidates: tuple[str, ...]
+    tried: dict[str, Got]
+
+    def to_json(self) -> BisectedData:
+        """Return the shape that ``bisect --json`` prints."""
+        return {
+            "commit": self.commit or None,
+            "subject": self.subject,
+            "candidates": list(self.candidates),
+            "tried": self.tried,
+        }
+
+
+def bisect(
+    bundle: Bundle,
+    good: str,
+    *,
+    bad: str = "HEAD",
+    folder: Path | None = None,
+    watch: Callable[[str, Got], None] = lambda _revision, _got: None,
+) -> Bisected:
+    """Find the commit of the agent's repository with which a crash came.
+
+    Revisions are checked out in a work tree of their own, which is removed in the end; the user's is left alone.
+
+    Args:
+        bundle: the crash.
+        good: a revision in which it does not crash.
+        bad: one in which it does.
+        folder: from which the agent can be imported, inside its repository; the current one by default.
+        watch: called with each revision that was tried, and what came of it.
+
+    Raises:
+        UsageError: a revision is none, or does not do what is said of it; the code would not come from the work tree.
+        CrashhuntError: git fails.
+    """
+    folder = (folder or Path.cwd()).resolve()
+    top = Path(_git(folder, "rev-parse", "--show-toplevel"))
+    ends = [_git(folder, "rev-parse", "--verify", "--quiet", f"{name}^{{commit}}", what=name) for name in (good, bad)]
+    modules = {
+        agent.agent.partition(":")[0]
+        for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()
+        if not agent.agent.startswith("crashhunt.")
+    }
+    tried: dict[str, Got] = {}
+    with tempfile.TemporaryDirectory(prefix="crashhunt-bisect-") as name:
+        tree, case = Path(name).resolve() / "tree", add_case(bundle, Path(name) / "corpus").case.path.resolve()
+        _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
+        try:
+
+            def run() -> Got:
+                revision = _git(tree, "rev-parse", "HEAD")
+                tried[revision] = got = _run(case, tree / folder.relative_to(top), tree, modules)
+                watch(revision, got)
+                return got
+
+            _see(run(), "still", bad, "--bad")
+            _git(tree, "checkout", "--quiet", "--detach", ends[0])
+            _see(run(), "fixed", good, "--good")
+            said = _git(tree, "bisect", "start", ends[1], ends[0])
+            while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
+                head = _git(tree, "rev-parse", "HEAD")
+                said = _git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
+            if found is not None:
+                return Bisected(found[1], _git(tree, "log", "-1", "--format=%s", found[1]), (), tried)
+            return Bisected("", "", tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)), tried)
+        finally:
+            _git(top, "worktree", "remove", "--force", str(tree), skipped=True)
+
+
+def _see(got: Got, expected: Got, revision: str, option: str) -> None:
+    if got != expected:
+        message = f"{option} {revision}: there, the crash is {got.replace('_', ' ')}, and not {expected}"
+        raise UsageError(message, fix="give another revision")
+
+
+def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
+    """Run a case with the code of a work tree, in a process that begins there."""
+    environment = _environment(folder, tree)
+    for module in sorted(modules):
+        place = [sys.executable, "-c", _ORIGIN, module]
+        found = subprocess.run(place, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        origin = found.stdout.strip()
+        if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
+            raise UsageError(
+                f"{module!r} comes from {origin}, whatever revision is checked out",
+                fix="run it from the folder of the repository in which the module is (--from)",
+            )
+        if found.returncode != 0:
+            return "cannot_run"
+    command = [sys.executable, "-m", "crashhunt", "corpus", "run", str(case), "--json"]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    try:
+        got: Got = json.loads(done.stdout)["cases"][0]["got"]
+    except (ValueError, KeyError, IndexError):
+        raise CrashhuntError(f"the case could not be run: {done.stderr.strip()[-300:]}", fix="see why") from None
+    return got
+
+
+def _environment(folder: Path, tree: Path) -> dict[str, str]:
+    places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
+    paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def _git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
+    """Return what git says; with ``skipped``, also where it ends with an error."""
+    command: Sequence[str] = ["git", "-C", str(folder), *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"})
+    except OSError as error:
+        raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
+    if done.returncode and not skipped:
+        if what:
+            raise UsageError(f"{what!r} is no commit of {folder}", fix="give a revision as git knows it")
+        said = " ".join(done.stderr.split()) or f"git {words[0]} failed"
+        raise CrashhuntError(said, fix="run it in the repository of the agent", where=str(folder))
+    return done.stdout.strip()

@@ -1,0 +1,60 @@
+"""Which commit brought a crash."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+from test_corpus import BROKEN, DRIVER, MENDED
+
+
+def git(folder, *words):
+    who = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
+    return subprocess.run(["git", *who, *words], cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture
+def repository(toy):
+    """A repository with the code of the agent, and a hunt of its last commit beside it."""
+    project = toy.folder / "my project"
+    project.mkdir()
+    git(project, "init", "-q")
+    for number, code in enumerate(
+        (MENDED, MENDED + "\n# 1\n", BROKEN.replace("raise", "raise SystemError or"), DRIVER)
+    ):
+        (project / "driver.py").write_text(code)
+        git(project, "add", "driver.py")
+        git(project, "commit", "-qm", f"change {number}")
+    (project / "driver.py").write_text(DRIVER + "\n# not committed\n")
+    toy.folder = project
+    words = ("--scenario", "../toy", "--agent", "driver:Driver", "--arg", "speed=20:22", "--seed", "1")
+    toy.crashhunt("run", "../h", "1", "1", "99", *words)
+    return toy
+
+
+@pytest.mark.nightly
+def test_the_commit_is_found_and_the_work_tree_left_alone(repository):
+    found = repository.crashhunt("bisect", "../h", "--good", "HEAD~3", "--json", expect=1).json
+    # The commit before cannot be told from it: there, it crashes in another way.
+    assert set(found["tried"].values()) == {"still", "fixed", "changed"}
+    assert found["commit"] is None
+    assert len(found["candidates"]) == 2
+    assert (repository.folder / "driver.py").read_text().endswith("# not committed\n")
+    assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
+    assert git(repository.folder, "status", "--short").split() == ["M", "driver.py"]
+
+
+@pytest.mark.nightly
+def test_the_first_of_them_is_told(repository):
+    git(repository.folder, "rebase", "-q", "--autostash", "--onto", "HEAD~2", "HEAD~1", "-X", "theirs")
+    done = repository.crashhunt("bisect", "../h", "--good", "HEAD~2")
+    assert "is the first in which it crashes: change 3" in done.out
+    assert "the crash is still, and not fixed" in repository.crashhunt("bisect", "../h", "--good", "HEAD", expect=2).err
+
+
+def test_what_is_no_revision_is_told(toy, made_once):
+    toy.crashhunt("run", "h", "1", "1", "80", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
+    assert "run it in the repository" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
+    git(toy.folder, "init", "-q")
+    git(toy.folder, "commit", "-qm", "empty", "--allow-empty")
+    assert "'v1' is no commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
