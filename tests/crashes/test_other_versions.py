@@ -164,7 +164,7 @@ def test_a_snapshot_of_a_later_version_is_read(hunt, data):
 def test_what_a_later_version_asked_is_kept_where_hunt_toml_is_written_again(hunt):
     file = hunt / "hunt.toml"
     asked = tomllib.loads(file.read_text())
-    later = {**asked, "probes": {"every_s": 2}, "run": {**asked["run"], "probing": True}}
+    later = {**asked, "weather": {"every_s": 2}, "run": {**asked["run"], "probing": True}}
     file.write_text(tomli_w.dumps(later))
     settings = read_settings(file)
     write_settings(file, settings, ["crashhunt", "run"])
