@@ -756,6 +756,24 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
     write_bundle(directory, result, scratch, hunt_seed=0, snapshot=snapshot, lanes=[])
 
 
+def bench_search() -> Iterator[Figure]:
+    """Trials to the first crash, guided against random; scripts/search.py has all samplers, peers and problems."""
+    from problems import PROBLEMS
+    from search import FIRST_SEED, all_runs, summary
+
+    count = 10
+    runs = all_runs(("random", "guided"), range(FIRST_SEED, FIRST_SEED + count), tuple(PROBLEMS), 2)
+    note = f"mean of {count} hunts; random draws by calculation: 1"
+    rare = []
+    for name, row in summary(list(runs)).items():
+        problem = PROBLEMS[name]
+        if problem.hint and problem.rate <= 1 / 200:
+            rare.append(row["guided"])
+        yield Figure(f"guided, {name}: one in {1 / problem.rate:.0f}", row["guided"], "x", "lower", 1.2, note)
+    mean = statistics.geometric_mean(rare)
+    yield Figure("guided, one in 200 and rarer, with a hint", mean, "x", "lower", 1 / 3, "geometric mean of the above")
+
+
 def _toy(place: Path) -> Path:
     scenario = place / "toy"
     scenario.mkdir(exist_ok=True)
@@ -782,6 +800,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "scale": bench_scale,
     "report": bench_report,
     "accelerator": bench_accelerator,
+    "search": bench_search,
 }
 
 

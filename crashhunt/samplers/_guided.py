@@ -34,10 +34,10 @@ _EVEN = "halton"
 _FIRST = 10  # unguided trials before anybody is measured against them
 # The share of the hunt's trials that strategies have, as long as they come nearer to a crash and when they no longer
 # do. Climbing may lead nowhere, so that never more than half of a hunt is at stake.
-_CLIMBING, _STUCK, _PROBING = 0.5, 0.3, 0.1
+_CLIMBING, _STUCK, _PROBING = 0.5, 0.3, 0.06
 _OF_OURS = 0.8  # the share of trials that the portfolio is asked for at all
-_PATIENCE, _PATIENCE_PER_ARGUMENT = 20, 4  # trials of strategies without a greater danger until they count as stuck
-_NEARER = 0.98  # of what was missing to a crash is missing now: less is no greater danger
+_PATIENCE, _PATIENCE_PER_ARGUMENT = 10, 4  # trials of strategies without a greater danger until they count as stuck
+_NEARER = 0.9  # of what was missing to a crash is missing now, or less: else it is no greater danger
 _FORGET = 0.96  # of what a strategy has earned, at each of its trials
 _REMEMBERED = 200  # trials from which strategies begin anew after a crash
 _AROUND = 0.1  # of a crash, times the square root of the dimensions: there, nothing more is looked for

@@ -87,6 +87,7 @@ def test_the_seed_of_the_hunt_scrambles_it(kind):
     assert len(first) == 8
 
 
+@pytest.mark.nightly
 def test_scipy_is_imported_only_when_it_is_asked():
     code = (
         "import sys; from crashhunt.samplers import HaltonSampler, NamedSampler; from crashhunt.space import Range\n"

@@ -56,10 +56,9 @@ def corner(proposal):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_rare_is_found_where_danger_leads_to_it(kind):
-    for seed in (1, 2):
-        asked, results = hunt(kind(UNIT, hunt=HuntFacts(seed)), corner, 900, seed=seed)
-        assert results[-1].outcome is Outcome.COLLISION
-        assert asked[-1].origin not in ("", "random")
+    asked, results = hunt(kind(UNIT, hunt=HuntFacts(1)), corner, 900)
+    assert results[-1].outcome is Outcome.COLLISION
+    assert asked[-1].origin not in ("", "random")
 
 
 @pytest.mark.parametrize("kind", KINDS)

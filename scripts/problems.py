@@ -1,0 +1,186 @@
+"""What samplers are measured on: crash regions of known size without any simulator, and real scenarios.
+
+The first have a danger that leads to the crash, misleads, or says nothing; see each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from crashhunt.plans import Given
+    from crashhunt.trial import Kind
+
+__all__ = ["PROBLEMS", "REAL", "Problem", "Real"]
+
+Danger = Callable[[Any, int], float]
+"""Of the values of the arguments and a trial's seed; 1 for a crash."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A crash region of known size.
+
+    Args:
+        about: in words.
+        arguments: name to specification and kind.
+        rate: of crashes, of random draws.
+        danger: of a trial.
+        hint: whether danger leads to the crash.
+    """
+
+    about: str
+    arguments: Mapping[str, tuple[str, Kind | None]]
+    rate: float
+    danger: Danger
+    hint: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Real:
+    """A scenario with an agent.
+
+    Args:
+        about: in words.
+        rate: of crashes, of random draws, as measured.
+        request: what is hunted.
+    """
+
+    about: str
+    rate: float
+    request: Given
+
+
+def _numbers(count: int) -> dict[str, tuple[str, Kind | None]]:
+    return {f"x{index:02d}": ("0.0:1.0", "float") for index in range(count)}
+
+
+def _radius(rate: float, dimensions: int) -> float:
+    """Of a ball of such a volume."""
+    return float((rate * math.gamma(dimensions / 2 + 1) / math.pi ** (dimensions / 2)) ** (1 / dimensions))
+
+
+def _ball(seed: int, dimensions: int, rate: float, reach: float) -> Danger:
+    """A crash within a ball somewhere; danger falls from there over the reach to nothing."""
+    radius = _radius(rate, dimensions)
+    center = np.random.default_rng(seed).uniform(radius, 1 - radius, dimensions)
+
+    def danger(values: Any, _seed: int) -> float:
+        away = float(np.linalg.norm(values - center)) - radius
+        return 1.0 if away < 0 else 0.95 * max(0.0, 1 - away / reach)
+
+    return danger
+
+
+def _deceptive(values: Any, _seed: int) -> float:
+    """Danger rises over nearly all of the space to where nothing crashes, and near the crash in a narrow ring."""
+    away = float(np.linalg.norm(values - np.array([0.2, 0.25, 0.8]))) - _radius(1 / 200, 3)
+    if away < 0:
+        return 1.0
+    false = 0.97 * max(0.0, 1 - float(np.linalg.norm(values - np.array([0.85, 0.8, 0.15]))) / 1.2)
+    return max(false, 0.9 * max(0.0, 1 - away / 0.15))
+
+
+def _discrete(values: Any, _seed: int) -> float:
+    """One of 625 combinations of words, and a number of five or more out of ten."""
+    *words, number = values
+    right = sum(word == wanted for word, wanted in zip(words, "bdac", strict=True)) + (number > 4)
+    return 1.0 if right == 5 else 0.95 * right / 6
+
+
+def _twenty(rate: float) -> Danger:
+    """A weighted sum of twenty arguments is above a limit."""
+    weights = np.random.default_rng(1).uniform(0.3, 1, 20) * np.random.default_rng(2).choice([-1, 1], 20)
+    sums = np.random.default_rng(3).random((400_000, 20)) @ weights
+    least, limit = float(sums.min()), float(np.quantile(sums, 1 - rate))
+
+    def danger(values: Any, _seed: int) -> float:
+        total = float(values @ weights)
+        return 1.0 if total > limit else min(0.99, max(0.0, (total - least) / (limit - least)))
+
+    return danger
+
+
+def _traffic(rate: float) -> Danger:
+    """Mostly the traffic decides, which is the seed's; danger is told with much noise."""
+    weights = np.array([2.4, -1.6, 1.0, 0.0, 0.0])
+    rng = np.random.default_rng(5)
+    margins = (rng.random((400_000, 5)) - 0.5) @ weights + rng.standard_normal(400_000)
+    limit = float(np.quantile(margins, 1 - rate))
+
+    def danger(values: Any, seed: int) -> float:
+        luck = np.random.default_rng(seed)
+        margin = float((values - 0.5) @ weights) + luck.standard_normal()
+        return 1.0 if margin > limit else min(0.99, max(0.0, 0.5 + 0.12 * (margin + 1.5 * luck.standard_normal())))
+
+    return danger
+
+
+def _seeds(rate: float) -> Danger:
+    """Which arguments crash is another with every seed: with the same one, danger leads there."""
+    radius = _radius(rate, 2)
+
+    def danger(values: Any, seed: int) -> float:
+        center = np.random.default_rng(seed).uniform(0.1, 0.9, 2)
+        away = float(np.linalg.norm(values[:2] - center)) - radius
+        return 1.0 if away < 0 else 0.95 * max(0.0, 1 - away / 0.5)
+
+    return danger
+
+
+def _blind(rate: float) -> Danger:
+    """Danger is drawn by the seed alone."""
+    ball = _ball(4, 2, rate, 1.0)
+
+    def danger(values: Any, seed: int) -> float:
+        return 1.0 if ball(values, seed) == 1.0 else 0.9 * float(np.random.default_rng(seed).random())
+
+    return danger
+
+
+def _as_floats(danger: Danger) -> Danger:
+    def of(values: Any, seed: int) -> float:
+        numbers: NDArray[np.float64] = values.astype(float)
+        return danger(numbers, seed)
+
+    return of
+
+
+_WORDS: dict[str, tuple[str, Kind | None]] = {f"c{index}": ("a|b|c|d|e", None) for index in range(4)}
+
+PROBLEMS = {
+    "easy": Problem("a ball in 3 dimensions", _numbers(3), 1 / 50, _as_floats(_ball(1, 3, 1 / 50, 1.0))),
+    "smooth": Problem("a ball in 5 dimensions", _numbers(5), 1 / 500, _as_floats(_ball(2, 5, 1 / 500, 1.0))),
+    "needle": Problem(
+        "a ball in 3 dimensions, danger only near it", _numbers(3), 1 / 5000, _as_floats(_ball(3, 3, 1 / 5000, 0.12))
+    ),
+    "deceptive": Problem("danger leads elsewhere", _numbers(3), 1 / 200, _as_floats(_deceptive)),
+    "discrete": Problem(
+        "four words and a whole number", {**_WORDS, "n": ("1:10", "int")}, 0.6 / 625, _discrete
+    ),
+    "twenty": Problem("a sum of 20 arguments", _numbers(20), 1 / 1000, _as_floats(_twenty(1 / 1000))),
+    "traffic": Problem("the seed decides more than the arguments", _numbers(5), 1 / 500, _as_floats(_traffic(1 / 500))),
+    "seeds": Problem("other arguments with every seed", _numbers(4), 1 / 1000, _as_floats(_seeds(1 / 1000))),
+    "blind": Problem("danger says nothing", _numbers(2), 1 / 300, _as_floats(_blind(1 / 300)), hint=False),
+}  # fmt: skip
+
+REAL = {
+    "motorway": Real("the shipped agent on SUMO", 1 / 8, {"scenario": "motorway", "max_steps": 200}),
+    "highway": Real(
+        "car following on highway-env", 1 / 35,
+        {"scenario": "highway", "agents": {"": "car-following"}, "max_steps": 30},
+    ),
+    "highway-idm": Real(
+        "the intelligent driver model on highway-env", 1 / 35,
+        {"scenario": "highway", "agents": {"": "idm"}, "max_steps": 30},
+    ),
+    "intersection": Real("the shipped agent on SUMO", 1 / 100, {"scenario": "intersection", "max_steps": 200}),
+}  # fmt: skip
+"""Their rates were seen in 100 trials each, and say only when a hunt is given up."""
