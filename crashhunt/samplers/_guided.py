@@ -32,6 +32,7 @@ __all__ = ["Portfolio"]
 
 _EVEN = "halton"
 _FIRST = 10  # unguided trials before anybody is measured against them
+_WHOLE = 150  # of those until strategies have their whole share: what crashes often is found without them
 # The share of the hunt's trials that strategies have, as long as they come nearer to a crash and when they no longer
 # do. Climbing may lead nowhere, so that never more than half of a hunt is at stake.
 _CLIMBING, _STUCK, _PROBING = 0.5, 0.3, 0.06
@@ -118,6 +119,7 @@ class Portfolio:
         """Of all trials of the hunt, which share a strategy has."""
         gains = {name: max(total / count - 1.0, 0.05) for name, (total, count) in self._earned.items()}
         most = _STUCK if self._without_record >= self._patience else _CLIMBING
+        most *= min(1.0, len(self._unguided) / _WHOLE)
         whole = max(most * min(1.0, max(gains.values())), _PROBING)
         return {name: whole * gain / sum(gains.values()) for name, gain in gains.items()}
 

@@ -163,7 +163,8 @@ class Range:
             return self._exp(rng.uniform(*self._logarithms))
         if self.step is not None or self.integer:
             return self._at(int(rng.integers(self.steps)))
-        return min(float(rng.uniform(self.low, self.high)), float(self.high))
+        high = self.high + 0.0  # of -0.0 NumPy says that it is below 0.0
+        return min(float(rng.uniform(self.low, high)), float(self.high))
 
     def _exp(self, logarithm: float) -> Value:
         value = min(max(math.exp(logarithm), self.low), self.high)

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 from spaces import are_inside, ask, distributions, spaces, spec_of
 
 from crashhunt.samplers import Cube, HaltonSampler, HuntFacts, NamedSampler, Proposal, SobolSampler
@@ -29,6 +29,7 @@ def test_a_quantile_is_a_value_and_has_a_share(known, share):
 
 @quickly
 @given(distributions)
+@example(Range(0.0, -0.0))
 def test_quantiles_of_even_shares_are_spread_as_draws_are(known):
     if isinstance(known, Constant) or (isinstance(known, Choice) and isinstance(known.options[0], str | bool)):
         return
