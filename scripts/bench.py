@@ -784,6 +784,34 @@ def _toy(place: Path) -> Path:
     return scenario
 
 
+def bench_ray() -> Iterator[Figure]:
+    """What hunts on Ray cost, against hunts on one machine."""
+    import bench_ray as ray
+
+    with ray.cluster(2) as address:
+        found = ray.in_child("child_rate", address, "5")
+        note = (
+            f"{found['ray']:.2f} against {found['pool']:.2f} trials a second, 1,000 steps each, in 5 pairs in turns "
+            f"({found['least']:.2f} to {found['most']:.2f}); load {found['load']:.1f}"
+        )
+        yield Figure("ray_rate", found["ratio"], "of the pool's", "higher", 0.95, note)
+        found = ray.in_child("child_wire", address)
+        note = f"a trial that costs nothing; besides, {found['idle']:.0f} B a second and node"
+        yield Figure("ray_bytes_a_trial", found["trial"], "B", "lower", None, note)
+        note = "CPU of the bridge, with Ray in it, for each trial, where they come one by one"
+        yield Figure("ray_bridge_ms_a_trial", found["ms"], "ms", "lower", None, note)
+        for name, executor in (("pool", "pool"), ("running", f"ray:{address}"), ("own", "ray:local")):
+            found = ray.first_trial("--executor", executor)
+            note = f"from the command to its first trial; {found['cpu']:.1f} s of CPU and {found['mb']:.0f} MB in all"
+            yield Figure(f"ray_first_trial_{name}", found["first"], "s", "lower", None, note)
+    with ray.cluster(2, 2, 2, 2) as address:
+        found = ray.stopped(address, "8")
+        note = (
+            f"from a crash to the last step of {found['running']:.0f} trials on 4 nodes; load {os.getloadavg()[0]:.1f}"
+        )
+        yield Figure("ray_crash_to_stop_s", found["last"], "s", "lower", 1.0, note)
+
+
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "parallel": bench_parallel,
@@ -799,6 +827,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "panels": bench_panels,
     "scale": bench_scale,
     "report": bench_report,
+    "ray": bench_ray,
     "accelerator": bench_accelerator,
     "search": bench_search,
 }

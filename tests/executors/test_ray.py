@@ -247,6 +247,7 @@ def test_where_all_nodes_are_lost_it_waits_and_says_so(begin, add):
     collect_into(found, executor, 8)
 
 
+@pytest.mark.nightly
 def test_a_node_that_differs_takes_no_part_and_the_others_go_on(begin, add, tmp_path):
     """What travels to it says so, whatever there is."""
     other = tmp_path / "other" / "libsumo-0.1.dist-info"
@@ -276,6 +277,7 @@ def refusal(executor):
     return str(raised.value)
 
 
+@pytest.mark.nightly
 def test_a_cluster_that_can_run_nothing_says_why(begin, settings, cluster):
     lacking = replace(settings, scenario=replace(settings.scenario, agents={"ego": AgentSetup(agent="nowhere:Agent")}))
     executor = RayExecutor(lacking, argument=cluster.address)

@@ -5,18 +5,24 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import zipfile
 from pathlib import Path
 
 import pytest
 
+from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
+from crashhunt.executors.ray._site import Site, code_digest
 from crashhunt.executors.ray._store import Store
+from crashhunt.executors.ray._work import Work
+from crashhunt.recording import BlackBox, Tag, read_black_box
 from crashhunt.scenario import Scenario
+from crashhunt.snapshots import versions
 from crashhunt.trial import CRASHES
 
 
@@ -92,6 +98,30 @@ def test_a_place_is_removed_by_whoever_comes_after_its_owner(tmp_path):
     for place in (mine, other):
         place.remove()
     assert not list((tmp_path / "store").iterdir())
+
+
+def test_a_node_says_what_differs(monkeypatch):
+    here = versions()
+    assert {"python", "crashhunt", "numpy"} <= {*here}
+    assert Site().differs(here, code_digest()) == ""
+    said = Site().differs({**here, "python": "3.0.0", "gone": "2"}, code_digest())
+    assert re.fullmatch(r"python is [\d.]+ there and 3.0.0 here, gone is not installed there and 2 here", said)
+    assert Site().differs(here, "other") == "crashhunt has the same version and other code there"
+    monkeypatch.setattr("crashhunt.executors.ray._site.importlib.util.find_spec", lambda name: None)
+    assert Site().differs(here, code_digest.__name__) == "crashhunt cannot be found there (no such package)"
+
+
+def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")  # which is set
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    box = BlackBox(tmp_path / layout.BLACK_BOX)
+    box.begin(pid=1, trial=0, started=0.0)
+    box.append(Tag.ROSTER, 0, bytes(range(1, 200)))
+    job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "slots": 1}
+    content = Work(job)._content(tmp_path / layout.BLACK_BOX)
+    assert len(content) < 1000
+    (tmp_path / "there").write_bytes(content)
+    assert list(read_black_box(tmp_path / "there")) == list(read_black_box(tmp_path / layout.BLACK_BOX)) != []
 
 
 def test_the_folder_of_a_cluster_is_removed_by_whoever_comes_after_its_owner(tmp_path):

@@ -18,6 +18,7 @@ from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors.ray._messages import Ended, News
 from crashhunt.executors.ray._parcel import settings_in
 from crashhunt.executors.ray._store import Store
+from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["Work", "unpacked"]
 
 _WHERE_EVERY_S = 0.5  # as often as people can read
+_HEAD = 64  # bytes of a black box that say what is in the rest, most of which is room for more
 _TEXTS = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
 
 
@@ -150,7 +152,9 @@ class Work:
         return Ended(ticket, result.spec.number, line, files)
 
     def _content(self, path: Path) -> bytes:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            box = read_header(path) if path.name == layout.BLACK_BOX else None
+            content = file.read(max(_HEAD, box.committed) if box is not None else -1)
         if path.name in _TEXTS:
             for here, there in self._renamed:
                 content = content.replace(os.fsencode(here), os.fsencode(there))
