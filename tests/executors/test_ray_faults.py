@@ -218,7 +218,7 @@ def test_a_clock_that_is_off_changes_nothing(toy, cluster, add, started, tmp_pat
     began = time.time()
     hunt = started("h", "--executor", f"ray:{cluster.address}")
     eventually(lambda: len(rows(toy, "h")) > 4)
-    (node,) = eventually(lambda: toy.crashhunt("status", "h", "--json").json.get("nodes"))
+    (node,) = eventually(lambda: toy.crashhunt("status", "h", "--json").json["hunts"][0].get("nodes"))
     assert 0 < node["rate_per_s"] < 100
     ends(hunt)
     for _, _, ended_at, wall_s in whole(toy, "h").values():
