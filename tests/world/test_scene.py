@@ -64,7 +64,7 @@ def test_scenes_of_one_roster_are_joined():
     assert frame.scene(1).spines == {1: SPINE}
     assert frame.scene(1).points == [(8, 9), (10, 11)]
     assert frame.scene(2).speeds == [22, 23]
-    assert joined_frame(roster, columns, [None, None, None])[2:] == (None, None)
+    assert joined_frame(roster, columns, [None, None, None])[2:] == (None, None, None)  # no core either
 
 
 def test_neighbors_are_found_once_and_are_all_the_others():
