@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.text import one_line
 from crashhunt.cli._common import add_json, integer
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
 from crashhunt.cli._options import add_options, chosen_options
@@ -63,11 +62,10 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     from crashhunt.report import Watcher, describe_hunt
 
     console = Console(stderr=options.json, highlight=False)
-    for note in hunt.scenario.notes:
-        console.print(one_line(note), markup=False, soft_wrap=True)
     agents = ", ".join(setup.agent for setup in hunt.settings.agents.values())
-    with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}") as watcher:
+    with Watcher(console, f"crashhunt: {hunt.scenario.name}, {agents}", hunt.scenario.notes) as watcher:
         report = hunt.run(watcher)
+        watcher.tell_notes()  # where there was nothing to run
     console.print(describe_hunt(report), markup=False, soft_wrap=True)
     if options.json:
         print(json.dumps(report.to_json()))

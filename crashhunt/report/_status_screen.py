@@ -17,6 +17,7 @@ from crashhunt.recording import Phase
 from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from types import TracebackType
 
     from rich.console import Console, RenderableType
@@ -42,10 +43,12 @@ class Watcher:
     Args:
         console: where to; a terminal gets the screen, anything else lines.
         title: on top.
+        notes: what to tell before the first status, when nothing can be refused any more.
     """
 
-    def __init__(self, console: Console, title: str) -> None:
+    def __init__(self, console: Console, title: str, notes: Sequence[str] = ()) -> None:
         self._console = console
+        self._notes = notes
         self._title = one_line(title)
         self._last_line = -math.inf
         self._live = Live(console=console, refresh_per_second=8, transient=True) if console.is_terminal else None
@@ -63,11 +66,18 @@ class Watcher:
 
     def __call__(self, status: HuntStatus) -> None:
         """Show a status."""
+        self.tell_notes()
         if self._live is not None:
             self._live.update(self._screen(status))
         elif time.monotonic() - self._last_line >= _LINE_EVERY_S:
             self._last_line = time.monotonic()
             self._console.print(_line(status), soft_wrap=True, highlight=False)
+
+    def tell_notes(self) -> None:
+        """Tell the notes, once."""
+        for note in self._notes:
+            self._console.print(one_line(note), markup=False, soft_wrap=True, highlight=False)
+        self._notes = ()
 
     def _screen(self, status: HuntStatus) -> RenderableType:
         """The head in a line, progress, outcomes; then as much of the rest as fits, the workers first."""
