@@ -150,6 +150,7 @@ def _trials(directory: Path) -> dict[str, object]:
                         "category": outcome.category,
                         "values": {**values, **row.scenario_arguments},
                         "ttc": round(time_s, 3) if time_s is not None else None,
+                        "danger": round(row.danger, 4) if row.danger is not None else None,
                     }
                 )
         return {
