@@ -17,7 +17,7 @@ from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._warm import WarmCopies
 from crashhunt.executors._worker import Worker
 from crashhunt.recording import Recording, read_black_box
-from crashhunt.scenario import AgentSetup, Scenario, load_scenario
+from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.simulators.toy import ToySimulator
 from crashhunt.trial import Outcome, TrialSpec
 
@@ -92,6 +92,9 @@ def same(stage, scenario="toy"):
     ]  # fmt: skip
     if scenario == "toy":
         specs[7] = replace(specs[7], scenario_arguments={"gap_m": 40.0})
+    else:
+        values = argument_values(load_scenario(scenario))
+        specs = [replace(one, scenario_arguments=values) for one in specs]
     found = {}
     for most in (4, 0):
         place = stage / str(most)

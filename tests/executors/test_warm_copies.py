@@ -38,7 +38,7 @@ def test_a_shared_warm_up_changes_nothing(ask, scenario):
     others = [True] if scenario == "loop" else [False]  # where an argument makes it another traffic
     assert [one.pop("shared") for one in shared] == [False, False, True, True, True, True, True, *others]
     assert not any(one.pop("shared") for one in alone)
-    assert len({one["digest"] for one in alone}) >= 5
+    assert len({one["digest"] for one in alone}) >= 4
     assert shared == alone
     assert found["log"] == "here\n"
     assert found["kept"] == alone[5]["digest"]
