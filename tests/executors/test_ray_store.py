@@ -199,3 +199,13 @@ def test_what_was_on_a_lost_node_runs_again_and_what_ends_every_node_in_the_end_
     (culprit,) = found.lose(found.nodes["a"])
     assert culprit.number == 0
     assert 0 not in [trial.number for trial in found.waiting]
+
+
+def test_who_is_alone_has_the_whole_machine():
+    found = roster(a=2, b=2)
+    found.nodes["b"].machine = "a"  # another part of it
+    found.waiting += [Trial(0, {"number": 0}, losses=2), Trial(1, {"number": 1})]
+    assert numbers(found.assign()) == {"a": [0]}
+    assert numbers(found.assign()) == {}
+    found.ended(found.nodes["a"], 0)
+    assert [*numbers(found.assign()).values()] == [[1]]
