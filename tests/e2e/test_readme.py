@@ -96,7 +96,7 @@ def test_every_option_that_is_mentioned_exists(shell):
     option = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
     scripts = [file.read_text(encoding="utf-8") for file in (ROOT / "scripts").iterdir() if file.is_file()]
     known = {"--help", "--upgrade"}.union(*map(option.findall, [shell.crashhunt("guide", "commands").out, *scripts]))
-    others = re.compile(r"^#SBATCH|\bsrun\b|\bray start\b")  # programs
+    others = re.compile(r"^#SBATCH|\bsrun\b|\bray start\b|\bpytest-xdist\b")  # programs
     for topic in PAGES:
         ours = [line for line in Page(topic).text.splitlines() if not others.search(line)]
         assert set(option.findall("\n".join(ours))) <= known, topic

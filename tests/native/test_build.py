@@ -15,11 +15,11 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def hook(monkeypatch, tmp_path):
-    """A hook of hatch_build.py; hatchling itself is not needed, nor is it part of a development environment."""
+    """A hook of scripts/build_core.py; hatchling itself is not needed, nor is it part of a development environment."""
     interface = types.ModuleType("interface")
     interface.BuildHookInterface = object
     monkeypatch.setitem(sys.modules, "hatchling.builders.hooks.plugin.interface", interface)
-    specification = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    specification = importlib.util.spec_from_file_location("build_core", ROOT / "scripts" / "build_core.py")
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     monkeypatch.setattr(module.tempfile, "mkdtemp", lambda **_: str(tmp_path))

@@ -24,7 +24,7 @@ FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-c
 INTERFACE = re.compile(r"^_INTERFACE = (\d+)$", re.MULTILINE)
 
 
-class CoreHook(BuildHookInterface):
+class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take none
     """Adds the module ``_crashhunt_core`` beside the package."""
 
     PLUGIN_NAME = "custom"
