@@ -61,6 +61,8 @@ def test_a_hunt_goes_on_with_the_trials_that_it_would_have_had(shell, place):
     shell.crashhunt("run", "anew", "1", "6", "60", *options)
     tables = [shell.crashhunt("trials", name, "--format", "jsonl").out.splitlines() for name in ("hunt", "anew")]
     old, new = ([{**json.loads(line), "wall_s": 0} for line in table] for table in tables)
+    for before, after in zip(old, new, strict=True):  # versions that did not measure the danger do not say it
+        after["danger"] = before["danger"] if before["danger"] is None else after["danger"]
     assert old == new
     assert len(old) == 6
 

@@ -46,14 +46,16 @@ def listener(answer):
                     connection, _ = server.accept()
                     if answer is None:
                         held.append(connection)
-                    else:
+                        continue
+                    with connection, contextlib.suppress(OSError):  # who has asked may be gone
                         connection.sendall(answer)
-                        connection.close()
 
         held = []
-        threading.Thread(target=serve, daemon=True).start()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
         yield f"127.0.0.1:{server.getsockname()[1]}"
         server.shutdown(socket.SHUT_RDWR)
+        thread.join()
         for connection in held:
             connection.close()
 
