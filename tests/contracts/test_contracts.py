@@ -360,7 +360,9 @@ for form in forms:
 """
 
 
-@pytest.mark.parametrize(("where", "forms"), [("here", ["continuous", "meta"]), ("own", ["meta"])])
+@pytest.mark.parametrize(
+    ("where", "forms"), [("here", ["continuous", "meta"]), pytest.param("own", ["meta"], marks=pytest.mark.nightly)]
+)
 def test_the_gymnasium_environment_passes_gymnasiums_own_checker(where, forms):
     command = [sys.executable, "-c", ENVIRONMENT, where, *forms]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -18,6 +18,7 @@ def told(shell, hunt: str, run) -> tuple:
     )
     (crash,) = done.json["crashes"]
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
+    err = re.sub(r"^hunting: .*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
     return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err
 
 

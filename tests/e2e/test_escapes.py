@@ -33,7 +33,7 @@ def test_a_rear_end_collision_could_be_avoided_until_the_step_that_is_told(toy):
         assert escape is None or escape.how == "at 8 m/s², all that it can do,"
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_on_sumo_it_brakes_as_hard_as_its_type(shell):
     shell.crashhunt("run", "h", "2", "3", "600", "--arg", "speed=20:25", *KEEP)
     told_of = told(shell.folder / "h")

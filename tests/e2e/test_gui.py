@@ -66,6 +66,7 @@ def test_the_window_follows_the_ego_and_pauses_before_the_crash(crash, screen):
     assert "reproduced" in out  # the window changes nothing, to the bit
 
 
+@pytest.mark.nightly
 def test_nobody_at_the_terminal_is_not_waited_for_and_sleep_slows_it_down(crash, screen):
     crash.environment["DISPLAY"] = screen
     began = time.monotonic()

@@ -31,7 +31,7 @@ SEEDS = {  # with which a crash comes soon
 }
 
 
-ALWAYS = ("highway", "intersection-two-agents", "loop", "roundabout")
+ALWAYS = ("highway", "loop", "roundabout")
 
 
 @pytest.mark.long

@@ -77,7 +77,7 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
     assert toy.crashhunt(*words).json["outcomes"] == {"survived": 8}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.nightly), signal.SIGKILL])
 def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
     words = ("run", "h", "1", "2", "40", *FINE, *SLOW, "--json")
     process = toy.start(*words)

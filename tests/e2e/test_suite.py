@@ -175,7 +175,7 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
 
 @pytest.mark.long
 def test_two_at_once_do_not_disturb_each_other(toy):
-    written(toy, SLOW.replace("80", "24"))
+    written(toy, SLOW.replace("80", "10"))
     first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     second = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     for process in (first, second):
@@ -183,7 +183,7 @@ def test_two_at_once_do_not_disturb_each_other(toy):
         assert process.returncode == 0, err
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(24))
+        assert numbers(toy, f"out/{name}/0") == list(range(10))
         assert "error" not in toy.crashhunt("logs", "out", "--run", name, "--type", "state").out
 
 

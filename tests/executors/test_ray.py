@@ -199,6 +199,7 @@ def busy(executor, specs, found, until):
             found[result.spec.number] = result
 
 
+@pytest.mark.nightly  # by day, test_ray_bridge.py asks it of a made-up cluster
 def test_what_is_killed_costs_time_and_nothing_else(begin, add, settings, tmp_path):
     """A node that joins late, its actor, then the node: every trial comes back once, as it does on one machine."""
     specs, found = [], {}

@@ -161,7 +161,7 @@ def track(edges):
     return np.array([tuple(map(float, point.split(","))) for edge in edges for point in lanes[f"{edge}_0"].split()])
 
 
-@pytest.mark.parametrize("step_s", [0.1, 1.0])
+@pytest.mark.parametrize("step_s", [pytest.param(0.1, marks=pytest.mark.nightly), 1.0])
 def test_trains_on_parallel_tracks_pass_each_other_in_a_bend(drive, tmp_path, step_s):
     traffic = (
         TRAIN

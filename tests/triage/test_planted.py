@@ -5,11 +5,14 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
+
 from crashhunt.crashes import list_bundles
 
 PLANTED = Path(__file__).with_name("planted.py")
 
 
+@pytest.mark.nightly  # by day, test_signature.py has crashes of every kind
 def test_each_defect_is_a_kind(shell):
     shutil.copy(PLANTED, shell.folder)
     arguments = ("--agent", "planted:Planted", "--arg", "defect=asleep|blind|reads")
