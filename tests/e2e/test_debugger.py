@@ -71,6 +71,7 @@ def test_a_breakpoint_in_the_users_code_works(crash):
     assert "reproduced: 9 of 29 steps" in out
 
 
+@pytest.mark.nightly
 def test_a_stop_compares_what_was_run(crash):
     done = crash.crashhunt("replay", "h", "--until", "12", "--json").json
     assert (done["verdict"], done["steps_replayed"]) == ("reproduced", 12)

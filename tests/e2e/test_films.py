@@ -62,6 +62,7 @@ def size(path) -> tuple[int, int]:
         return image.size
 
 
+@pytest.mark.nightly  # by day, the README does
 def test_a_replay_is_filmed_with_the_agents_own_panels(crash):
     words = ("--video", "out.mp4", "--gif", "out.gif", "--frames", "f", "--size", "480x320", "--last-step-repeats", "2")
     done = crash.crashhunt("replay", "h", *words, "--json").json

@@ -110,7 +110,10 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     assert [path.name for path in crashes.iterdir()] == ["000000-agent_error"]
 
 
-@pytest.mark.parametrize(("number", "hunted", "trials"), [(signal.SIGINT, FINE, 30), (signal.SIGTERM, ON_SUMO, 24)])
+@pytest.mark.parametrize(
+    ("number", "hunted", "trials"),
+    [(signal.SIGINT, FINE, 30), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
+)
 def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, number, hunted, trials):
     words = ("run", "h", "2", str(trials), "300", *hunted, "--json")
     process = toy.start(*words, start_new_session=True)

@@ -108,6 +108,7 @@ def test_a_damaged_proposal_is_found_and_the_others_are_saved(own):
     assert trials(own.folder / "saved") == before
 
 
+@pytest.mark.nightly
 def test_a_sampler_that_says_so_is_independent_even_when_nobody_can_import_it(own):
     own.crashhunt("run", "mine", *HUNT, "--sampler", "mine:Mine")
     own.crashhunt("run", "random", *HUNT)

@@ -84,6 +84,7 @@ def test_every_end_has_its_state(toy):
     assert "does not exist" in toy.crashhunt("status", "nowhere", expect=2).err
 
 
+@pytest.mark.nightly
 def test_watching_ends_with_the_hunt(toy):
     process = started(toy, "--timeout", "9")
     watching = subprocess.Popen(
@@ -153,6 +154,7 @@ def test_trials_that_could_not_be_set_up_run_again(toy):
     assert toy.crashhunt("rerun", "h", "--json").json["hunts"][0]["trials_run"] == 20
 
 
+@pytest.mark.nightly  # by day, the README does
 def test_another_version_of_a_hunt_runs_elsewhere(toy):
     toy.crashhunt("run", "h", "2", "4", "99", *KEEP, "--arg", "speed=14", "--set", "gap_m=20:30")
     done = toy.crashhunt("rerun", "h", "--to", "slower", "--set", "speed=4", "--set", "trials=3", "--json").json

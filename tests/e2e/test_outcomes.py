@@ -35,7 +35,11 @@ def crash_of(folder: Path) -> dict[str, Any]:
 ON_SUMO = ("Raises", "Segfaults")
 
 
-@pytest.mark.parametrize(("agent", "outcome", "kind", "message"), FAULTS, ids=[fault[0] for fault in FAULTS])
+@pytest.mark.parametrize(
+    ("agent", "outcome", "kind", "message"),
+    # A hang that holds the interpreter is the harder one.
+    [pytest.param(*fault, id=fault[0], marks=[pytest.mark.nightly] * (fault[0] == "Hangs")) for fault in FAULTS],
+)
 def test_a_software_fault_is_found_saved_and_replayed(toy, agent, outcome, kind, message):
     where = QUIET if agent in ON_SUMO else TOY
     limit = ("--timeout", "2" if agent in ON_SUMO else "1") if outcome == "hang" else ()

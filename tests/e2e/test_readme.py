@@ -12,7 +12,7 @@ from conftest import mostly_nightly
 from pages import PAGES, ROOT, Page, prepare, tree
 
 ROOTS = [topic for topic in PAGES if not Page(topic).before and Page(topic).commands]
-AT_NIGHT = ("disturbances", "highway-env")  # the dearest; hunts of both kinds run by day elsewhere
+AT_NIGHT = ("disturbances", "highway-env", "sampler")  # the dearest; hunts of both kinds run by day elsewhere
 # Times, rates, digests and the numbers of what is drawn differ, and so do lines that come now and then.
 # How many trials have ended beside the one that crashed depends on time; which one crashed does not.
 VARIES = re.compile(

@@ -31,7 +31,7 @@ SEEDS = {  # with which a crash comes soon
 }
 
 
-ALWAYS = ("highway", "loop", "roundabout")
+ALWAYS = ("highway", "loop")
 
 
 @pytest.mark.long

@@ -142,7 +142,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
 
 @pytest.mark.long
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
-    written(toy, SLOW.replace("80", "60"))
+    written(toy, SLOW.replace("80", "36"))
     process = toy.start("suite", "run", "suite.toml", "out", "2")
     wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
     os.kill(process.pid, signal.SIGKILL)
@@ -154,7 +154,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(60))
+        assert numbers(toy, f"out/{name}/0") == list(range(36))
     for name, rows in before.items():
         after = digests(toy, f"out/{name}/0")
         assert {number: after[number] for number in rows} == rows

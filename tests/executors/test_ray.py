@@ -104,6 +104,7 @@ def collect(executor, count, *, until_s=DEADLINE_S):
     return found
 
 
+@pytest.mark.nightly  # by day, a hunt on a cluster has to be the same as on one machine
 class TestRayExecutor(ExecutorContract):
     @pytest.fixture
     def make(self, cluster):
