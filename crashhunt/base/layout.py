@@ -106,6 +106,11 @@ REPLACED: Final = ".replaced-"
 """What stands in the name of a hunt that another one has taken the place of."""
 
 
+def crash_folder(number: int, outcome: str) -> str:
+    """Return the name of the folder of a crash, which is its id, such as ``000012-collision``."""
+    return f"{number:06d}-{outcome}"
+
+
 def numbered(number: int, name: str) -> str:
     """Return the name of a file of one trial beside those of others, such as ``job-000012.json``."""
     stem, dot, ending = name.partition(".")

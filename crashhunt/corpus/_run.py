@@ -1,4 +1,4 @@
-"""Running the cases of a corpus with today's code, several at a time."""
+"""Running the cases of a corpus with today's code, several at a time, and whether each is as expected."""
 
 from __future__ import annotations
 

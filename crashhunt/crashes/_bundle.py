@@ -1,4 +1,4 @@
-"""Crash bundles: the folder that holds everything needed to replay one crash."""
+"""Crash bundles: the folder with all that replaying one crash needs, and what its log says of itself."""
 
 from __future__ import annotations
 
@@ -344,7 +344,7 @@ def write_bundle(
     """
     from crashhunt.recording import foxglove_layout, write_log
 
-    name = name or f"{result.spec.number:06d}-{result.outcome}"
+    name = name or layout.crash_folder(result.spec.number, result.outcome)
     final, building = directory / place / name, directory / place / f".{name}.part"
     shutil.rmtree(building, ignore_errors=True)
     building.mkdir(parents=True)

@@ -1,3 +1,4 @@
+from ._environment import worker_environment as worker_environment
 from ._fresh import FreshProcessExecutor as FreshProcessExecutor, fresh_environment as fresh_environment
 from ._make import make_executor as make_executor
 from ._pool import PoolExecutor as PoolExecutor
@@ -11,5 +12,4 @@ from ._protocol import (
 from ._worker import (
     Worker as Worker,
     read_map as read_map,
-    worker_environment as worker_environment,
 )

@@ -18,10 +18,11 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._baseline import OPEN_FILES
+from crashhunt.executors._environment import worker_environment
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
 from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
-from crashhunt.executors._worker import Worker, worker_environment
+from crashhunt.executors._worker import Worker
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
 

@@ -1,4 +1,4 @@
-"""A pool of warm worker processes."""
+"""A pool of warm worker processes: who runs which trial, and when a worker is replaced by another one."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
+from crashhunt.executors._environment import worker_environment
 from crashhunt.executors._remains import signal_name
-from crashhunt.executors._worker import worker_environment
 
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings

@@ -1,4 +1,4 @@
-"""Where two recordings first differ."""
+"""Walks through two recordings to where they first differ; how values are compared is in `records`, a type each."""
 
 from __future__ import annotations
 

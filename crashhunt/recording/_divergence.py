@@ -1,4 +1,4 @@
-"""The first difference between two recordings."""
+"""What is said of a difference between two recordings: step, agent, field, both values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a crash needs to be run again: its recording, the trial with all edits, and who drives."""
+"""What a crash needs to be run again: its recording, the trial with all edits, who drives; what differs since."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who has stood still for how long."""
+"""A counter of who has stood still for how long; whose standing counts is for each simulator to say."""
 
 from __future__ import annotations
 

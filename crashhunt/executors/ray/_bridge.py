@@ -1,4 +1,4 @@
-"""The process that speaks to Ray, between a hunt and the nodes.
+"""The process between a hunt and Ray: which nodes take part, with how many trials at a time, when one is lost.
 
 Ray ends the process that is connected to a cluster when the cluster goes, prints into its output and takes its signals;
 here none of that reaches the hunt. The hunt tells it by a socket what to run, and hears what came of it.
