@@ -43,6 +43,7 @@ __all__ = [
     "SNAPSHOTS",
     "STACK",
     "TRIALS",
+    "crash_folder",
     "numbered",
 ]
 
