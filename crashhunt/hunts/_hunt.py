@@ -366,7 +366,7 @@ class Hunt:
     def _status(
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
     ) -> HuntStatus:
-        elapsed, crashes = time.monotonic() - progress.began, progress.all_crashes
+        elapsed = time.monotonic() - progress.began
         return HuntStatus(
             phase,
             self.settings.trials,
@@ -376,11 +376,11 @@ class Hunt:
             elapsed,
             progress.nearest,
             dict(workers or {}),
-            len(crashes),
+            len(progress.crashes) + (progress.unsaved is not None),
             progress.nodes,
             *progress.about_kinds(),
             progress.time_left_s,
-            sum(crash.disturbed for crash in crashes) if self._disturber is not None else None,
+            progress.disturbed if self._disturber is not None else None,
             progress.stressed,
         )
 

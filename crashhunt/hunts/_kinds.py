@@ -58,8 +58,9 @@ class Kinds:
         self._at_fault: set[int] = set()
         self._wanted = wanted
         self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
+        self._seen: set[Signature] = set()
+        self._first: dict[Signature, int] = {}  # of each kind that counts, its trial of the least number
         self._groups: tuple[Group, ...] | None = None
-        self._until: int | None = None
         self.newest = newest
         self.newest_trial: int | None = None
         for bundle in crashes:
@@ -72,9 +73,7 @@ class Kinds:
             bundle: the crash.
             ended: how many trials have ended by now.
         """
-        before = {signature for signature, _ in self._signed.values()}
-        signature = self._sign(bundle)
-        if signature is not None and signature not in before:
+        if self._sign(bundle):
             self.newest, self.newest_trial = time.time(), ended
 
     def groups(self) -> tuple[Group, ...]:
@@ -86,7 +85,8 @@ class Kinds:
     @property
     def until(self) -> int | None:
         """The least number of a trial up to which there are enough kinds; None where there are not."""
-        return self._until
+        firsts = sorted(self._first.values())
+        return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
 
     @property
     def at_fault(self) -> tuple[int, ...] | None:
@@ -101,20 +101,21 @@ class Kinds:
                 self._signed[number] = self._signed[number][0], bundle
         self._groups = None
 
-    def _sign(self, bundle: Bundle) -> Signature | None:
+    def _sign(self, bundle: Bundle) -> bool:
+        """Take in a crash; return whether it is of a kind that has not been there."""
+        number = bundle.result.spec.number
         try:
-            signature = signature_of(bundle)
-            if self._only_at_fault and fault_of(bundle).is_egos:
-                self._at_fault.add(bundle.result.spec.number)
+            # Both look at it, and reading a log takes longer than looking.
+            recording = bundle.recording() if self._only_at_fault and bundle.result.collision is not None else None
+            signature = signature_of(bundle, recording)
+            if self._only_at_fault and fault_of(bundle, recording).is_egos:
+                self._at_fault.add(number)
         except BundleError:
-            return None  # which is of no kind, and which crashhunt check tells of
-        self._signed[bundle.result.spec.number] = signature, bundle
+            return False  # it is of no kind, and crashhunt check tells of it
+        is_new = signature not in self._seen
+        self._seen.add(signature)
+        self._signed[number] = signature, bundle
         self._groups = None
-        seen: set[Signature] = set()
-        counted = self._at_fault if self._only_at_fault else self._signed
-        for number in sorted(counted) if self._wanted else ():
-            seen.add(self._signed[number][0])
-            if len(seen) >= self._wanted:
-                self._until = number
-                break
-        return signature
+        if number in self._at_fault or not self._only_at_fault:
+            self._first[signature] = min(number, self._first.get(signature, number))
+        return is_new

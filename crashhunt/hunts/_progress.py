@@ -125,12 +125,18 @@ class Progress:
         return bool(self.crashes) if self.kinds is None else self.kinds.until is not None
 
     @property
-    def all_crashes(self) -> tuple[TrialResult, ...]:
-        """Those that are saved, and the one that is to be."""
-        saved = [bundle.result for bundle in self.crashes]
-        if self.found and min(self.found) not in [result.spec.number for result in saved]:
-            saved.append(self.found[min(self.found)])
-        return tuple(saved)
+    def unsaved(self) -> TrialResult | None:
+        """The crash that ends the hunt, until it is saved."""
+        if not self.found:
+            return None
+        lowest = min(self.found)
+        return None if any(lowest == one.result.spec.number for one in self.crashes) else self.found[lowest]
+
+    @property
+    def disturbed(self) -> int:
+        """How many of the crashes had disturbances."""
+        unsaved = self.unsaved
+        return sum(one.result.disturbed for one in self.crashes) + (unsaved is not None and unsaved.disturbed)
 
     @property
     def time_left_s(self) -> float:

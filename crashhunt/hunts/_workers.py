@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.episode import WorkerSettings
@@ -22,14 +23,8 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
     The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
     """
     run = settings.run
-    return WorkerSettings(
-        scenario=with_settings(snapshot.scenario(), settings),
-        oracles=settings.oracles,
-        crash_on=settings.crash_on,
-        scratch=scratch,
-        code=snapshot.code,
-        argument_files=snapshot.argument_files,
-        timeout_s=run.timeout_s,
+    return replace(
+        _settings(settings, snapshot, scratch),
         keep_trials=run.keep_trials,
         warm_copies=run.warm_copies if settings.seeds else 0,
         audit=run.audit,
@@ -40,6 +35,11 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
 
 def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
     """Return what processes are told that run single trials of a hunt again, for their recordings."""
+    return replace(_settings(settings, snapshot, scratch), keep_trials=True)
+
+
+def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
+    """What both have in common: all that a trial is."""
     return WorkerSettings(
         scenario=with_settings(snapshot.scenario(), settings),
         oracles=settings.oracles,
@@ -48,5 +48,4 @@ def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) ->
         code=snapshot.code,
         argument_files=snapshot.argument_files,
         timeout_s=settings.run.timeout_s,
-        keep_trials=True,
     )

@@ -58,7 +58,7 @@ def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
 
 
 def test_only_the_agents_own_crashes_count_where_that_was_asked(monkeypatch):
-    monkeypatch.setattr(_kinds, "fault_of", lambda bundle: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
+    monkeypatch.setattr(_kinds, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
     kinds = Kinds(1, only_at_fault=True)
     kinds.add(crash(3, "KeyError"), 1)
     assert (kinds.until, kinds.at_fault) == (None, ())
