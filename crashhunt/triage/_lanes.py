@@ -138,13 +138,7 @@ class LaneMap:
             edge = point + math.copysign(half_width, end.aside_m) * np.array(
                 [-math.sin(end.heading), math.cos(end.heading)]
             )
-            return any(
-                abs(other.aside_m) <= beside.half_width
-                and abs(math.remainder(other.heading - end.heading, math.tau)) < _ALONG
-                for beside in self._lanes
-                if beside is not lane
-                for other in (beside.place(edge),)
-            )
+            return self._is_beside(lane, edge, end.heading)
         return False
 
     def _driven(self, pose: tuple[NDArray[np.float64], float]) -> _Lane | None:
@@ -166,9 +160,12 @@ class LaneMap:
             return False
         if abs(math.remainder(place.heading - heading, math.tau)) >= _ALONG:
             return False  # it turns off
+        return self._is_beside(lane, point, place.heading)
+
+    def _is_beside(self, lane: _Lane, point: NDArray[np.float64], heading: float) -> bool:
+        """Whether a point lies in another lane that leads the same way."""
         return any(
-            abs(other.aside_m) <= beside.half_width
-            and abs(math.remainder(other.heading - place.heading, math.tau)) < _ALONG
+            abs(other.aside_m) <= beside.half_width and abs(math.remainder(other.heading - heading, math.tau)) < _ALONG
             for beside in self._lanes
             if beside is not lane
             for other in (beside.place(point),)

@@ -8,16 +8,15 @@ import os
 import re
 import signal
 import sqlite3
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from ray_cluster import head, nodes
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'crashhunt[ray]'")
 
-from ray.cluster_utils import Cluster
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.episode import WorkerSettings
@@ -33,32 +32,21 @@ DEADLINE_S = 90.0
 @pytest.fixture(scope="module")
 def cluster():
     """A head that runs nothing, and a node of two CPUs."""
-    with (
-        tempfile.TemporaryDirectory(prefix="chr-", dir="/tmp") as short,  # Ray makes sockets there
-        pytest.MonkeyPatch.context() as patched,
-    ):
-        Path(short, "ray").mkdir()
-        patched.setenv("RAY_TMPDIR", short)  # where it says which cluster is the current one
-        head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": short}
-        found = Cluster(initialize_head=True, head_node_args=head)
+    with head() as found:
         found.add_node(num_cpus=2)
         yield found
-        found.shutdown()
 
 
 @pytest.fixture
 def add(cluster):
     """Adds nodes, and removes them in the end."""
-    added = []
+    with nodes(cluster) as added:
 
-    def node(**options):
-        added.append(cluster.add_node(**options))
-        return added[-1]
+        def node(**options):
+            added.append(cluster.add_node(**options))
+            return added[-1]
 
-    yield node
-    for one in added:
-        with contextlib.suppress(Exception):
-            cluster.remove_node(one)
+        yield node
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 import pytest
+from ray_cluster import head, nodes
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'crashhunt[ray]'")
 
-from ray.cluster_utils import Cluster
 
 pytestmark = pytest.mark.nightly
 DEADLINE_S = 150.0
@@ -29,32 +29,20 @@ TRIALS = 40
 @pytest.fixture(scope="module")
 def cluster():
     """A head that runs nothing."""
-    with (
-        tempfile.TemporaryDirectory(prefix="chf-", dir="/tmp") as short,  # Ray makes sockets there
-        pytest.MonkeyPatch.context() as patched,
-    ):
-        Path(short, "ray").mkdir()
-        patched.setenv("RAY_TMPDIR", short)  # where it says which cluster is the current one
-        found = Cluster(
-            initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, "temp_dir": short}
-        )
+    with head() as found:
         yield found
-        found.shutdown()
 
 
 @pytest.fixture
 def add(cluster):
     """Adds nodes of one CPU, and removes them in the end."""
-    added = []
+    with nodes(cluster) as added:
 
-    def node(count=1, **options):
-        added.extend(cluster.add_node(num_cpus=1, **options) for _ in range(count))
-        return added[-count:]
+        def node(count=1, **options):
+            added.extend(cluster.add_node(num_cpus=1, **options) for _ in range(count))
+            return added[-count:]
 
-    yield node
-    for one in added:
-        with contextlib.suppress(Exception):
-            cluster.remove_node(one)
+        yield node
 
 
 @pytest.fixture

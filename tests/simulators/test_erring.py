@@ -9,9 +9,10 @@ from pathlib import Path
 import libsumo
 import numpy as np
 import pytest
+from onlookers import Steady, Watch
 
 from crashhunt.disturbances import disturber_of
-from crashhunt.episode import Episode, Observer
+from crashhunt.episode import Episode
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators import Disturbs
@@ -30,35 +31,6 @@ AHEAD, BEHIND = (
     for name, pos in (("lead", 60), ("follow", 10))
 )
 LEFT = '<vehicle id="left" type="car" route="across" depart="0" departPos="{}" departLane="1" departSpeed="8"/>'
-
-
-class Steady:
-    """Drives at a speed that may be set."""
-
-    def __init__(self, speed=8.0):
-        self.speed = speed
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return self.speed, 0
-
-
-class Watch(Observer):
-    """Keeps scenes, and what takes place."""
-
-    def __init__(self):
-        self.scenes, self.told = [], []
-
-    def scene(self, step, scene, rewards):
-        self.scenes.append(scene)
-
-    def disturbance(self, disturbance):
-        self.told.append(disturbance)
-
-    def speeds(self, name):
-        return [scene.speeds[scene.roster.index[name]] for scene in self.scenes if name in scene.roster.index]
 
 
 @pytest.fixture

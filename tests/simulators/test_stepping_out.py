@@ -8,8 +8,9 @@ from pathlib import Path
 import libsumo
 import numpy as np
 import pytest
+from onlookers import Steady, Watch
 
-from crashhunt.episode import Episode, Observer
+from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators.sumo import SumoSimulator
@@ -23,36 +24,6 @@ WALKER = (
 )
 WAITING = '<person id="waiting" depart="0" departPos="60"><stop lane="e_0" duration="100"/></person>'
 EGO = '<vehicle id="ego" depart="0" departPos="10" departSpeed="10"><route edges="e"/></vehicle>'
-
-
-class Steady:
-    """Drives at one speed, whoever is in the way."""
-
-    def __init__(self, speed):
-        self.speed = speed
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return self.speed, 0
-
-
-class Watch(Observer):
-    """Keeps scenes, and what takes place."""
-
-    def __init__(self):
-        self.scenes, self.told = [], []
-
-    def scene(self, step, scene, rewards):
-        self.scenes.append(scene)
-
-    def disturbance(self, disturbance):
-        self.told.append(disturbance)
-
-    def of(self, name, values):
-        there = [scene for scene in self.scenes if name in scene.roster.index]
-        return np.array([getattr(scene, values)[scene.roster.index[name]] for scene in there])
 
 
 @pytest.fixture
@@ -95,9 +66,9 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     (told,) = watch.told
     assert told.vehicle == "person walker"
     assert told.words == "person walker steps out onto the road with 1.4 m/s, and is back after 6 s"
-    points, speeds = watch.of("person walker", "points"), watch.of("person walker", "speeds")
+    points, speeds = np.array(watch.of("person walker", "points")), np.array(watch.of("person walker", "speeds"))
     out = points[:, 1] - points[19, 1]
-    way = watch.of("ego", "points")[0, 1] - points[19, 1]
+    way = watch.of("ego", "points")[0][1] - points[19, 1]
     assert out.max() == pytest.approx(way)  # the middle of the agent's way, and no further
     assert np.flatnonzero(out > 0.01).tolist() == list(range(20, 79))  # away from step 20 on, for 6 s
     moved = np.hypot(*np.diff(points[19:80], axis=0).T) / 0.1
@@ -107,14 +78,14 @@ def test_a_walker_steps_out_and_walks_on_where_it_was_going(drive):
     assert points[80:, 1] == pytest.approx(points[19, 1])
     walked = np.diff(points[80:, 0])  # it goes on where it was going
     assert (len(points), walked.min() > 0.05, walked.max() < 0.2) == (121, True, True)
-    assert plain.of("person walker", "points")[:20].tolist() == points[:20].tolist()
+    assert np.array(plain.of("person walker", "points"))[:20].tolist() == points[:20].tolist()
 
 
 def test_nobody_steps_out_faster_than_its_type_can_nor_further_than_it_is_back_in_time(drive):
     slow = WALKER.replace('"1.4"', '"0.5"')
     _, watch = drive(EGO + slow, stepping(20, strong=3.0, long=2.0))
     assert watch.told[0].how_strong == 0.5
-    points = watch.of("person walker", "points")
+    points = np.array(watch.of("person walker", "points"))
     assert points[:, 1].max() - points[19, 1] == pytest.approx(0.5)  # a second out, a second back
     assert points[39, 1] == pytest.approx(points[19, 1])
 
@@ -147,7 +118,7 @@ def test_a_vehicle_merges_only_at_the_end_of_its_lane(drive, strong):
     left = []
     for disturbances in ((), (Disturbance(2, "right ahead", "late_merge", strong, 30.0, "ego"),)):
         result, watch = drive(ego + other, *disturbances, net="taper", speed=9.0, steps=340)
-        points = watch.of("merges", "points")
+        points = np.array(watch.of("merges", "points"))
         changed = np.flatnonzero(points[:, 1] > LANE_0_M + 0.1)[0]
         left.append(END_M - points[changed - 1][0])
         assert [one.vehicle for one in result.disturbances] == ["merges"] * len(disturbances)

@@ -1,0 +1,39 @@
+"""An agent and an observer with which tests look at what others do."""
+
+from __future__ import annotations
+
+from crashhunt.episode import Observer
+
+
+class Steady:
+    """Drives at a speed that may be set, whoever is in the way."""
+
+    def __init__(self, speed=8.0):
+        self.speed = speed
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return self.speed, 0
+
+
+class Watch(Observer):
+    """Keeps scenes, and what takes place."""
+
+    def __init__(self):
+        self.scenes, self.told = [], []
+
+    def scene(self, step, scene, rewards):
+        self.scenes.append(scene)
+
+    def disturbance(self, disturbance):
+        self.told.append(disturbance)
+
+    def of(self, name, values):
+        """One of the arrays of scenes, for one actor, in the scenes in which it is there."""
+        there = [scene for scene in self.scenes if name in scene.roster.index]
+        return [getattr(scene, values)[scene.roster.index[name]] for scene in there]
+
+    def speeds(self, name):
+        return self.of(name, "speeds")
