@@ -21,6 +21,7 @@ from ._outlines import (
     on_one_level as on_one_level,
     outlines as outlines,
 )
+from ._paths import Path as Path, Paths as Paths, PathsData as PathsData, State as State, paths_of as paths_of
 from ._right_of_way import Link as Link, RightOfWay as RightOfWay
 from ._scene import (
     PERSON as PERSON,
