@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Archive, Bundle
 
 __all__ = [
-    "Commands", "Parser", "add_crash", "add_json", "chosen_runs", "integer", "number", "opened_crash", "opened_hunt",
-    "pairs", "refuse_strangers", "say",
+    "Commands", "Parser", "add_crash", "add_json", "chosen_runs", "integer", "is_trusted", "number", "opened_crash",
+    "opened_hunt", "pairs", "refuse_strangers", "say",
 ]  # fmt: skip
 
 
@@ -184,6 +184,11 @@ def number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def is_trusted(archive: Archive | None, said: bool) -> bool:
+    """Return whether the code of a crash may run: this user made it on this machine, or has ``said`` ``--trust``."""
+    return archive is None or archive.made_here or said
 
 
 def refuse_strangers(archive: Archive, bundle: Bundle, path: Path, *, fix: str) -> UsageError:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_json, integer, opened_crash, say
+from crashhunt.cli._common import add_json, integer, is_trusted, opened_crash, say
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._progress import shown_progress
 
@@ -87,7 +87,7 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
     answers = []
     for path in options.bundles:
         with opened_crash(path, "") as (bundle, archive):
-            if archive is not None and not archive.made_here and not options.trust:
+            if archive is not None and not is_trusted(archive, options.trust):
                 raise UsageError(
                     f"it says that {archive.made_by} made it, and whoever runs the corpus runs what it names",
                     fix="look at its hunt.toml and scenario, and give --trust if you trust whoever gave it to you",

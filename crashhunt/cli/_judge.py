@@ -7,7 +7,7 @@ import os
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, integer, opened_crash, refuse_strangers, say
+from crashhunt.cli._common import add_crash, add_json, integer, is_trusted, opened_crash, refuse_strangers, say
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 from crashhunt.cli._progress import shown_progress
 
@@ -57,7 +57,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
             told += (_judge_one(options, bundle, stops, write=True) for bundle in _unjudged(options) if not stops)
         else:
             with opened_crash(options.directory, options.crash) as (bundle, archive):
-                if archive is not None and not archive.made_here and not options.trust:
+                if archive is not None and not is_trusted(archive, options.trust):
                     raise refuse_strangers(archive, bundle, options.directory, fix="give --trust if you trust them")
                 told.append(_judge_one(options, bundle, stops, write=archive is None))
     if options.json:

@@ -9,7 +9,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, integer, number, opened_crash, pairs, refuse_strangers, say
+from crashhunt.cli._common import (
+    add_crash,
+    add_json,
+    integer,
+    is_trusted,
+    number,
+    opened_crash,
+    pairs,
+    refuse_strangers,
+    say,
+)
 from crashhunt.cli._film import (
     add_film_options,
     film_options,
@@ -120,7 +130,7 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     answers, shots, good = [], [], True
     for crash in crashes:
         with opened_crash(options.directory, crash) as (bundle, archive):
-            trusted = archive is None or archive.made_here or options.trust
+            trusted = is_trusted(archive, options.trust)
             if film is not None and options.from_log:
                 shots.append(recorded_shot(bundle))
                 continue

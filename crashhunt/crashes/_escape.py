@@ -1,4 +1,4 @@
-"""Until when braking would have avoided a crash: found out by running the trial again, with the agent overruled."""
+"""Until when braking would have avoided a crash, found out by runs as it is confirmed; `judge` is in `replays`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The list of all modules with what each is about, made from the first sentence of its docstring."""
+"""The list of all modules with what each is about, made from what it says first of itself."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ if TYPE_CHECKING:
 __all__ = ["describe_modules"]
 
 _ROOT = Path(__file__).parents[1]
-_SAID = re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL)
-"""The first paragraph of a module's docstring; read as text, since importing everything would take seconds."""
+_SAID = {
+    ".py": re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL),
+    ".cpp": re.compile(r"\A// (.+?)\n"),
+    ".html": re.compile(r"\A<!DOCTYPE html>\n<!-- (.+?) -->"),
+}
+"""What a file says first of itself; read as text, since importing everything would take seconds."""
 
 
 def describe_modules() -> str:
@@ -32,13 +36,13 @@ def _lines() -> Iterator[str]:
 
 
 def _members(folder: Path) -> Iterator[str]:
-    for file in sorted(folder.glob("*.py")):
-        if file.name != "__init__.py":
+    for file in sorted(folder.iterdir()):
+        if file.suffix in _SAID and file.name != "__init__.py":
             yield f"- `{file.name}`: {_said(file)}"
 
 
 def _said(file: Path) -> str:
-    found = _SAID.match(file.read_text(encoding="utf-8"))
+    found = _SAID[file.suffix].match(file.read_text(encoding="utf-8"))
     if found is None:
-        raise LookupError(f"{file} does not begin with a docstring")
+        raise LookupError(f"{file} does not begin with what it is about")
     return " ".join(found[1].replace("``", "`").split())

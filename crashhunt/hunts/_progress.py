@@ -66,6 +66,19 @@ class HuntStatus:
     disturbed: int | None = None
     stressed: TrialResult | None = None
 
+    @property
+    def seconds_left(self) -> float:
+        """When the hunt will be at its end, by trials or by the clock, whichever comes first; infinite if never."""
+        left = (self.planned - self.done) / self.rate_per_s if self.planned and self.rate_per_s else math.inf
+        return min(left, self.time_left_s)
+
+    @property
+    def share_done(self) -> float:
+        """Which share of the hunt is done, from 0 to 1, by trials or by the clock, whichever is nearer to its end."""
+        by_count = self.done / self.planned if self.planned else 0.0
+        whole_s = self.elapsed_s + self.time_left_s
+        return max(by_count, self.elapsed_s / whole_s if whole_s > 0 else 1.0)
+
 
 @dataclass(slots=True)
 class Progress:

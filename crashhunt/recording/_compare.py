@@ -1,4 +1,4 @@
-"""Walks through two recordings to where they first differ; how values are compared is in `records`, a type each."""
+"""Where two recordings first differ, and the values around it; how values are compared is in `records`, a type each."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
 
 
 def values_around(
-    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int = 2
+    recorded: Recording, replayed: Recording, divergence: Divergence, *, reach: int
 ) -> list[tuple[int, object, object]]:
     """Return (step, recorded value, replayed value) of the field that diverges, in the steps around.
 

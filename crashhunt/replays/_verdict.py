@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ReplayData", "ReplayReport", "Verdict", "judged", "up_to"]
 
+_AROUND = 2  # steps that are told before and after the first difference
+
 Verdict = Literal["reproduced", "diverged", "fixed", "changed", "not_comparable"]
 
 
@@ -120,7 +122,7 @@ def judged(
     if divergence is None and whole:
         divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
     verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
-    around = tuple(values_around(recorded, replayed, divergence)) if divergence is not None else ()
+    around = tuple(values_around(recorded, replayed, divergence, reach=_AROUND)) if divergence is not None else ()
     return ReplayReport(rerun, verdict, result, replayed, divergence, around, reason)
 
 

@@ -116,12 +116,12 @@ class Watcher:
 
 
 def _bar(status: HuntStatus, width: int) -> RenderableType:
-    said = (f"{_count(status)} trials", f"{status.rate_per_s:.1f}/s", f"{_time_left(status)} left")
+    said = (f"{_count(status)} trials", f"{status.rate_per_s:.1f}/s", f"{format_seconds(status.seconds_left)} left")
     if width - sum(len(part) + 2 for part in said) < _LEAST_BAR:
         said = (said[0].removesuffix(" trials"), *said[1:])
     table = Table.grid(padding=(0, 2))
     room = width - sum(len(part) + 2 for part in said)
-    bar = ProgressBar(total=1.0, completed=_done(status), width=max(1, min(30, room)))
+    bar = ProgressBar(total=1.0, completed=status.share_done, width=max(1, min(30, room)))
     table.add_row(bar, *said)
     return table
 
@@ -210,7 +210,7 @@ def _line(status: HuntStatus) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in sorted(status.outcomes.items())) or "none has ended yet"
     line = f"{status.phase}: {_count(status)} trials ({outcomes})"
     if status.phase == "hunting" and status.done:
-        line += f", {status.rate_per_s:.1f}/s, {_time_left(status)} left"
+        line += f", {status.rate_per_s:.1f}/s, {format_seconds(status.seconds_left)} left"
     if status.disturbed is not None and status.crashes:
         line += f"; {_disturbed(status)}"
     if status.phase == "hunting" and status.kinds:
@@ -220,20 +220,8 @@ def _line(status: HuntStatus) -> str:
     return line
 
 
-def _time_left(status: HuntStatus) -> str:
-    by_count = (status.planned - status.done) / status.rate_per_s if status.planned and status.rate_per_s else math.inf
-    return format_seconds(min(by_count, status.time_left_s))
-
-
 def _count(status: HuntStatus) -> str:
     return f"{status.done}/{status.planned}" if status.planned else str(status.done)
-
-
-def _done(status: HuntStatus) -> float:
-    """Which share of the hunt is done, by trials or by the clock, whichever is nearer to its end."""
-    by_count = status.done / status.planned if status.planned else 0.0
-    whole_s = status.elapsed_s + status.time_left_s
-    return max(by_count, status.elapsed_s / whole_s if whole_s > 0 else 1.0)
 
 
 def _stressed(result: TrialResult) -> str:

@@ -1,4 +1,4 @@
-"""How a crash is made smaller: what is tried, in which order. Nothing here knows what a trial is.
+"""Delta debugging of a set, plainer values of one: what is tried next. Nothing here knows what a trial is.
 
 Delta debugging (Zeller and Hildebrandt, *Simplifying and Isolating Failure-Inducing Input*, 2002) for what there are
 several of; for a value, the plainest first, as Hypothesis does it. There is no chance in it: what is tried depends on

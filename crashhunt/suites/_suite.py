@@ -1,4 +1,4 @@
-"""Suites: many hunts from one file, each several times with a seed of its own."""
+"""`suite.toml`: many hunts, each several times with its own seeds; its keys are the options of hunts and a few more."""
 
 from __future__ import annotations
 

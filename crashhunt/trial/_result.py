@@ -11,6 +11,7 @@ from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.trial._stress import Stress
+from crashhunt.trial._summary import summarize
 from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
@@ -148,22 +149,7 @@ class TrialResult:
     @property
     def summary(self) -> str:
         """The outcome in one line, for people."""
-        if self.collision is not None:
-            hit = self.collision
-            if hit.role == "alone":
-                what = "left the road" if self.outcome is Outcome.OFF_ROAD else f"crashed ({hit.kind})"
-                return f"{hit.agent} {what} at step {self.steps}"
-            verb = "drove into" if hit.role == "collider" else "was hit by"
-            return f"{hit.agent} {verb} {hit.other} at step {self.steps}"
-        if self.event is not None:
-            return f"{self.event.what}, at step {self.steps}"
-        if self.failure is not None:
-            failure = self.failure
-            if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
-                whose = f"{failure.agent}: " if failure.agent else ""
-                return f"{whose}{failure.kind}: {failure.message}"
-            return failure.message
-        return f"{self.outcome} after {self.steps} steps"
+        return summarize(self)
 
 
 def in_effect(result: TrialResult, told: Iterable[Disturbance]) -> TrialResult:
