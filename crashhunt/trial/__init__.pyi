@@ -12,6 +12,7 @@ from ._disturbance import (
     OF_AGENT as OF_AGENT,
     Disturbance as Disturbance,
     steps_of as steps_of,
+    why_not as why_not,
 )
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (
