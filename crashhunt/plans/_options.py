@@ -60,7 +60,8 @@ class Subject(_Options):
     )  # fmt: skip
     ego: str = option(
         "", "which vehicle of a bare ``.sumocfg``",
-        help="for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one", unset="the first",
+        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO to add one; any: another in each trial",
+        unset="any",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
