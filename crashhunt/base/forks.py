@@ -40,6 +40,7 @@ __all__ = [
     "Watchdog",
     "copying",
     "ended",
+    "ends",
     "fork",
     "held",
     "shared_memory",
@@ -54,7 +55,8 @@ _HARMLESS = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom
 _LARGEST = 16 << 20  # bytes of a file that is written and read again
 _RECEIVED = 1 << 16
 _copying = False
-_ends: set[int] = set()  # descriptors by which copies of this process are talked to, and it to what it is a copy of
+ends: set[int] = set()
+"""Descriptors by which copies of this process are talked to, and it to what it is a copy of; a copy has none."""
 _alive: set[int] = set()  # copies of this process
 
 # Kept apart from what an agent may put in their place.
@@ -183,7 +185,7 @@ class Copy:
     def __init__(self, work: Callable[[], Plain], known: Held | None = None) -> None:
         self.raised = ""
         self._end, theirs = os.pipe()
-        _ends.add(self._end)
+        ends.add(self._end)
 
         def answer() -> None:
             try:
@@ -232,7 +234,7 @@ class Copy:
             self._close()
 
     def _close(self) -> None:
-        _ends.discard(self._end)
+        ends.discard(self._end)
         os.close(self._end)
         self._end = -1
 
@@ -292,8 +294,8 @@ def _be_copy(
         faulthandler.unregister(signal.SIGUSR1)
         _replace(replaced)
         _alive.clear()
-        _ends.clear()
-        _ends.update(keeps)
+        ends.clear()
+        ends.update(keeps)
         work()
         code = 0
     finally:
@@ -329,7 +331,7 @@ def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, i
 def _replacement(descriptor: int, what: str, known: Held) -> tuple[int, int]:
     flags = fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE
     mode = os.fstat(descriptor).st_mode
-    ours = descriptor in _ends or known.files.get(descriptor) == what
+    ours = descriptor in ends or known.files.get(descriptor) == what
     if descriptor in (1, 2):
         return _NOTHING, 0
     if stat.S_ISREG(mode):

@@ -10,6 +10,7 @@ __all__ = [
     "ARCHIVE_INDEX",
     "ARCHIVE_KEY",
     "BLACK_BOX",
+    "BRANCHES",
     "BUILDING",
     "CASE",
     "CODE",
@@ -58,6 +59,7 @@ SNAPSHOTS: Final = "snapshots"
 CRASHES: Final = "crashes"
 NEAR_MISSES: Final = "near-misses"
 PROBES: Final = "probes"
+BRANCHES: Final = "branches"
 TRIALS: Final = "trials"
 REPORT: Final = "report.html"
 

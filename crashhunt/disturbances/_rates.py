@@ -16,9 +16,8 @@ from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate, registered
-from crashhunt.disturbances._fixed import FORM, is_fixed
 from crashhunt.disturbances._protocol import Drawn
-from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance
+from crashhunt.trial import CELLS, OF_AGENT, Disturbance, in_turn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -31,6 +30,7 @@ __all__ = ["NONE", "Disturber", "disturber_of", "parse_rates"]
 NONE = "none"
 """The word for no disturbances, whatever the scenario says."""
 _STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
+_BRANCH = 0x6272616E  # and what is drawn for copies of it
 _SHOWN = "--disturb"
 
 
@@ -38,7 +38,7 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     """Return how often what happens, from ``NAME=RATE``; what has the rate 0 is left out.
 
     Args:
-        words: as they are given; ``none`` alone for nothing. Those that fix a disturbance are left aside.
+        words: as they are given; ``none`` alone for nothing.
 
     Raises:
         UsageError: a word says no rate, or a name comes twice.
@@ -50,11 +50,9 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
             if len(given) > 1:
                 raise UsageError(f"{_SHOWN} {','.join(given)}: none stands alone", fix="leave it or the others out")
             continue
-        if is_fixed(word):
-            continue
         name, equals, text = word.rpartition("=")
         if not equals or not name:
-            fix = f"write NAME=RATE with a rate per second, such as brake=0.02, or {FORM}"
+            fix = "write NAME=RATE with a rate per second, such as brake=0.02"
             raise UsageError(f"{_SHOWN} {word!r} says no rate", fix=fix)
         if name in rates:
             raise UsageError(f"{_SHOWN} gives {name!r} twice", fix="give it once")
@@ -75,7 +73,7 @@ def _rate(name: str, text: str) -> float:
 
 def disturber_of(
     rates: Mapping[str, float], *, agents: Sequence[str], step_length_s: float, known: Sequence[str] | None = None,
-    simulator: str = "the simulator", fixed: Sequence[Disturbance] = (),
+    simulator: str = "the simulator",
 ) -> Disturber:  # fmt: skip
     """Return what draws the disturbances of trials.
 
@@ -85,7 +83,6 @@ def disturber_of(
         step_length_s: in s.
         known: the kinds that the simulator can do; None where nobody knows.
         simulator: how people call it.
-        fixed: what every trial has besides.
 
     Raises:
         PluginError: there is no such model.
@@ -97,28 +94,16 @@ def disturber_of(
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
             raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one a step of {step_length_s:g} s", fix=fix)
-        _refuse_what_it_cannot(name, model.what, known, simulator)
+        if known is not None and model.what not in known and model.what not in OF_AGENT:
+            able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
+            message = f"{_SHOWN} {name}: {simulator} cannot do {model.what!r}"
+            raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:
             message = f"{_SHOWN}: {twin} and {name} are both about {model.what!r}"
             raise UsageError(message, fix="choose one of the two")
         models[name] = model
-    for one in fixed:
-        if known is None and one.what not in KINDS:
-            continue  # whose simulator has not said what it can do
-        if one.what not in (*KINDS, *(known or ())):
-            fix = one_of(one.what, sorted({*KINDS, *(known or ())}))
-            raise UsageError(f"{_SHOWN}: there is no kind of disturbance {one.what!r}", fix=fix)
-        _refuse_what_it_cannot(f"{one.what}@{one.step}", one.what, known, simulator)
-    return Disturber(models, dict(rates), tuple(agents), step_length_s, tuple(fixed))
-
-
-def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
-    if known is None or what in known or what in OF_AGENT:
-        return
-    able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
-    message = f"{_SHOWN} {name}: {simulator} cannot do {what!r}"
-    raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
+    return Disturber(models, dict(rates), tuple(agents), step_length_s)
 
 
 def locate_model(name: str) -> DisturbanceModel:
@@ -166,14 +151,12 @@ class Disturber:
         rates: of each, in 1/s.
         agents: around whom.
         step_length_s: in s.
-        fixed: what every trial has besides, whatever is drawn.
     """
 
     models: Mapping[str, DisturbanceModel]
     rates: Mapping[str, float]
     agents: tuple[str, ...]
     step_length_s: float
-    fixed: tuple[Disturbance, ...] = ()
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
         """Return the disturbances of a trial, in order; those of a longer one begin with these.
@@ -184,31 +167,51 @@ class Disturber:
         """
         found: list[Disturbance] = []
         for number, agent in enumerate(self.agents):
-            for name, model in self.models.items():
+            for name in self.models:
                 key = (_STREAM, number, *name.encode())
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
-                chance, step = self._chance(name), 0
-                # A waiting time can be longer than any number of steps: that of a rate near 0.
-                while (step := step + int(min(rng.geometric(chance), max_steps + 1))) <= max_steps:
-                    drawn = _drawn(name, model, rng)
-                    strong, long = float(drawn.how_strong), float(drawn.how_long)
-                    found.append(Disturbance(step, drawn.who, model.what, strong, long, agent))
-        taken = {_key(one) for one in self.fixed}
-        found = [one for one in found if _key(one) not in taken]
-        found += [one for one in self.fixed if one.step <= max_steps]
-        return tuple(sorted(found, key=_key))
+                found += self._between(0, max_steps, name, agent, rng)
+        return in_turn(found)
+
+    def draw_another(self, seed: int, number: int, after: int, soon: int, last: int) -> tuple[Disturbance, ...]:
+        """Return what else might begin after a step of a trial: at least one disturbance soon, others as ever.
+
+        Args:
+            seed: of the trial.
+            number: which of several draws.
+            after: the step.
+            soon: the first one begins within so many steps.
+            last: the last step in which one begins.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH, after, number)))
+        places = [(agent, name) for agent in self.agents for name in self.models]
+        chances = np.array([self._chance(name) for _, name in places])
+        agent, name = places[int(rng.choice(len(places), p=chances / chances.sum()))]
+        first = self._one(after + 1 + int(rng.integers(soon)), name, agent, rng)
+        others = [one for agent, name in places for one in self._between(first.step, last, name, agent, rng)]
+        return in_turn([first, *others])
+
+    def _between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
+        """What a model begins around an agent after a step, up to another one."""
+        chance, step, found = self._chance(name), after, []
+        # A waiting time can be longer than any number of steps: that of a rate near 0.
+        while (step := step + int(min(rng.geometric(chance), last + 1))) <= last:
+            found.append(self._one(step, name, agent, rng))
+        return found
+
+    def _one(self, step: int, name: str, agent: str, rng: np.random.Generator) -> Disturbance:
+        drawn = _drawn(name, self.models[name], rng)
+        strong, long = float(drawn.how_strong), float(drawn.how_long)
+        return Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
 
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
         """Return the natural logarithm of the probability that just these begin in so many steps.
-
-        What is fixed begins anyway, whatever a model draws for that step.
 
         Args:
             disturbances: as they were drawn; what begins later is left out.
             steps: how many there were.
         """
-        given = {_key(one) for one in self.fixed if one.step <= steps}
-        begun = [one for one in disturbances if one.step <= steps and _key(one) not in given]
+        begun = [one for one in disturbances if one.step <= steps]
         total = 0.0
         for agent in self.agents:
             for name, model in self.models.items():
@@ -216,27 +219,19 @@ class Disturber:
                 mine = [one for one in begun if one.agent == agent and one.what == model.what]
                 for one in mine:
                     total += math.log(chance) + model.log_likelihood(Drawn(one.who, one.how_strong, one.how_long))
-                free = steps - sum((one_agent, what) == (agent, model.what) for _, one_agent, what in given)
-                if len(mine) < free:
-                    total += (free - len(mine)) * (math.log1p(-chance) if chance < 1 else -math.inf)
+                if len(mine) < steps:
+                    total += (steps - len(mine)) * (math.log1p(-chance) if chance < 1 else -math.inf)
         known = {model.what for model in self.models.values()}
         return total if all(one.what in known and one.agent in self.agents for one in begun) else -math.inf
 
-    def log_likelihood_of(self, result: TrialResult) -> float | None:
+    def log_likelihood_of(self, result: TrialResult) -> float:
         """Return the logarithm of the probability that just what took place in a trial begins in its steps.
 
-        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier. None
-        where nothing is drawn at all.
+        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier.
         """
-        if not self.models:
-            return None
         there = {(one.step, one.agent, one.what) for one in result.disturbances}
         drawn = [one for one in result.spec.disturbances if (one.step, one.agent, one.what) in there]
         return self.log_likelihood(drawn, result.steps_begun)
 
     def _chance(self, name: str) -> float:
         return min(1.0, self.rates[name] * self.step_length_s)
-
-
-def _key(one: Disturbance) -> tuple[int, str, str]:
-    return one.step, one.agent, one.what

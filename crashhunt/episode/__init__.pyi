@@ -1,3 +1,4 @@
+from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
 from ._failures import failure_of as failure_of, words_of as words_of
 from ._nearness import Nearness as Nearness

@@ -100,6 +100,13 @@ class Disturbed:
         waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
         waits.sort(key=lambda one: one.step, reverse=True)
 
+    def replan(self, disturbances: Sequence[Disturbance]) -> None:
+        """Plan others in place of those that were planned for after the next step."""
+        for waits in (self._traffic_waits, self._agent_waits):
+            waits[:] = [one for one in waits if one.step <= self._step + 1]
+        for one in disturbances:
+            self.add(one)
+
     def took_place(self, planned: Disturbance) -> bool:
         """Whether somebody was there for a disturbance that has begun."""
         return any(

@@ -6,36 +6,36 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-import numpy as np
-
+from crashhunt.base.asleep import Asleep
 from crashhunt.base.errors import InvalidEpisodeError, RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import Copy, Held, held, shared_memory
 from crashhunt.episode._disturbed import Disturbed
 from crashhunt.episode._failures import close_agent, failure_of, is_emptied
-from crashhunt.episode._observer import Observer
+from crashhunt.episode._wiring import agent_seed, told, unflattener
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import FlattensObservations, HasMap, LeavesOut
-from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from types import TracebackType
 
-    from gymnasium import Space
+    import numpy as np
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
     from crashhunt.base.plain import Plain
+    from crashhunt.episode._observer import Observer
     from crashhunt.simulators import Info, Observations, Options, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
 __all__ = ["Episode", "MakeAgent", "Reset"]
 
+C = TypeVar("C")
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
 Reset = Callable[..., "tuple[Observations, Info]"]
@@ -113,13 +113,13 @@ class Episode:
         self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
         # Only those that want to be told are called: this is done several times a step.
-        self._on_begin: list[Callable[[Episode], None]] = _told(observers, "begin")
-        self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = _told(observers, "observation")
-        self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = _told(observers, "action")
-        self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = _told(observers, "scene")
-        self._on_disturbance: list[Callable[[Disturbance], None]] = _told(observers, "disturbance")
-        self._on_copied: list[Callable[[], None]] = _told(observers, "copied")
-        self._on_end: list[Callable[[TrialResult], TrialResult]] = _told(observers[::-1], "end")
+        self._on_begin: list[Callable[[Episode], None]] = told(observers, "begin")
+        self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = told(observers, "observation")
+        self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = told(observers, "action")
+        self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = told(observers, "scene")
+        self._on_disturbance: list[Callable[[Disturbance], None]] = told(observers, "disturbance")
+        self._on_copied: list[Callable[[], None]] = told(observers, "copied")
+        self._on_end: list[Callable[[TrialResult], TrialResult]] = told(observers[::-1], "end")
         self._disturbed: Disturbed | None = None
         self._forks = forks
         self._reset = reset or simulator.reset
@@ -230,17 +230,31 @@ class Episode:
         Raises:
             CannotForkError: the agents, or whoever has begun before them, have something that has no copy.
         """
+        return self._copied(Copy, work, observed=observed)
+
+    def leave_asleep(self, work: Callable[..., Plain]) -> Asleep:
+        """Leave a copy asleep here; whenever it is asked, a copy of that one goes on from here, told of to nobody.
+
+        Args:
+            work: what is done with that copy, and with what is asked.
+
+        Raises:
+            CannotForkError: as of `fork`.
+        """
+        return self._copied(Asleep, work, observed=False)
+
+    def _copied(self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], **how: bool) -> C:
         if self.scene is None or self.result is not None:
             raise RuntimeError("an episode has copies only while it goes on")
 
-        def go_on() -> Plain:
-            for tell in self._on_copied if observed else ():
+        def go_on(*asked: Plain) -> Plain:
+            for tell in self._on_copied if how["observed"] else ():
                 tell()
-            if not observed:
+            if not how["observed"]:
                 self._look_away()
-            return work(self)
+            return work(self, *asked)
 
-        copy = Copy(go_on, self._held)
+        copy = make(go_on, self._held)
         self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
         return copy
 
@@ -254,6 +268,13 @@ class Episode:
             raise RuntimeError("only an episode of which there may be copies is disturbed while it goes on")
         self._disturbed.add(disturbance)
 
+    def replan(self, disturbances: Sequence[Disturbance]) -> None:
+        """Have others take place than what was planned for after the next step; the specification says so as well."""
+        if self._disturbed is not None:
+            self._disturbed.replan(disturbances)
+        begun = [one for one in self.spec.disturbances if one.step <= self.steps + 1]
+        self.spec = replace(self.spec, disturbances=in_turn([*begun, *disturbances]))
+
     def takes_place(self, disturbance: Disturbance) -> bool:
         """Whether somebody was there for a disturbance that has begun."""
         return self._disturbed is not None and self._disturbed.took_place(disturbance)
@@ -261,8 +282,8 @@ class Episode:
     def _look_away(self) -> None:
         """Tell nobody of anything from now on."""
         tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
-        for told in (*tells, self._on_copied, self._on_end):
-            told.clear()
+        for listening in (*tells, self._on_copied, self._on_end):
+            listening.clear()
         if self._disturbed is not None:
             self._on_end.append(self._disturbed.end)
 
@@ -294,7 +315,7 @@ class Episode:
                 self._disturb(Disturbed(spec, simulator, self._on_disturbance))
             for number, agent in enumerate(self.names):
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
-                self.agents[agent].reset(_agent_seed(spec.seed, number))
+                self.agents[agent].reset(agent_seed(spec.seed, number))
             agent = ""
             self.scene = scene = simulator.scene()
             for show in self._on_scene:
@@ -316,7 +337,7 @@ class Episode:
         self.acting = tuple(range(len(self.names)))
         self._encoders = [simulator.actions[name].encode for name in self.names]
         if offers(simulator, FlattensObservations):
-            self._unflatten = {name: _unflattener(space) for name, space in simulator.shown_spaces.items()}
+            self._unflatten = {name: unflattener(space) for name, space in simulator.shown_spaces.items()}
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
     def _disturb(self, disturbed: Disturbed) -> None:
@@ -375,20 +396,3 @@ class Episode:
         with suppress(BaseException):
             self._add(self.result)
         return self.result
-
-
-def _agent_seed(seed: int, number: int) -> int:
-    """A seed of each agent's own, which differs from the simulator's."""
-    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
-
-
-def _unflattener(space: Space[object]) -> Callable[[NDArray[np.generic]], object]:
-    """What makes a Dict or Tuple observation again of the flattened array, which is recorded."""
-    from gymnasium.spaces import unflatten
-
-    return partial(unflatten, space)
-
-
-def _told(observers: Sequence[Observer], name: str) -> Any:
-    """What is called to tell observers of something; those that do not want to be told are left out."""
-    return [getattr(one, name) for one in observers if getattr(type(one), name) is not getattr(Observer, name)]

@@ -18,6 +18,7 @@ from crashhunt.trial import CRASHES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from crashhunt.episode._branches import Brancher
     from crashhunt.episode._episode import MakeAgent, Reset
     from crashhunt.episode._observer import Observer
     from crashhunt.episode._probes import Prober
@@ -40,6 +41,7 @@ def run_episode(
     observers: Sequence[Observer] = (),
     reset: Reset | None = None,
     prober: Prober | None = None,
+    brancher: Brancher | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -53,6 +55,7 @@ def run_episode(
         observers: who else is told; after the recorder.
         reset: what resets the simulator, where it is not the simulator itself.
         prober: asks copies of it how little it would take for a crash.
+        brancher: has copies of it go on with other disturbances where it comes near to one.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -62,24 +65,30 @@ def run_episode(
     """
     began = time.monotonic()
     seed_everything(spec.seed)
-    everybody = (Recorder(box, simulator), Nearness(box.take_frames), *observers)
-    with Episode(
-        spec,
-        simulator=simulator,
-        make_agent=make_agent,
-        oracles=oracles,
-        crash_on=crash_on,
-        observers=everybody,
-        forks=prober is not None,
-        reset=reset,
-    ) as episode:
-        result = episode.start()
-        while result is None:
-            result = episode.step()
-            if prober is not None and result is None and prober.is_due(episode):
-                prober.ask(episode)
-    if prober is not None:
-        result = prober.result(result)
+    asking = [one for one in (prober, brancher) if one is not None]
+    watching = [] if brancher is None else [brancher]
+    try:
+        with Episode(
+            spec,
+            simulator=simulator,
+            make_agent=make_agent,
+            oracles=oracles,
+            crash_on=crash_on,
+            observers=(Recorder(box, simulator), Nearness(box.take_frames), *observers, *watching),
+            forks=bool(asking),
+            reset=reset,
+        ) as episode:
+            result = episode.start()
+            while result is None:
+                result = episode.step()
+                for one in asking:
+                    if result is None and one.is_due(episode):
+                        one.ask(episode)
+    finally:
+        for one in watching:
+            one.close()
+    for one in asking:
+        result = one.result(result)
     return replace(result, setup_s=episode.setup_s, wall_s=time.monotonic() - began)
 
 

@@ -51,6 +51,7 @@ class SettingsData(TypedDict):
     hunt_seed: NotRequired[int]
     warm_copies: NotRequired[int]
     probe_s: NotRequired[float]
+    branch: NotRequired[Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +76,8 @@ class WorkerSettings:
         warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
         probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
             for never.
+        branch: how often what disturbs copies that go on otherwise where a trial comes near to a crash, ``NAME=RATE``
+            each; empty for no such copies.
     """
 
     scenario: Scenario
@@ -91,6 +94,7 @@ class WorkerSettings:
     hunt_seed: int = 0
     warm_copies: int = 0
     probe_s: float = 0.0
+    branch: tuple[str, ...] = ()
 
     def is_audited(self, result: TrialResult) -> bool:
         """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
@@ -126,6 +130,8 @@ class WorkerSettings:
             data["warm_copies"] = self.warm_copies
         if self.probe_s:
             data["probe_s"] = self.probe_s
+        if self.branch:
+            data["branch"] = self.branch
         if requires:
             data["requires"] = requires
         return data
@@ -165,6 +171,7 @@ class WorkerSettings:
             hunt_seed=data.get("hunt_seed", 0),
             warm_copies=data.get("warm_copies", 0),
             probe_s=data.get("probe_s", 0.0),
+            branch=tuple(data.get("branch", ())),
         )
 
 

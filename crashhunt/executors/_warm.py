@@ -16,11 +16,11 @@ from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import forks
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.memory import FREE, free_memory
 from crashhunt.base.processes import end_descendants, kill
 from crashhunt.episode import words_of
 from crashhunt.trial import TrialResult, TrialSpec
@@ -34,7 +34,6 @@ __all__ = ["WarmCopies"]
 
 _RECEIVED = 1 << 16
 _WORTH_S = 0.02  # a copy of a copy costs some ten milliseconds, half of them for its end
-_FREE = 0.25  # of the memory, below which nobody is left asleep
 _STALE = 8  # as many times as there are copies, trials go by without one before it makes room for another
 
 # Kept apart from what an agent may put in their place.
@@ -143,9 +142,9 @@ class WarmCopies:
         self._tell(f"trials in the same traffic do not share its warm-up: {why}")
 
     def _make_room(self) -> bool:
-        if _free_memory() < _FREE:
+        if free_memory() < FREE:
             self._tell(
-                f"less than {_FREE:.0%} of the memory is free: fewer warmed-up copies are kept than there might be"
+                f"less than {FREE:.0%} of the memory is free: fewer warmed-up copies are kept than there might be"
             )
             return False
         if len(self._asleep) < self._most:
@@ -257,17 +256,3 @@ def _say(says: int, said: _Said) -> None:
 def _key(spec: TrialSpec) -> str:
     """What the traffic of a trial follows from."""
     return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only], sort_keys=True)
-
-
-def _free_memory() -> float:
-    """The share of the memory that is free, or would be as soon as somebody needs it; 1 where nobody can say."""
-    with suppress(OSError, ValueError, KeyError, ZeroDivisionError):
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        found = {name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines)}
-        free = found["MemAvailable"] / found["MemTotal"]
-        with suppress(OSError, ValueError):  # of a container
-            most = int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
-            used = int(Path("/sys/fs/cgroup/memory.current").read_text(encoding="ascii"))
-            free = min(free, 1 - used / most)
-        return free
-    return 1.0

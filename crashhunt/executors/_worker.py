@@ -26,6 +26,7 @@ from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import (
     Braking,
+    Brancher,
     Parts,
     Prober,
     WorkerSettings,
@@ -80,6 +81,7 @@ class Worker:
         self._pid = os.getpid()
         self._is_copy = False
         self._prober = Prober(settings.probe_s, settings.crash_on, self._delay) if settings.probe_s else None
+        self._brancher = Brancher(settings.branch, settings.crash_on, self._delay) if settings.branch else None
         self._settings = settings
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
@@ -156,6 +158,7 @@ class Worker:
                 crash_on=self._settings.crash_on,
                 reset=reset,
                 prober=self._prober,
+                brancher=self._brancher,
             )
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
@@ -164,8 +167,9 @@ class Worker:
             watchdog.cancel()
             self.change = self._changed(simulator)
             self._tell(simulator)
-            if self._prober is not None and self._prober.why_not:
-                self._notice(f"probes are left out: {self._prober.why_not}")
+            for asks, what in ((self._prober, "probes"), (self._brancher, "branches")):
+                if asks is not None and asks.why_not:
+                    self._notice(f"{what} are left out: {asks.why_not}")
             result = self._kept(result, simulator, folder)
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)

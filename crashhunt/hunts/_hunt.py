@@ -18,7 +18,9 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._branched import look_at_branches
 from crashhunt.hunts._directory import HuntDirectory
+from crashhunt.hunts._from_the_start import FromTheStart
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
@@ -170,7 +172,8 @@ class Hunt:
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
         near = keep_near_misses(self._place, ledger, settings, progress.notes, self._parallel_here, self._stops)
-        probes = look_at_probes(self._place, ledger, settings, snapshot, self._disturber, self._stops)
+        again = FromTheStart(self._place, settings, snapshot, self._disturber, self._stops)
+        probes, branches = look_at_probes(ledger, settings, again), look_at_branches(ledger, settings, again)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         reason = ""
@@ -183,7 +186,7 @@ class Hunt:
             settings,
             stopped,
             ledger.outcomes(),
-            ledger.steps_total() + (probes.steps if probes is not None else 0),
+            ledger.steps_total() + sum(asked.steps for asked in (probes, branches) if asked is not None),
             time.monotonic() - progress.began,
             tuple(crashes),
             reason,
@@ -194,6 +197,7 @@ class Hunt:
             near,
             probes,
             progress.kinds.at_fault if progress.kinds is not None else None,
+            branches,
         )
 
     def _hunt(
@@ -382,6 +386,7 @@ class Hunt:
             progress.time_left_s,
             progress.disturbed if self._disturber is not None else None,
             progress.stressed,
+            progress.branched,
         )
 
 

@@ -47,6 +47,7 @@ class HuntStatus:
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
         stressed: the trial of this run for whose crash it would have taken the least; None where nobody asked, or where
             nothing plausible would have done it.
+        branched: how many branches of trials of this run have crashed.
     """
 
     phase: str
@@ -65,6 +66,7 @@ class HuntStatus:
     time_left_s: float = math.inf
     disturbed: int | None = None
     stressed: TrialResult | None = None
+    branched: int = 0
 
     @property
     def seconds_left(self) -> float:
@@ -93,6 +95,7 @@ class Progress:
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     nearest: TrialResult | None = None
     stressed: TrialResult | None = None
+    branched: int = 0
     last_invalid: TrialResult | None = None
     notes: list[str] = field(default_factory=list)
     audit: AuditReport | None = None
@@ -111,6 +114,8 @@ class Progress:
         """Take note of a trial without a crash."""
         if result.collision is None and result.failure is None:
             self.nearest = max(self.nearest or result, result, key=lambda one: one.nearness)
+        if result.branches is not None:
+            self.branched += len(result.branches.crashes)
         if result.stress is not None and result.stress.disturbance is not None:
             least = self.stressed.stress.margin if self.stressed is not None and self.stressed.stress else 1.0
             self.stressed = result if result.stress.margin < least else self.stressed

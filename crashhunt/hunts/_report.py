@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._audit import AuditData, AuditReport
+    from crashhunt.hunts._branched import BranchReport, BranchReportData
     from crashhunt.hunts._probed import ProbeData, ProbeReport
     from crashhunt.plans import HuntSettings
     from crashhunt.triage import Group
@@ -46,6 +47,7 @@ class HuntReportData(TypedDict):
     kinds: NotRequired[list[KindData]]
     near_misses: NotRequired[list[CrashSummary]]
     probes: NotRequired[ProbeData]
+    branches: NotRequired[BranchReportData]
     at_fault: NotRequired[list[int]]
 
 
@@ -69,6 +71,7 @@ class HuntReport:
         near_misses: that were kept, the most dangerous first.
         probes: what came of asking copies of trials; None where nobody did.
         at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
+        branches: what came of copies that went on with other disturbances; None where there were to be none.
     """
 
     directory: Path
@@ -86,6 +89,7 @@ class HuntReport:
     near_misses: tuple[Bundle, ...] = ()
     probes: ProbeReport | None = None
     at_fault: tuple[int, ...] | None = None
+    branches: BranchReport | None = None
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -105,6 +109,8 @@ class HuntReport:
         }
         if self.probes is not None:
             found["probes"] = self.probes.to_json()
+        if self.branches is not None:
+            found["branches"] = self.branches.to_json()
         if self.kinds is not None:
             found["kinds"] = list(map(kind_data, self.kinds))
         if self.settings.run.near_misses:

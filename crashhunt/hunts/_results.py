@@ -17,7 +17,7 @@ from crashhunt.base.names import one_of
 from crashhunt.crashes import Bundle, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._ledger import Ledger, has_begun
-from crashhunt.hunts._row import DISTURBANCES, FACTS, ORIGINS, STRESS, TrialRow
+from crashhunt.hunts._row import BRANCHES, DISTURBANCES, FACTS, ORIGINS, STRESS, TrialRow
 from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
 from crashhunt.plans import HuntSettings, read_settings, with_settings
 from crashhunt.snapshots import Snapshot, latest_snapshot
@@ -98,12 +98,14 @@ class HuntResults:
         """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing.
 
         Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances, and ``stress_margin``, where it
-        has probes.
+        has probes, ``branches`` and ``branch_crashes``, where it has those.
         """
         with closing(self._ledger()) as ledger:
             origins = ORIGINS if ledger.facts().get("origins") else ()
         stress = STRESS if self.settings.probe else ()
-        return (*columns_of(self.settings), *(DISTURBANCES if self.settings.disturb else ()), *stress, *origins)
+        disturbances = DISTURBANCES if self.settings.disturb else ()
+        branches = BRANCHES if self.settings.branch else ()
+        return (*columns_of(self.settings), *disturbances, *stress, *branches, *origins)
 
     @property
     def crashes(self) -> list[Bundle]:

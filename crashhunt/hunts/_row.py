@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from crashhunt.trial import Outcome, ResultData, Value
     from crashhunt.world import ClosestData
 
-__all__ = ["DISTURBANCES", "FACTS", "ORIGINS", "STRESS", "Cell", "TrialRow"]
+__all__ = ["BRANCHES", "DISTURBANCES", "FACTS", "ORIGINS", "STRESS", "Cell", "TrialRow"]
 
 FACTS = (
     "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
@@ -29,6 +29,9 @@ DISTURBANCES = ("disturbances", "log_likelihood")
 
 STRESS = ("stress_margin",)
 """A further one, of hunts with probes: how little it would have taken, 0 to 1."""
+
+BRANCHES = ("branches", "branch_crashes")
+"""Further ones, of hunts with branches: how many there were, and how many crashed."""
 
 Cell: TypeAlias = "Value | None"
 """What a table has in one place; None where a trial has no such value."""
@@ -87,7 +90,7 @@ class TrialRow:
         """Return it as a row of a table that has some columns.
 
         Args:
-            columns: some of `FACTS`, `DISTURBANCES`, `STRESS` and `ORIGINS`, ``AGENT.ARGUMENT`` and
+            columns: some of `FACTS`, `DISTURBANCES`, `STRESS`, `BRANCHES` and `ORIGINS`, ``AGENT.ARGUMENT`` and
                 ``scenario.ARGUMENT``.
         """
         data = self.data
@@ -110,6 +113,9 @@ class TrialRow:
             "log_likelihood": data.get("log_likelihood"),
             "stress_margin": self.stress_margin,
         }
+        branches = data.get("branches")
+        if branches is not None:
+            found |= {"branches": branches.get("asked"), "branch_crashes": len(branches.get("crashes", ()))}
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)
             found |= events

@@ -30,6 +30,7 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
         audit=run.audit,
         hunt_seed=settings.seed,
         probe_s=settings.probe_s,
+        branch=tuple(settings.disturb) if settings.branch else (),
     )
 
 

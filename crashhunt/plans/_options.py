@@ -60,8 +60,7 @@ class Subject(_Options):
     )  # fmt: skip
     ego: str = option(
         "", "which vehicle of a bare ``.sumocfg``",
-        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO to add one; any: another in each trial",
-        unset="any",
+        help="for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one", unset="the first",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
@@ -118,12 +117,10 @@ class TrialOptions(_Options):
         flag="--crash-on", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
-        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second; or "
-        "what every trial has in one step, ``KIND@STEP=WHO:HOW_STRONG:HOW_LONG``",
+        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second",
         help="have others around the agent err, or the agent see or act late, so often a second, as in "
-        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, ignore_priority, unseen, "
-        "late_observation, noisy_observation, late_action or module:attribute; or in every trial from one step on, as "
-        "in brake@124=ahead:4:2 for 4 m/s² and 2 s; none for nothing at all",
+        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, ignore_priority, unseen, "
+        "late_observation, noisy_observation, late_action or module:attribute; none for nothing at all",
         unset="as the scenario says, and nothing where it is silent",
         flag="--disturb", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip
@@ -131,6 +128,12 @@ class TrialOptions(_Options):
         "", "how often copies of a trial are asked for the mildest disturbance with which it crashes, such as ``4s``",
         help="every so many seconds of simulation, ask copies of the trial for the mildest disturbance with which it "
         "crashes, such as 4s", unset="never", flag="--probe", metavar="TIME", check=check_probe,
+    )  # fmt: skip
+    branch: bool = option(
+        False, "whether copies of a trial go on with other disturbances where it comes near to a crash",
+        help="where a trial comes near to a crash, have copies of it go on with other disturbances, from then and from "
+        "some seconds before; needs --disturb",
+        flag="--branch",
     )  # fmt: skip
     seeds: int = option(
         0, "how many traffics there are, each used for many arguments; 0: every trial has its own",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import secrets
+import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
-from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
+from crashhunt.disturbances import disturber_of, parse_rates
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
@@ -72,6 +73,7 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
     disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
+    _check_branch(settings)
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
     return scenario, replace(settings, run=sized(settings.run))
@@ -129,14 +131,14 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
 
     Args:
         scenario: in which they take place.
-        disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
+        disturb: how often what happens: ``NAME=RATE`` each.
         agents: around whom.
 
     Raises:
         CrashhuntError: there is no such disturbance, or the simulator cannot do it.
     """
-    rates, fixed = parse_rates(disturb), parse_fixed(disturb, tuple(agents))
-    if not rates and not fixed:
+    rates = parse_rates(disturb)
+    if not rates:
         return None
     backend = scenario.backend
     return disturber_of(
@@ -145,7 +147,6 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
         step_length_s=backend.step_length_s(scenario),
         known=backend.disturbances,
         simulator=backend.title or "the simulator",
-        fixed=fixed,
     )
 
 
@@ -162,17 +163,16 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
     """What is asked for, or else what the scenario says."""
-    words = request.disturb or tuple(f"{name}={rate}" for name, rate in scenario.disturbances.items())
-    agents = tuple(scenario.agents)
-    fixed = parse_fixed(words, agents)
-    late = next((one for one in fixed if one.step > request.max_steps), None) if request.disturb else None
-    if late is not None:
-        fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
-        raise UsageError(f"--disturb {late.what}@{late.step}: a trial has {request.max_steps} steps", fix=fix)
-    return (
-        *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
-        *(word_of(one, agents) for one in fixed),
-    )
+    words = request.disturb or tuple(f"{name}={rate!r}" for name, rate in scenario.disturbances.items())
+    return tuple(f"{name}={rate!r}" for name, rate in parse_rates(words).items())
+
+
+def _check_branch(settings: HuntSettings) -> None:
+    if settings.branch and not settings.disturb:
+        fix = "say what may happen there, such as --disturb brake=0.02,cut_in=0.02"
+        raise UsageError("--branch has copies of trials go on with other disturbances, and there are none", fix=fix)
+    if settings.branch and sys.platform != "linux":
+        raise UsageError("--branch: processes are copied on Linux only", fix="leave it out")
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:

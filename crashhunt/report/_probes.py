@@ -1,4 +1,4 @@
-"""What is told of the probes of a hunt."""
+"""What is told of the probes and branches of a hunt."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from crashhunt.hunts import HuntReport
 
-__all__ = ["describe_probes"]
+__all__ = ["describe_branches", "describe_probes"]
 
 
 def describe_probes(report: HuntReport) -> list[str]:
@@ -16,7 +16,7 @@ def describe_probes(report: HuntReport) -> list[str]:
     found = report.probes
     if found is None or not found.margins:
         return []
-    steps = report.steps_total - found.steps
+    steps = _of_trials(report)
     safe = sum(margin == 1.0 for margin in found.margins)
     least, median = min(found.margins), statistics.median(found.margins)
     said = f"nothing plausible made {safe} of them crash"
@@ -35,3 +35,28 @@ def describe_probes(report: HuntReport) -> list[str]:
         what = f", {last.words}" if last is not None else ""
         lines.append(f"  {bundle.path}: {bundle.result.summary}{what}")
     return lines
+
+
+def describe_branches(report: HuntReport) -> list[str]:
+    """Return what came of branches, and which of those that crashed have done so from the start as well."""
+    found = report.branches
+    if found is None or not found.trials:
+        return []
+    enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
+    near = f"Near a crash {found.moments} times in {found.trials} trials, {found.branches} copies went on with other"
+    lines = [
+        f"{near} disturbances: {found.crashed} crashed, of {found.crashed_trials} trials.",
+        f"  they took {found.steps} steps beside {_of_trials(report)} of trials{enough}",
+    ]
+    if found.run_again:
+        lines.append(f"  of the {found.run_again} likeliest, {len(found.crashes)} crashed from the start as well:")
+    for bundle in found.crashes:
+        likely = bundle.result.log_likelihood
+        said = f", log-likelihood {likely:.2f}" if likely is not None else ""
+        lines.append(f"  {bundle.path}: {bundle.result.summary}{said}")
+    return lines
+
+
+def _of_trials(report: HuntReport) -> int:
+    """How many steps trials have taken themselves."""
+    return report.steps_total - sum(one.steps for one in (report.probes, report.branches) if one is not None)

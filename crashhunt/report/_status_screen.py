@@ -105,6 +105,9 @@ class Watcher:
         if status.stressed is not None and len(status.workers) < left:
             rows.append(Text(one_line(_stressed(status.stressed)), no_wrap=True, overflow="ellipsis"))
             left -= 1
+        if status.branched and len(status.workers) < left:
+            rows.append(Text(f"branches that crashed: {status.branched}", no_wrap=True, overflow="ellipsis"))
+            left -= 1
         nodes = _nodes(status, max(1, left // 2))
         return Group(*rows, *nodes, _workers(status, width, max(1, left - len(nodes))))
 

@@ -10,7 +10,7 @@ from crashhunt.base import layout
 from crashhunt.base.text import in_lines
 from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
 from crashhunt.report._groups import describe_groups
-from crashhunt.report._probes import describe_probes
+from crashhunt.report._probes import describe_branches, describe_probes
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.world import event_counts
 
@@ -55,6 +55,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         )
     lines += _describe_events(report)
     lines += describe_probes(report)
+    lines += describe_branches(report)
     lines += describe_disturbances(report.crashes)
     if report.at_fault is not None and report.crashes:
         all_of_them = len(report.crashes)

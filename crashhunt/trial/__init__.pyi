@@ -1,4 +1,7 @@
+from ._branches import Branch as Branch, Branches as Branches
 from ._data import (
+    BranchData as BranchData,
+    BranchesData as BranchesData,
     CollisionData as CollisionData,
     DisturbanceData as DisturbanceData,
     EscapeData as EscapeData,
@@ -11,8 +14,8 @@ from ._disturbance import (
     KINDS as KINDS,
     OF_AGENT as OF_AGENT,
     Disturbance as Disturbance,
+    in_turn as in_turn,
     steps_of as steps_of,
-    why_not as why_not,
 )
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from crashhunt.world import ClosestData, EventData
 
 __all__ = [
+    "BranchData",
+    "BranchesData",
     "CollisionData",
     "DisturbanceData",
     "EscapeData",
@@ -116,6 +118,26 @@ class StressData(TypedDict):
     step: int
 
 
+class BranchData(TypedDict):
+    """Of a `Branch`."""
+
+    disturbances: list[DisturbanceData]
+    branched: int
+    outcome: str
+    step: int
+    log_likelihood: float | None
+
+
+class BranchesData(TypedDict):
+    """Of `Branches`."""
+
+    moments: int
+    asked: int
+    steps: int
+    left_out: int
+    crashes: list[BranchData]
+
+
 class ResultData(TypedDict):
     """Of a `TrialResult`; ``category`` is that of an outcome which an oracle has brought."""
 
@@ -139,3 +161,4 @@ class ResultData(TypedDict):
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]
     stress: NotRequired[StressData]
+    branches: NotRequired[BranchesData]

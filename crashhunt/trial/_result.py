@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.plain import finite
+from crashhunt.trial._branches import Branches
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
@@ -47,6 +48,7 @@ class TrialResult:
             probability, as the hunt's models have it; None where the hunt has none.
         danger: how near to a crash it came, from 0 (nothing near) to 1 (touched); None where nobody measured it.
         stress: how little it would have taken; None where nobody asked.
+        branches: what else might have happened where it came near to a crash; None where nobody asked.
     """
 
     spec: TrialSpec
@@ -68,6 +70,7 @@ class TrialResult:
     log_likelihood: float | None = None
     danger: float | None = None
     stress: Stress | None = None
+    branches: Branches | None = None
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -99,6 +102,8 @@ class TrialResult:
             data["danger"] = finite(self.danger)
         if self.stress is not None:
             data["stress"] = self.stress.to_json()
+        if self.branches is not None:
+            data["branches"] = self.branches.to_json()
         return data
 
     @classmethod
@@ -106,6 +111,7 @@ class TrialResult:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default."""
         hit, failure = data.get("collision"), data.get("failure")
         event, escape, stress = data.get("event"), data.get("escape"), data.get("stress")
+        branches = data.get("branches")
         return cls(
             spec=TrialSpec.from_json(data["spec"]),
             outcome=outcome_of(data),
@@ -126,6 +132,7 @@ class TrialResult:
             log_likelihood=data.get("log_likelihood"),
             danger=data.get("danger"),
             stress=Stress.from_json(stress) if stress else None,
+            branches=Branches.from_json(branches) if branches else None,
         )
 
     @property

@@ -12,14 +12,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from ray_cluster import head, nodes
 
-if find_spec("ray") is None:  # to import it takes a while, wherever its tests are not run
-    pytest.skip("Ray is not installed: pip install 'crashhunt[ray]'", allow_module_level=True)
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'crashhunt[ray]'")
+
 
 pytestmark = pytest.mark.nightly
 DEADLINE_S = 150.0

@@ -1,0 +1,35 @@
+"""What connects an episode with those who take part, and with those who look on."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from crashhunt.episode._observer import Observer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+__all__ = ["agent_seed", "told", "unflattener"]
+
+
+def agent_seed(seed: int, number: int) -> int:
+    """Return a seed of each agent's own, which differs from the simulator's."""
+    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
+
+
+def unflattener(space: Space[object]) -> Callable[[NDArray[np.generic]], object]:
+    """Return what makes a Dict or Tuple observation again of the flattened array, which is recorded."""
+    from gymnasium.spaces import unflatten
+
+    return partial(unflatten, space)
+
+
+def told(observers: Sequence[Observer], name: str) -> Any:
+    """Return what is called to tell observers of something; those that do not want to be told are left out."""
+    return [getattr(one, name) for one in observers if getattr(type(one), name) is not getattr(Observer, name)]

@@ -1,0 +1,119 @@
+"""What the branches of trials have found in a hunt, and the likeliest of it run from the start."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.hunts._from_the_start import Found
+from crashhunt.trial import TrialResult
+
+if TYPE_CHECKING:
+    from crashhunt.crashes import Bundle, CrashSummary
+    from crashhunt.hunts._from_the_start import FromTheStart
+    from crashhunt.hunts._ledger import Ledger
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import Branch, Branches
+
+__all__ = ["BranchReport", "BranchReportData", "look_at_branches"]
+
+_LIKELIEST = 10  # trials; each takes two processes of its own
+
+
+class BranchReportData(TypedDict):
+    """What ``run --json`` prints of them."""
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    left_out: int
+    crashed: int
+    crashed_trials: int
+    run_again: int
+    confirmed: int
+    crashes: list[CrashSummary]
+
+
+@dataclass(frozen=True, slots=True)
+class BranchReport:
+    """What came of the branches of a hunt.
+
+    Args:
+        trials: of how many trials there might have been some.
+        moments: how often one came near to a crash.
+        branches: how many there were.
+        steps: how many steps they took.
+        left_out: how many were left out, because branches had taken enough steps.
+        crashed: how many crashed.
+        crashed_trials: in how many trials.
+        run_again: how many of these were run from the start: of each trial the likeliest.
+        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+    """
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    left_out: int
+    crashed: int
+    crashed_trials: int
+    run_again: int
+    crashes: tuple[Bundle, ...]
+
+    def to_json(self) -> BranchReportData:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "trials": self.trials,
+            "moments": self.moments,
+            "branches": self.branches,
+            "steps": self.steps,
+            "left_out": self.left_out,
+            "crashed": self.crashed,
+            "crashed_trials": self.crashed_trials,
+            "run_again": self.run_again,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+def look_at_branches(ledger: Ledger, settings: HuntSettings, again: FromTheStart) -> BranchReport | None:
+    """Sum up what branches came to, and run the likeliest that crashed from the start, in fresh processes.
+
+    Args:
+        ledger: of the hunt.
+        settings: of the hunt.
+        again: runs trials from the start.
+
+    Returns:
+        None where there were to be none.
+    """
+    if not settings.branch:
+        return None
+    asked = [
+        (result, result.branches) for result in map(TrialResult.from_json, ledger.plain_results()) if result.branches
+    ]
+    found = [(result, max(branches.crashes, key=_likely)) for result, branches in asked if branches.crashes]
+    likeliest = sorted(found, key=lambda pair: -_likely(pair[1]))[:_LIKELIEST]
+    specs = [
+        Found(replace(result.spec, disturbances=branch.disturbances, origin="branch"), branch.outcome, branch.step)
+        for result, branch in likeliest
+    ]
+    every: list[Branches] = [branches for _, branches in asked]
+    return BranchReport(
+        len(every),
+        sum(one.moments for one in every),
+        sum(one.asked for one in every),
+        sum(one.steps for one in every),
+        sum(one.left_out for one in every),
+        sum(len(one.crashes) for one in every),
+        len(found),
+        len(specs),
+        again.crashes(specs, layout.BRANCHES),
+    )
+
+
+def _likely(branch: Branch) -> float:
+    return -math.inf if branch.log_likelihood is None else branch.log_likelihood

@@ -1,0 +1,79 @@
+"""Branches: that they crash from the start as they did, change nothing, and leave nothing behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from crashhunt.executors import worker_environment
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """Asks a process of one thread."""
+
+    def ask_it(what):
+        done = subprocess.run(
+            [sys.executable, Path(__file__).with_name("branching.py"), what, tmp_path],
+            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=100,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return ask_it
+
+
+@pytest.mark.parametrize("scenario", ["toy", "loop"])
+def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scenario):
+    found = ask(scenario)
+    assert found["outcomes"] == ["survived", "survived"]
+    assert found["same"]
+    branches = found["branches"]
+    assert branches["moments"] >= 2
+    assert branches["asked"] >= 3
+    assert 0 < branches["steps"] < 2 * 150 + 60
+    assert branches["left_out"] > 0
+    assert branches["crashes"]
+    assert found["starts"] == [
+        [crash["outcome"], crash["step"], crash["log_likelihood"]] for crash in branches["crashes"]
+    ]
+    for crash in branches["crashes"]:
+        first = min(one["step"] for one in crash["disturbances"])
+        assert crash["branched"] + 2 <= first <= crash["branched"] + 2 + 20
+        assert first <= crash["step"] <= crash["branched"] + 60
+        assert crash["log_likelihood"] < 0
+    assert found["waited"]
+    assert (found["left"], found["why_not"]) == (0, "")
+    if scenario == "toy":
+        assert found["again"]
+        assert found["itself"][0] == "collision"
+        assert found["itself"][1]["crashes"] == []  # it needed no other
+        assert found["never"] is None
+
+
+def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
+    found = ask("ends")
+    for how in ("hangs", "dies"):
+        assert found[how] == ["survived", "a copy died, or hung", 0]
+    assert len(found["left"]) == 3
+    deadline = time.monotonic() + 10.0
+    for pid in found["left"]:
+        while goes_on(pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def goes_on(pid):
+    """Whether a process has not ended; it may not have been reaped."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
