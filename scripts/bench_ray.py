@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import resource
@@ -54,17 +55,20 @@ class Agent:
         return 1.0, 0
 """
 
+_SWING, _TRIALS = 4, 40
+"""Trials before somebody is timed, and during that."""
+
 
 @contextmanager
-def cluster(*cpus: int) -> Iterator[str]:
-    """A cluster whose head runs nothing, and whose nodes have so many CPUs; yields its address."""
+def cluster(*cpus: int, head: int = 0) -> Iterator[str]:
+    """A cluster whose head and nodes have so many CPUs; yields its address."""
     from ray.cluster_utils import Cluster
 
     with tempfile.TemporaryDirectory(prefix="bench-", dir="/tmp") as short:  # Ray makes sockets there
         os.environ["RAY_TMPDIR"] = short
         Path(short, "ray").mkdir()
-        head = {"num_cpus": 0, "include_dashboard": False, "temp_dir": short}
-        found = Cluster(initialize_head=True, head_node_args=head)
+        first = {"num_cpus": head, "include_dashboard": False, "temp_dir": short}
+        found = Cluster(initialize_head=True, head_node_args=first)
         try:
             for count in cpus:
                 found.add_node(num_cpus=count)
@@ -112,34 +116,87 @@ def run(
 
 
 def child_rate(address: str, rounds: str) -> dict[str, Any]:
-    """Trials a second on the pool and on Ray, in pairs whose order alternates, both with two workers."""
+    """What a pool of two workers does in a second, and for how much CPU, against Ray on the same cores.
+
+    Pool, Ray, Ray, pool, and so on: what else the machine does burdens both alike. Both run the same trials, and are
+    timed while their workers have something to do all the time. To Ray's CPU belong all processes of the cluster, of
+    which a pool has none; the rate is that of a machine on which the cluster runs in any case.
+    """
     from crashhunt.executors import PoolExecutor
     from crashhunt.executors.ray import RayExecutor
     from crashhunt.scenario import argument_values
 
-    rates: dict[str, list[float]] = {"pool": [], "ray": []}
+    taken: dict[str, list[tuple[float, float]]] = {"pool": [], "ray": []}
     with tempfile.TemporaryDirectory() as name:
         here, there = settings(Path(name, "pool"), "loop"), settings(Path(name, "ray"), "loop")
         kinds: dict[str, Executor] = {
             "pool": PoolExecutor(here, parallel=2),
             "ray": RayExecutor(there, parallel=2, argument=address),
         }
-        number, count, arguments = 0, 24, argument_values(here.scenario)
+        arguments = argument_values(here.scenario)
         try:
             for executor in kinds.values():
                 run(executor, 0, 8, 100, 5.0, arguments)
             for turn in range(int(rounds)):
                 for kind in sorted(kinds, reverse=bool(turn % 2)):
-                    number += count
-                    rates[kind].append(count / run(kinds[kind], number, count, 1000, 5.0, arguments))
+                    taken[kind].append(_in_full_swing(kinds[kind], kind, 1000 * (turn + 1), arguments))
         finally:
             for executor in kinds.values():
                 executor.close()
-    ratios = [ray / pool for ray, pool in zip(rates["ray"], rates["pool"], strict=True)]
-    return {
-        "ratio": statistics.median(ratios), "least": min(ratios), "most": max(ratios), "load": os.getloadavg()[0],
-        "pool": statistics.median(rates["pool"]), "ray": statistics.median(rates["ray"]),
-    }  # fmt: skip
+    found: dict[str, Any] = {"load": os.getloadavg()[0]}
+    for index, figure in enumerate(("wall", "cpu")):
+        pairs = [(pool[index], ray[index]) for pool, ray in zip(taken["pool"], taken["ray"], strict=True)]
+        ratios = [pool / ray for pool, ray in pairs]
+        found[figure] = {
+            "ratio": statistics.median(ratios), "interval": _interval_of_median(ratios),
+            "pool": statistics.median(pool for pool, _ in pairs), "ray": statistics.median(ray for _, ray in pairs),
+        }  # fmt: skip
+    return found
+
+
+def _in_full_swing(executor: Executor, kind: str, first: int, arguments: dict[str, Any]) -> tuple[float, float]:
+    """Seconds, and seconds of CPU, that a trial takes while others run before and after it."""
+    from crashhunt.trial import TrialSpec
+
+    number = first
+    began, spent, done = 0.0, 0.0, 0
+    while done < _SWING + _TRIALS:
+        while number - first - done < 2 * executor.capacity:
+            executor.submit(TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=1000))
+            number += 1
+        for _ in executor.completed(1.0):
+            done += 1
+            if done == _SWING:
+                began, spent = time.perf_counter(), _spent_by(kind)
+            if done == _SWING + _TRIALS:
+                found = (time.perf_counter() - began) / _TRIALS, (_spent_by(kind) - spent) / _TRIALS
+    while done < number - first:
+        done += sum(1 for _ in executor.completed(1.0))
+    return found
+
+
+def _spent_by(kind: str) -> float:
+    """Seconds of CPU that this process and those of its executor have taken; to Ray belongs the cluster beside it."""
+    bridge, others = [], []
+    for pid in _with_descendants(os.getpid())[1:]:
+        with contextlib.suppress(OSError):
+            is_bridge = b"crashhunt.executors.ray._bridge" in Path(f"/proc/{pid}/cmdline").read_bytes()
+            (bridge if is_bridge else others).append(pid)
+    if kind == "ray":
+        whole = _with_descendants(os.getppid())
+        others = [pid for pid in whole if pid not in (os.getppid(), os.getpid(), *bridge, *others)]
+    return sum(map(_spent_of, [os.getpid(), *others, *(bridge if kind == "ray" else [])]))
+
+
+def _interval_of_median(values: list[float]) -> tuple[float, float]:
+    """Where the median of what was drawn from lies in 19 cases out of 20, whatever its distribution."""
+    count = len(values)
+    below, beyond = 0, 0.0
+    while beyond + math.comb(count, below) / 2**count <= 0.025:
+        beyond += math.comb(count, below) / 2**count
+        below += 1
+    lowest = max(0, below - 1)
+    return sorted(values)[lowest], sorted(values)[count - 1 - lowest]
 
 
 def child_wire(address: str) -> dict[str, float]:
@@ -170,11 +227,15 @@ def child_wire(address: str) -> dict[str, float]:
 
 def _spent() -> float:
     """Seconds of CPU that the bridge has taken, which is below this process; Ray's own threads are part of it."""
-    total = 0
-    for one in _with_descendants(os.getpid())[1:]:
-        with contextlib.suppress(OSError):
-            total += sum(map(int, Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()[11:13]))
-    return total / os.sysconf("SC_CLK_TCK")
+    return sum(map(_spent_of, _with_descendants(os.getpid())[1:]))
+
+
+def _spent_of(pid: int) -> float:
+    """Seconds of CPU that a process has taken, with those below it that have ended."""
+    with contextlib.suppress(OSError):
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def _over_the_wire() -> int:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
+import re
 import socket
+import sys
 import threading
 import time
 
@@ -12,7 +15,7 @@ import pytest
 from crashhunt.base.errors import PluginError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._address import cluster_of, require_ray
+from crashhunt.executors.ray._address import OLDEST, cluster_of, require_ray
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES
 
@@ -150,3 +153,34 @@ def test_without_ray_it_says_how_to_get_it(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(PluginError, match=r"which is not installed; pip install 'crashhunt\[ray\]'"):
         require_ray()
+
+
+def test_a_folder_of_that_name_is_not_ray(monkeypatch, tmp_path):
+    (tmp_path / "ray").mkdir()
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "ray", raising=False)
+    with pytest.raises(PluginError, match="which is not installed"):
+        require_ray()
+
+
+@pytest.mark.parametrize(
+    ("version", "good"), [("2.9.3", False), ("1.13.0", False), ("2.10.0", True), ("3.0.0.dev0", True)]
+)
+def test_a_ray_that_is_too_old_is_named(version, good, monkeypatch, tmp_path):
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "__init__.py").write_text("raise ImportError('of something else')")
+    (tmp_path / f"ray-{version}.dist-info").mkdir()
+    (tmp_path / f"ray-{version}.dist-info" / "METADATA").write_text(f"Name: ray\nVersion: {version}\n")
+    monkeypatch.delitem(sys.modules, "ray", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    if good:
+        require_ray()
+        return
+    said = f"needs Ray 2.10 or newer, and {version} is installed; pip install 'ray>=2.10', on every machine"
+    with pytest.raises(PluginError, match=re.escape(said)):
+        require_ray()
+
+
+def test_the_oldest_ray_is_the_one_that_is_installed_with_crashhunt():
+    wanted = [line for line in importlib.metadata.requires("crashhunt") if line.startswith("ray")]
+    assert {line.partition(";")[0].strip() for line in wanted} == {f"ray>={'.'.join(map(str, OLDEST))}"}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -36,6 +38,7 @@ class Made:
         self.nowhere = set()  # those that do
         self.ready = {}  # answer to value
         self.orders = []
+        self.given = []  # machine, how and trials
         self.differing = {}  # machine to what
 
     def nodes(self):
@@ -56,6 +59,8 @@ class Made:
 
     def ask(self, actor, what, *arguments):
         actor.asked = answer = object()
+        if what == "take" and arguments[1]:
+            self.given.append((actor.machine, "take", arguments[1]))
         if actor in self.nowhere:
             return answer
         if what == "differs":
@@ -65,7 +70,7 @@ class Made:
         return answer
 
     def order(self, actor, what, *arguments):
-        self.orders.append((actor.machine, what, *arguments))
+        (self.given if what == "submit" else self.orders).append((actor.machine, what, *arguments))
 
     def answered(self, answers, wait_s):
         return [answer for answer in answers if answer in self.ready]
@@ -152,7 +157,7 @@ def notes(told):
 
 
 def submitted(cluster):
-    return [(machine, [ticket - 100 for ticket, _ in words[0]]) for machine, what, *words in cluster.orders if words]
+    return [(machine, [ticket - 100 for ticket, _ in trials]) for machine, _, trials in cluster.given]
 
 
 def test_a_node_gets_ready_and_runs_what_is_submitted(begin):
@@ -248,7 +253,7 @@ def test_where_no_node_is_left_it_says_so_once_and_goes_on(begin):
     ]
     assert [message["capacity"] for message in told if "capacity" in message] == [0, 0]
     cluster.cpus["b"] = 1
-    cluster.orders.clear()
+    cluster.given.clear()
     assert {"capacity": 1} in after()
     assert submitted(cluster) == [("b", [0, 1])]
     cluster.cpus.clear()
@@ -318,7 +323,7 @@ def test_what_a_node_cannot_run_runs_elsewhere_and_is_not_to_blame(begin):
     after()
     error = CrashhuntError("the disk is full").to_json()
     cluster.news(cluster.actors[1], error=error)
-    cluster.orders.clear()
+    cluster.given.clear()
     assert notes(after()) == ["node b takes no part: the disk is full"]
     (left,) = bridge._roster.nodes.values()
     assert not any(trial.losses for trial in [*left.running.values(), *bridge._roster.waiting])
@@ -346,22 +351,69 @@ def test_rates_are_by_the_clock_here(begin):
 
 
 def test_what_is_given_up_is_given_up_everywhere(begin):
+    """Also what is still on its way, which is told from what is submitted later by its ticket."""
     bridge, cluster, after = begin(a=1, b=1)
-    submit(bridge, *range(6))
     after()
-    lines = SimpleNamespace(makefile=lambda mode: _Lines([json.dumps({"cancel": 1}).encode()]))
-    bridge._control, control = lines, bridge._control
-    bridge._listen()
-    bridge._control, bridge._closing = control, False
-    assert sorted(order for order in cluster.orders if order[1] == "cancel") == [("a", "cancel", 1), ("b", "cancel", 1)]
+    hunt(bridge, submission(*range(6)))
+    after()
+    hunt(bridge, {"cancel": 1})
+    given_up = sorted(order for order in cluster.orders if order[1] == "cancel")
+    assert given_up == [("a", "cancel", 1, 106), ("b", "cancel", 1, 106)]
     cluster.news(cluster.actors[0], ended(2))
     assert not [message for message in after() if "result" in message]
     assert not bridge._roster.waiting
 
 
-class _Lines(list):
-    def __enter__(self):
-        return self
+def test_what_is_submitted_for_what_has_ended_goes_along_with_the_next_question(begin):
+    """And nothing of it once it is given up; whoever has been asked already is told at once."""
+    bridge, cluster, after = begin(a=2)
+    after()
+    hunt(bridge, submission(0, 1), submission(2))
+    assert cluster.given == [("a", "submit", [(100 + number, spec(number)) for number in range(3)])], "in one call"
+    cluster.news(cluster.actors[0], ended(0), ended(1))
+    bridge.turn(0)
+    hunt(bridge, submission(3, 4, 5), {"cancel": 4})
+    cluster.given.clear()
+    bridge.turn(0)
+    assert cluster.given == [("a", "take", [(103, spec(3)), (104, spec(4))])]
 
-    def __exit__(self, *error):
-        pass
+
+def test_the_hunt_is_given_a_moment_to_submit_more(begin, monkeypatch):
+    bridge, cluster, after = begin(a=1)
+    after()
+    hunt(bridge, submission(0))
+    monkeypatch.setattr(_bridge, "_REFILL_S", 60.0)
+    cluster.news(cluster.actors[0], ended(0))
+    cluster.given.clear()
+
+    def submits_when_it_hears_of_it():
+        while bridge._missing < 1:
+            time.sleep(0.01)
+        with bridge._lock:  # it has been told
+            hunt(bridge, submission(1))
+
+    thread = threading.Thread(target=submits_when_it_hears_of_it)
+    thread.start()
+    bridge.turn(60.0)
+    thread.join()
+    bridge.turn(0)
+    assert cluster.given == [("a", "take", [(101, spec(1))])]
+
+
+def spec(number):
+    return TrialSpec(number, number, {}, {}, max_steps=3).to_json()
+
+
+def submission(*numbers):
+    return {"submit": [(100 + number, spec(number)) for number in numbers]}
+
+
+def hunt(bridge, *messages):
+    """Have the hunt say something, all at once."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        ours.sendall(b"".join(json.dumps(message).encode() + b"\n" for message in messages))
+        ours.close()
+        bridge._control, control = theirs, bridge._control
+        bridge._listen()
+    bridge._control, bridge._closing = control, False

@@ -13,7 +13,7 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
-from crashhunt.episode import WorkerSettings
+from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
@@ -23,7 +23,7 @@ from crashhunt.executors.ray._work import Work
 from crashhunt.recording import BlackBox, Tag, read_black_box
 from crashhunt.scenario import Scenario
 from crashhunt.snapshots import versions
-from crashhunt.trial import CRASHES
+from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
 
 @pytest.fixture
@@ -122,6 +122,80 @@ def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypat
     assert len(content) < 1000
     (tmp_path / "there").write_bytes(content)
     assert list(read_black_box(tmp_path / "there")) == list(read_black_box(tmp_path / layout.BLACK_BOX)) != []
+
+
+class Pool:
+    """Of which the test says what ends next."""
+
+    def __init__(self, *ending):
+        self.submitted, self.ending = [], list(ending)
+
+    def submit(self, spec):
+        self.submitted.append(spec.number)
+
+    def cancel(self, *, above):
+        self.submitted = [number for number in self.submitted if number <= above]
+
+    def completed(self, wait_s):
+        for number, kept in self.ending[:1]:
+            self.ending.pop(0)
+            yield TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, wall_s=0.0, kept=kept)
+
+    def where(self):
+        return {}
+
+    def notes(self):
+        return []
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def work(settings, tmp_path, monkeypatch):
+    """Makes what runs trials on a node, four at a time, with such a pool."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")  # which is set
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("crashhunt.executors.ray._work._GATHER_S", 60.0)
+
+    made = []
+
+    def make(*ending):
+        job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "slots": 4}
+        made.append(Work(job))
+        made[-1]._place = made[-1]._store.place()
+        made[-1]._pool = Pool(*ending)
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def submissions(*numbers):
+    return [(100 + number, TrialSpec(number, number, {}, {}, max_steps=3).to_json()) for number in numbers]
+
+
+def test_what_ends_together_goes_back_together_as_long_as_nobody_waits_for_more(work):
+    node = work(*((number, False) for number in range(8)))
+    assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1, 2]
+    assert [ended.number for ended in node.take(0.0, submissions(8, 9, 10)).ended] == [3, 4, 5]
+
+
+def test_what_is_kept_goes_back_at_once(work):
+    node = work((0, False), (1, True), (2, False))
+    scratch_of(node._place.scratch, 1).mkdir(parents=True)
+    assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1]
+
+
+def test_what_was_given_up_on_its_way_is_not_run(work):
+    node = work()
+    node.submit(submissions(1, 5))
+    node.cancel(2, 107)
+    node.take(0.0, submissions(2, 6))
+    assert node._pool.submitted == [1, 2]
+    node.submit(submissions(7))
+    assert node._pool.submitted == [1, 2, 7], "which came later, and is meant"
 
 
 def test_the_folder_of_a_cluster_is_removed_by_whoever_comes_after_its_owner(tmp_path):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
 import queue
+import re
 import secrets
 import socket
 import threading
@@ -14,10 +16,12 @@ from typing import NamedTuple
 
 from crashhunt.base.errors import PluginError, UsageError
 
-__all__ = ["TOKEN", "Meant", "cluster_of", "require_ray", "silent"]
+__all__ = ["OLDEST", "TOKEN", "Meant", "cluster_of", "require_ray", "silent"]
 
 TOKEN = "put the one that the cluster was started with into RAY_AUTH_TOKEN, or into ~/.ray/auth_token"
 """What to do about a token that is asked for."""
+OLDEST = (2, 10)
+"""The first Ray with which it works, as in pyproject.toml, where the reason is."""
 _ANSWER_S = 5.0
 _HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])  # and no settings of ours
 _FRAME, _KIND, _SETTINGS = (
@@ -43,13 +47,23 @@ class Meant(NamedTuple):
 
 
 def require_ray() -> None:
-    """See that Ray is installed.
+    """See that Ray is installed, and not too old.
 
     Raises:
-        PluginError: it is not.
+        PluginError: it is not, or it is.
     """
-    if importlib.util.find_spec("ray") is None:
+    spec = importlib.util.find_spec("ray")
+    if spec is None or spec.origin is None:  # some folder of that name is none
         raise PluginError("--executor ray needs Ray, which is not installed", fix="pip install 'crashhunt[ray]'")
+    with suppress(importlib.metadata.PackageNotFoundError):
+        there_is = importlib.metadata.version("ray")
+        found = re.match(r"(\d+)\.(\d+)", there_is)
+        if found and (int(found[1]), int(found[2])) < OLDEST:
+            oldest = ".".join(map(str, OLDEST))
+            raise PluginError(
+                f"--executor ray needs Ray {oldest} or newer, and {there_is} is installed",
+                fix=f"pip install 'ray>={oldest}', on every machine of the cluster",
+            )
 
 
 def cluster_of(argument: str) -> Meant:

@@ -38,6 +38,8 @@ __all__ = ["main"]
 
 _LOOK_EVERY_S = 1.0  # which nodes there are
 _WAIT_S = 0.2  # for a node to answer, before somebody else is looked at
+_REFILL_S = 0.005  # for the hunt to submit more, which then goes along with the next question
+_RECEIVED = 1 << 18  # bytes at a time
 _TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
 _FREE_S = 3.0  # for CPUs to become free that somebody else has just left
 _START_S = 30.0  # for an actor to be where it should stand; then whoever came before it has the CPUs
@@ -80,6 +82,9 @@ class Bridge:
         self._parcel = Parcel.of(self._settings)
         self._digest = self._parcel.digest()
         self._lock = threading.RLock()
+        self._refilled = threading.Condition(self._lock)
+        self._missing = 0  # trials that have ended, and for which the hunt has submitted no others yet
+        self._tickets = 0  # that were given out
         self._roster = Roster()
         self._refused: dict[str, str] = {}  # machine to why
         self._losses: dict[str, int] = {}
@@ -108,38 +113,61 @@ class Bridge:
         with self._lock:
             self._look_for_nodes()
             self._hand_out()
+            for node in self._roster.nodes.values():
+                if node.ready and node.answer is None:
+                    given, node.given = node.given, []
+                    self._ask(node, "take", _TAKE_S, given)
             self._tell_figures()
             asked = {node.answer: node for node in self._roster.nodes.values() if node.answer is not None}
         if not asked:
             time.sleep(wait_s / 2)
             return
+        self._missing = 0
         for answer in self._cluster.answered(list(asked), wait_s):
             with self._lock:
                 if asked[answer].answer is answer and not self._closing:
                     self._hear(asked[answer])
+        with self._refilled:
+            self._refilled.wait_for(lambda: self._missing <= 0, timeout=min(wait_s, _REFILL_S))
 
     def _listen(self) -> None:
         """Take what the hunt wants, also while nodes are waited for."""
-        with self._control.makefile("rb") as lines:
-            for line in lines:
-                message: ToBridge = json.loads(line)
+        received = b""
+        try:
+            while data := self._control.recv(_RECEIVED):
+                *lines, received = (received + data).split(b"\n")
                 with self._lock:
-                    if "submit" in message:
-                        self._roster.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
-                        self._hand_out()
-                    else:
-                        self._roster.cancel(message["cancel"])
-                        for node in self._roster.nodes.values():
-                            if node.ready:
-                                self._cluster.order(node.actor, "cancel", message["cancel"])
-        self._closing = True
+                    for line in lines:
+                        self._want(json.loads(line))
+                    self._hand_out()
+        finally:
+            self._closing = True
+
+    def _want(self, message: ToBridge) -> None:
+        if "submit" in message:
+            self._roster.waiting += [Trial(ticket, spec) for ticket, spec in message["submit"]]
+            self._tickets = max([self._tickets, *(ticket + 1 for ticket, _ in message["submit"])])
+            self._missing -= len(message["submit"])
+        else:
+            self._roster.cancel(message["cancel"])
+            self._missing = 0
+            for node in self._roster.nodes.values():
+                if node.ready:
+                    self._cluster.order(node.actor, "cancel", message["cancel"], self._tickets)
+        if self._missing <= 0:
+            self._refilled.notify()
 
     def _say(self, **message: Unpack[FromBridge]) -> None:
         self._control.sendall(json.dumps(message).encode() + b"\n")
 
     def _hand_out(self) -> None:
+        """Give out what waits; whoever is to be asked in a moment gets it then, for each call costs both sides time."""
         for node, trials in self._roster.assign().items():
-            self._cluster.order(node.actor, "submit", [(trial.ticket, trial.spec) for trial in trials])
+            given = [(trial.ticket, trial.spec) for trial in trials]
+            if node.answer is None:
+                node.given += given
+            else:
+                self._cluster.order(node.actor, "submit", given)
 
     def _look_for_nodes(self) -> None:
         """Find nodes that have come or gone, and have new ones get ready."""
@@ -206,8 +234,9 @@ class Bridge:
 
     def _hear(self, node: Node) -> None:
         """Take what a node answers, and ask it the next thing."""
+        answer, node.answer = node.answer, None
         try:
-            said = self._cluster.value(node.answer)
+            said = self._cluster.value(answer)
         except Lost:
             self._lose(node)
             return
@@ -231,7 +260,6 @@ class Bridge:
             node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
             self._say(capacity=self._roster.capacity)
             self._tell_figures(now=True)
-            self._ask(node, "take", 0.0)
         elif said == "lacks":
             self._ask(node, "deliver", self._cluster.shared(self._parcel.packed))
         else:
@@ -248,8 +276,8 @@ class Bridge:
         for ended in found:
             if ended.files:
                 self._keep(node, ended)
-            self._control.sendall(ended.line)
-        self._hand_out()
+        self._missing += len(found)
+        self._control.sendall(b"".join(ended.line for ended in found))
         for note in news.notes:
             self._say(note=note)
         if news.where is not None:
@@ -257,8 +285,6 @@ class Bridge:
         if news.error is not None:
             error = CrashhuntError.from_json(news.error)
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
-        else:
-            self._ask(node, "take", _TAKE_S)
 
     def _keep(self, node: Node, ended: Ended) -> None:
         """Write what a trial that is kept has left behind to where the hunt looks for it."""

@@ -26,6 +26,8 @@ __all__ = ["Cluster", "Found", "Lost", "TokenError", "UnreachableError"]
 _ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
 _ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, beside those of the other
+_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
+_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 
 class Lost(Exception):  # noqa: N818 - it is no fault
@@ -92,7 +94,11 @@ class Cluster:
                 fix="run the hunt on a machine of the cluster that has its versions of Ray and Python",
             ) from error
         cloudpickle.register_pickle_by_value(_site)
-        kind = ray.remote(concurrency_groups={_ORDERS: 1, _ANSWERS: 1}, max_restarts=0, max_task_retries=0)
+        for method, group in _GROUPS.items():
+            ray.method(concurrency_group=group)(getattr(_site.Site, method))
+        groups = {_ORDERS: 1, _ANSWERS: 1}
+        # Nobody looks at what Ray would note of every call; that it does not costs a tenth less.
+        kind = ray.remote(concurrency_groups=groups, max_restarts=0, max_task_retries=0, enable_task_events=False)
         self._kind: Any = kind(_site.Site)
         self._shared: Any = None
 
@@ -134,11 +140,11 @@ class Cluster:
 
     def ask(self, actor: Any, what: str, *arguments: Any) -> Any:
         """Call a method of an actor; return where its answer will be."""
-        return getattr(actor, what).options(concurrency_group=_ANSWERS).remote(*arguments)
+        return getattr(actor, what).remote(*arguments)
 
     def order(self, actor: Any, what: str, *arguments: Any) -> Any:
         """Call one whose answer says nothing; orders are carried out one after another."""
-        return getattr(actor, what).options(concurrency_group=_ORDERS).remote(*arguments)
+        return getattr(actor, what).remote(*arguments)
 
     def answered(self, answers: Sequence[Any], wait_s: float) -> list[Any]:
         """Return the answers that are there, waiting so long for a first one."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from crashhunt.executors.ray._messages import Figures
+    from crashhunt.executors.ray._messages import Figures, Submitted
     from crashhunt.trial import SpecData
 
 __all__ = ["Node", "Roster", "Trial", "shares"]
@@ -58,6 +58,7 @@ class Node:
         doing: what it was asked last, and has not answered yet.
         answer: where its answer to that will be.
         ready: whether it runs trials.
+        given: what goes along with the next question, by ticket; of what is running.
         running: ticket to trial.
         done: trials so far.
         since: when it became ready, as of `time.monotonic`.
@@ -72,6 +73,7 @@ class Node:
     doing: str = ""
     answer: Any = None
     ready: bool = False
+    given: list[Submitted] = field(default_factory=list)
     running: dict[int, Trial] = field(default_factory=dict)
     done: int = 0
     since: float = 0.0
@@ -162,6 +164,7 @@ class Roster:
         self.waiting = deque(trial for trial in self.waiting if trial.number <= above)
         for node in self.nodes.values():
             node.running = {ticket: trial for ticket, trial in node.running.items() if trial.number <= above}
+            node.given = [(ticket, spec) for ticket, spec in node.given if ticket in node.running]
 
 
 def shares(free: Mapping[str, int], wanted: int | None) -> dict[str, int]:

@@ -63,13 +63,13 @@ class Site:
         """Queue trials, each with its ticket."""
         self._work.submit(trials)
 
-    def cancel(self, above: int) -> None:
-        """Give up trials."""
-        self._work.cancel(above)
+    def cancel(self, above: int, before: int) -> None:
+        """Give up trials, also those that come later on another way than this does."""
+        self._work.cancel(above, before)
 
-    def take(self, wait_s: float) -> Any:
-        """Return what has happened since the last call."""
-        return self._work.take(wait_s)
+    def take(self, wait_s: float, trials: list[tuple[int, dict[str, Any]]]) -> Any:
+        """Queue trials as `submit` does; return what has happened since the last call."""
+        return self._work.take(wait_s, trials)
 
     def close(self) -> None:
         """End everything."""

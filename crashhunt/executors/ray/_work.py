@@ -22,7 +22,7 @@ from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from crashhunt.base.plain import ErrorData
     from crashhunt.executors.ray._messages import Header, NodeJob, Submitted
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["Work", "unpacked"]
 
 _WHERE_EVERY_S = 0.5  # as often as people can read
+_GATHER_S = 0.05  # in which what ends goes back together, while there is enough to do
 _HEAD = 64  # bytes of a black box that say what is in the rest, most of which is room for more
 _TEXTS = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
 
@@ -51,6 +52,7 @@ class Work:
         self._pool: PoolExecutor | None = None
         self._lock = threading.Lock()
         self._tickets: dict[int, int] = {}
+        self._given_up: list[tuple[int, int]] = []  # greatest number that is not, and first ticket that is not
         self._renamed: list[tuple[str, str]] = []
         self._looked = 0.0
         self._map_sent = False
@@ -89,32 +91,38 @@ class Work:
         return True
 
     def submit(self, trials: Sequence[Submitted]) -> None:
-        """Queue trials."""
+        """Queue trials, but for those that were given up before they came."""
         assert self._pool is not None
         try:
             for ticket, spec in trials:
                 with self._lock:
-                    self._tickets[spec["number"]] = ticket
-                self._pool.submit(TrialSpec.from_json(spec))
+                    if not any(spec["number"] > above and ticket < before for above, before in self._given_up):
+                        self._tickets[spec["number"]] = ticket
+                        self._pool.submit(TrialSpec.from_json(spec))
         except Exception as error:  # nobody looks at what comes of this call; the next `take` tells
             self._broken = CrashhuntError(f"a trial cannot be begun: {type(error).__name__}: {error}")
 
-    def cancel(self, above: int) -> None:
-        """Give up trials whose number is greater."""
+    def cancel(self, above: int, before: int) -> None:
+        """Give up trials whose number is greater than ``above``, and whose ticket is less than ``before``.
+
+        Tickets tell those that were submitted later from those that are late: `take` brings trials beside `submit`.
+        """
         assert self._pool is not None
         with self._lock:
+            self._given_up.append((above, before))
             self._tickets = {number: ticket for number, ticket in self._tickets.items() if number <= above}
-        self._pool.cancel(above=above)
+            self._pool.cancel(above=above)
 
-    def take(self, wait_s: float) -> News:
-        """Return what has happened, waiting so long for a trial to end."""
+    def take(self, wait_s: float, trials: Sequence[Submitted]) -> News:
+        """Queue trials; return what has happened, waiting so long for a trial to end."""
         assert self._pool is not None
+        self.submit(trials)
         ended: list[Ended] = []
         error: ErrorData | None = None
         try:
             if self._broken is not None:
                 raise self._broken
-            for result in self._pool.completed(wait_s):
+            for result in self._completed(wait_s):
                 with self._lock:
                     ticket = self._tickets.pop(result.spec.number, None)
                 if ticket is not None:
@@ -127,6 +135,21 @@ class Work:
             where = {number: _values(header) for number, header in self._pool.where().items()}
         notes = [self._named_as_there(note) for note in self._pool.notes()]
         return News(ended, where, notes, error, self._map() if any(done.files for done in ended) else b"")
+
+    def _completed(self, wait_s: float) -> Iterator[TrialResult]:
+        """Yield what has ended, and what ends soon after it: each call from another machine costs both some time.
+
+        Nobody waits for that: what is kept goes back at once, as does everything where workers may soon be idle.
+        """
+        assert self._pool is not None
+        deadline, urgent = 0.0, False
+        while True:
+            for result in self._pool.completed(wait_s):
+                deadline, urgent = deadline or time.monotonic() + _GATHER_S, urgent or result.kept
+                yield result
+            wait_s = deadline - time.monotonic()
+            if urgent or wait_s <= 0 or 2 * len(self._tickets) < 3 * self._job["slots"]:
+                return
 
     def close(self) -> None:
         """End everything, and leave nothing behind."""
