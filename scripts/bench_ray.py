@@ -177,7 +177,8 @@ def _in_full_swing(executor: Executor, kind: str, first: int, arguments: dict[st
 
 def _spent_by(kind: str) -> float:
     """Seconds of CPU that this process and those of its executor have taken; to Ray belongs the cluster beside it."""
-    bridge, others = [], []
+    bridge: list[int] = []
+    others: list[int] = []
     for pid in _with_descendants(os.getpid())[1:]:
         with contextlib.suppress(OSError):
             is_bridge = b"crashhunt.executors.ray._bridge" in Path(f"/proc/{pid}/cmdline").read_bytes()
