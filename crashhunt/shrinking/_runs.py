@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
+from crashhunt.replays import is_todays
 from crashhunt.triage import signature_of
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Runs:
         self._scratch = scratch
         self._memory = _remembered(memory)
         worker = replace(rerun.worker, scratch=scratch, keep_trials=False)
-        kind = PoolExecutor if _is_todays(rerun) else FreshProcessExecutor
+        kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
         self._executor = kind(worker, parallel=parallel)
         self._next = _FIRST
 
@@ -224,20 +224,3 @@ def _remembered(file: Path) -> dict[str, Ran]:
                 data = json.loads(line)
                 found[data["key"]] = Ran(bool(data["same"]), int(data["steps"]), str(data["digest"]))
     return found
-
-
-def _is_todays(rerun: Rerun) -> bool:
-    """Whether the crashhunt that runs is this one, so that it is told of trials as this one tells its own."""
-    if not rerun.worker.code:
-        return True
-    files = rerun.snapshot.manifest["files"]
-    ours = {name: entry for name, entry in files.items() if f"/{layout.PACKAGE.name}/executors/" in name}
-    return bool(ours) and all(_is_ours(name, entry["size"]) for name, entry in ours.items())
-
-
-def _is_ours(name: str, size: int) -> bool:
-    path = layout.PACKAGE / name.partition(f"/{layout.PACKAGE.name}/")[2]
-    try:
-        return os.stat(path).st_size == size  # noqa: PTH116
-    except OSError:
-        return False
