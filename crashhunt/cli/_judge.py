@@ -27,13 +27,19 @@ def add_judge(commands: Commands) -> None:
         help="find out until when a collision could have been avoided, by running it",
         description="Run the trial of a collision again and again, each time with the agent overruled from another "
         "step on: braking as hard as its vehicle can, or changing lanes and braking, the others reacting as they then "
-        "do. Says until when that avoids it, writes it into crash.json, and from then on show tells it too.",
+        "do. Says until when that avoids it. Then with one thing left out at a time: a decision of the agent's, what "
+        "another vehicle did, the value of an argument; says what the collision hangs on. Writes it into crash.json, "
+        "and from then on show tells it too.",
     )
     add_crash(judge)
     judge.add_argument("--all", action="store_true", help="all collisions of the hunt that have not been judged yet")
     judge.add_argument(
         "--runs", metavar="N", type=integer, default=60, help="the most trials to run for one collision; default: 60"
     )
+    judge.add_argument(
+        "--why", metavar="N", type=integer, default=80,
+        help="the most trials to run for what one collision hangs on; 0: none; default: 80",
+    )  # fmt: skip
     judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
     )
@@ -47,6 +53,8 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
 
     if options.runs < 1:
         raise UsageError(f"--runs is {options.runs}", fix="give at least 1")
+    if options.why < 0:
+        raise UsageError(f"--why is {options.why}", fix="give at least 0 (0: do not ask what it hangs on)")
     if options.parallel < 0:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     if options.all and options.crash:
@@ -93,6 +101,7 @@ def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *,
             bundle,
             ReplayOptions(force=True),
             runs=options.runs,
+            why=options.why,
             parallel=options.parallel or len(os.sched_getaffinity(0)),
             watch=watch,
             stopped=lambda: bool(stops),

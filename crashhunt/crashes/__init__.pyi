@@ -32,3 +32,12 @@ from ._judgement import (
     with_judgement as with_judgement,
 )
 from ._side_effects import refuse_side_effects as refuse_side_effects
+from ._why import (
+    Factor as Factor,
+    FactorData as FactorData,
+    LeftOut as LeftOut,
+    Why as Why,
+    WhyData as WhyData,
+    Without as Without,
+    wilson as wilson,
+)

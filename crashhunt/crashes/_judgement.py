@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from crashhunt.base.integrity import typed
+from crashhunt.crashes._why import why_from
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.crashes._bundle import Bundle
     from crashhunt.crashes._escape import Ending
+    from crashhunt.crashes._why import Why, WhyData
 
 __all__ = ["INTERRUPTED", "Attempt", "AttemptData", "Judgement", "JudgementData", "judgement_of", "with_judgement"]
 
@@ -41,6 +43,7 @@ class JudgementData(TypedDict):
     runs: int
     why_not: str
     attempts: list[AttemptData]
+    why: NotRequired[WhyData]
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +101,12 @@ class Judgement:
     Args:
         attempts: a manoeuvre each.
         why_not: why there is no answer, or not a whole one; empty where there is.
+        why: what the collision hangs on; None where nobody asked.
     """
 
     attempts: tuple[Attempt, ...] = ()
     why_not: str = ""
+    why: Why | None = None
 
     @property
     def runs(self) -> int:
@@ -126,7 +131,7 @@ class Judgement:
     def to_json(self) -> JudgementData:
         """Return plain data."""
         best = self.best
-        return {
+        found: JudgementData = {
             "avoidable": self.avoidable,
             "manoeuvre": best.manoeuvre if best else "",
             "last_step": best.last_step if best else None,
@@ -134,6 +139,9 @@ class Judgement:
             "why_not": self.why_not,
             "attempts": [attempt.to_json() for attempt in self.attempts],
         }
+        if self.why is not None:
+            found["why"] = self.why.to_json()
+        return found
 
 
 def judgement_of(bundle: Bundle) -> Judgement | None:
@@ -145,7 +153,7 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
             typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
             endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
             attempts.append(Attempt(each["manoeuvre"], bundle.result.steps, endings, each["deceleration"]))
-        return Judgement(tuple(attempts), str(data.get("why_not", "")))
+        return Judgement(tuple(attempts), str(data.get("why_not", "")), why_from(data.get("why")))
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 

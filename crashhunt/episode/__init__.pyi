@@ -3,7 +3,7 @@ from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
 from ._failures import failure_of as failure_of, words_of as words_of
 from ._nearness import Nearness as Nearness
 from ._observer import Observer as Observer
-from ._overruled import Braking as Braking
+from ._overruled import Braking as Braking, Keeping as Keeping, overruled_agent as overruled_agent
 from ._parts import Parts as Parts, require_origin as require_origin, seal as seal
 from ._probes import PROBED as PROBED, Probed as Probed, Prober as Prober
 from ._recorder import Recorder as Recorder

@@ -8,15 +8,15 @@ decides.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.faculties import offers
-from crashhunt.simulators import Disturbs, HasMeanings, NamesObservations
-from crashhunt.trial import OF_AGENT, Disturbance, in_effect, steps_of
+from crashhunt.simulators import Disturbs, HasMeanings, HoldsBack, NamesObservations
+from crashhunt.trial import HELD, OF_AGENT, Disturbance, in_effect, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -77,8 +77,10 @@ class Disturbed:
         self._tells = tells
         self._dt = simulator.step_length_s
         self._traffic = simulator if offers(simulator, Disturbs) else None
+        self._holding = simulator if offers(simulator, HoldsBack) else None
         known = tuple(self._traffic.disturbing_kinds) if self._traffic is not None else ()
-        odd = next((one.what for one in spec.disturbances if one.what not in (*known, *OF_AGENT)), None)
+        able = (*known, *OF_AGENT, *(HELD if self._holding is not None else ()))
+        odd = next((one.what for one in spec.disturbances if one.what not in able), None)
         if odd is not None:
             raise InvalidEpisodeError(
                 f"the simulator cannot do the disturbance {odd!r}", fix=f"it can do {', '.join((*known, *OF_AGENT))}"
@@ -156,17 +158,29 @@ class Disturbed:
 
     def _begin(self, planned: Disturbance) -> None:
         """Have a vehicle err from this step on, where there is one that can."""
-        traffic, last = self._traffic, self._step + self._steps(planned.how_long) - 1
-        assert traffic is not None
-        vehicle = traffic.whom(planned) if planned.agent in self._simulator.agents else ""
+        last = self._step + self._steps(planned.how_long) - 1
+        vehicle = self._whom(planned)
         errs = None
         if vehicle and all(going.vehicle != vehicle for going in self._going):  # one at a time
-            errs = traffic.disturb(vehicle, planned)
+            errs = self._erring(vehicle, planned)
         if errs is None:
-            self._tell(planned)
+            self._tell(replace(planned, vehicle=""))
             return
         self._going.append(_Going(last, vehicle, planned.what, errs))
         self._tell(planned.took_place(vehicle, errs.how_strong))
+
+    def _whom(self, planned: Disturbance) -> str:
+        if planned.what in HELD:
+            return planned.vehicle
+        assert self._traffic is not None
+        return self._traffic.whom(planned) if planned.agent in self._simulator.agents else ""
+
+    def _erring(self, vehicle: str, planned: Disturbance) -> Disturbing | None:
+        if planned.what in HELD:
+            assert self._holding is not None
+            return self._holding.hold(vehicle, planned.what)
+        assert self._traffic is not None
+        return self._traffic.disturb(vehicle, planned)
 
     def _tell(self, disturbance: Disturbance) -> None:
         self._told.append(disturbance)

@@ -1,4 +1,4 @@
-"""An agent that is overruled from a step on: it brakes, or changes lanes and brakes."""
+"""An agent that is overruled from a step on: it brakes, changes lanes and brakes, or keeps its lane or its speed."""
 
 from __future__ import annotations
 
@@ -11,9 +11,29 @@ from crashhunt.simulators import BrakesFully, HasMeanings
 
 if TYPE_CHECKING:
     from crashhunt.agents import Agent
-    from crashhunt.simulators import Simulator
+    from crashhunt.simulators import ActionForm, Simulator
+    from crashhunt.trial import Overruled
 
-__all__ = ["Braking"]
+__all__ = ["Braking", "Keeping", "overruled_agent"]
+
+_LANES = ("LANE_LEFT", "LANE_RIGHT")
+_SPEEDS = ("FASTER", "SLOWER")
+
+
+def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
+    """Return an agent that drives as another one up to a step.
+
+    Args:
+        driver: the other one.
+        simulator: which has been reset.
+        overruled: how, and from when on.
+
+    Raises:
+        InvalidEpisodeError: the simulator does not know how.
+    """
+    if overruled.keeps:
+        return Keeping(driver, simulator, overruled.agent, overruled.after, overruled.keeps)
+    return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)
 
 
 class Braking:
@@ -55,6 +75,65 @@ class Braking:
         """Close the driver."""
         if offers(self._driver, Closes):
             self._driver.close()
+
+
+class Keeping:
+    """Lets an agent drive, and from a step on keeps it from changing lanes, or from changing its speed.
+
+    Args:
+        driver: the agent.
+        simulator: which knows how fast the vehicle is.
+        agent: the vehicle.
+        after: the step after which it is kept from that.
+        keeps: ``lane`` keeps it from changing lanes, ``speed`` holds its speed.
+
+    Raises:
+        InvalidEpisodeError: nobody knows what its actions say about lanes and speeds.
+    """
+
+    def __init__(self, driver: Agent, simulator: Simulator, agent: str, after: int, keeps: str) -> None:
+        form = simulator.actions[agent]
+        self._idle = _idle(form)
+        if self._idle is None and tuple(form.names) != ("target_speed", "lane_change"):
+            raise InvalidEpisodeError(f"nobody knows what the actions of {agent} say about lanes and speeds")
+        self._driver, self._simulator, self._agent, self._form = driver, simulator, agent, form
+        self._after, self._stays = after, keeps == "lane"
+        self._step, self._speed = 0, 0.0
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode."""
+        self._step = 0
+        self._driver.reset(seed)
+
+    def act(self, observation: object) -> object:
+        """Return the driver's action, without what it is kept from."""
+        step, self._step = self._step, self._step + 1
+        if step == self._after:
+            scene = self._simulator.scene()
+            self._speed = max(0.0, float(scene.speeds[scene.roster.index[self._agent]]))
+        action = self._driver.act(observation)
+        return action if step < self._after else self._kept(action)
+
+    def close(self) -> None:
+        """Close the driver."""
+        if offers(self._driver, Closes):
+            self._driver.close()
+
+    def _kept(self, action: object) -> object:
+        encoded = self._form.encode(action)
+        if self._idle is None:
+            speed, change = encoded.tolist()
+            return (speed, 0) if self._stays else (self._speed, int(change))
+        space = self._form.space
+        assert offers(space, HasMeanings)
+        word = space.meanings[int(encoded[0])]
+        return self._idle if word in (_LANES if self._stays else _SPEEDS) else action
+
+
+def _idle(form: ActionForm) -> int | None:
+    """The action of doing nothing; None where there is none."""
+    space = form.space
+    return tuple(space.meanings).index("IDLE") if offers(space, HasMeanings) and "IDLE" in space.meanings else None
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:

@@ -25,12 +25,12 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import (
-    Braking,
     Brancher,
     Parts,
     Prober,
     WorkerSettings,
     generators,
+    overruled_agent,
     run_episode,
     scratch_of,
     set_generators,
@@ -275,9 +275,7 @@ class Worker:
         self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
     ) -> Agent:
         made = self._parts.agent(agent, simulator, arguments)
-        return (
-            Braking(made, simulator, agent, overruled.after, overruled.manoeuvre) if agent == overruled.agent else made
-        )
+        return overruled_agent(made, simulator, overruled) if agent == overruled.agent else made
 
     def _draw_map(self, simulator: Simulator, kept: Path | None) -> None:
         """Write the map down, once for all workers; for a trial that is kept, where an argument has made it another."""

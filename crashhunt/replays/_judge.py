@@ -1,23 +1,18 @@
-"""Judging a collision: its trial is run again with the agent overruled from many a step on, to see what avoids it."""
+"""Judging a collision: its trial is run again, overruled or with something left out, to see what avoids it."""
 
 from __future__ import annotations
 
-import itertools
-import shutil
 import tempfile
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError, UsageError
+from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing
-from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor
-from crashhunt.recording import Recording, read_black_box
 from crashhunt.replays._avoiding import CannotError, Search, Tried
 from crashhunt.replays._prepare import ReplayOptions, prepare
+from crashhunt.replays._warm import Reruns, StoppedError
+from crashhunt.replays._why import find_why
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -25,11 +20,12 @@ if TYPE_CHECKING:
 
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Judgement
+    from crashhunt.recording import Recording
+    from crashhunt.replays._warm import Ended
     from crashhunt.trial import TrialResult
 
 __all__ = ["judge"]
 
-_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 _GUESS = 4.5  # m/s², to begin the search somewhere
 
 
@@ -38,21 +34,23 @@ def judge(
     options: ReplayOptions | None = None,
     *,
     runs: int = 60,
+    why: int = 0,
     parallel: int = 1,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Judgement:
-    """Return until when a collision could have been avoided, and how, by running its trial again.
+    """Return until when a collision could have been avoided, how, and what it hangs on, by running its trial again.
 
     The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes; the
     others react as they then do. The search begins where a calculation guesses it, bisects, and then runs the steps
     after the last one that helped, as many as it may: that it is too late after one step does not say that it is too
-    late after the next.
+    late after the next. What it hangs on is found by leaving one thing out at a time.
 
     Args:
         bundle: of a collision.
         options: of the replays; only whose code drives, and whether it is trusted.
-        runs: the most trials to run; each is one process.
+        runs: the most trials to run to avoid it.
+        why: the most trials to run for what it hangs on; 0 leaves that out.
         parallel: how many at a time.
         watch: called with how many have been run, and the most.
         stopped: asked now and then whether to give up; what has been found by then is returned.
@@ -71,26 +69,25 @@ def judge(
     rerun = prepare(bundle, options or ReplayOptions())
     guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_GUESS)
     with tempfile.TemporaryDirectory(prefix="crashhunt-judge-") as folder:
-        executor = FreshProcessExecutor(replace(rerun.worker, scratch=Path(folder)), parallel=parallel)
-        trials = _Trials(result, rerun.recorded, executor, Path(folder), stopped, lambda done: _tell(watch, done, runs))
+        reruns = Reruns(rerun, Path(folder), parallel=parallel, stopped=stopped)
+
+        def tell(done: int) -> None:
+            if watch is not None:
+                watch(done, runs + why)
+
+        trials = _Trials(result, rerun.recorded, reruns, tell)
         start = result.steps - 1 if guess is None else guess
         search = Search(result.steps, start, trials.run, runs=runs, parallel=parallel)
+        found = None
         try:
             search.all()
-        except _StoppedError:
+            if why > 0:
+                found = find_why(rerun, reruns, most=why, tell=lambda done: tell(trials.done + done))
+        except StoppedError:
             search.why_not = INTERRUPTED
         finally:
-            executor.close()
-    return search.judgement()
-
-
-def _tell(watch: Watch | None, done: int, most: int) -> None:
-    if watch is not None:
-        watch(done, most)
-
-
-class _StoppedError(Exception):
-    pass
+            reruns.close()
+    return replace(search.judgement(), why=found)
 
 
 @dataclass(slots=True)
@@ -99,12 +96,9 @@ class _Trials:
 
     result: TrialResult
     recorded: Recording
-    executor: FreshProcessExecutor
-    scratch: Path
-    stopped: Callable[[], bool]
+    reruns: Reruns
     tell: Callable[[int], None]
     done: int = 0
-    _numbers: itertools.count[int] = field(default_factory=lambda: itertools.count(1))  # folders of their own
 
     def run(self, manoeuvre: str, steps: list[int]) -> Iterator[Tried]:
         """Yield what comes of a manoeuvre after each of some steps, as it ends.
@@ -114,42 +108,26 @@ class _Trials:
             CrashhuntError: the trials could not be run.
         """
         made = [overruled_trial(self.result, self.recorded, step, None, manoeuvre) for step in steps]
-        asked = {number: spec for spec, number in zip(made, self._numbers, strict=False)}
         try:
-            for number, spec in asked.items():
-                self.executor.submit(replace(spec, number=number))
-            while asked:
-                for result in self._completed(manoeuvre):
-                    overruled = asked.pop(result.spec.number).overruled
-                    assert overruled is not None
-                    yield self._tried(overruled.after, result)
-                if self.stopped():
-                    raise _StoppedError
-        finally:
-            self.executor.cancel()  # where enough is known before all have ended
-
-    def _completed(self, manoeuvre: str) -> list[TrialResult]:
-        try:
-            return list(self.executor.completed(_LOOK_EVERY_S))
+            for ended in self.reruns.run(made):
+                yield self._tried(steps[ended.place], ended)
         except RecorderError:
+            raise
+        except CannotError:
             raise
         except CrashhuntError as error:
             if manoeuvre == "brake":
                 raise
             raise CannotError(str(error)) from error  # the crashhunt of an older snapshot knows braking only
 
-    def _tried(self, step: int, result: TrialResult) -> Tried:
+    def _tried(self, step: int, ended: Ended) -> Tried:
+        result, recording = ended.result, ended.recording
         if result.outcome is Outcome.INVALID:
             raise CannotError(result.failure.message if result.failure else "its trial could not be set up")
         self.done += 1
         self.tell(self.done)
         assert self.result.collision is not None
-        folder = scratch_of(self.scratch, result.spec.number)
-        try:
-            with suppress(BundleError):  # its process died
-                recording = Recording(read_black_box(folder / layout.BLACK_BOX))
-                ending = ending_of(self.result, self.recorded, step, result, recording)
-                return Tried(step, ending, slowing(self.result.collision.agent, step, result, recording))
+        if recording is None:
             return Tried(step, "unclear")
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        ending = ending_of(self.result, self.recorded, step, result, recording)
+        return Tried(step, ending, slowing(self.result.collision.agent, step, result, recording))

@@ -13,6 +13,7 @@ from crashhunt.report._events import about_events
 from crashhunt.report._judgement import about_judgement
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.report._why import about_why
 from crashhunt.triage import fault_of
 
 if TYPE_CHECKING:
@@ -228,7 +229,10 @@ class Story:
 
     def about_judgement(self) -> list[str]:
         """Return until when it could have been avoided, as `judge` has found out by running it."""
-        return about_judgement(self.judgement, self._ago) if self.judgement is not None else []
+        if self.judgement is None:
+            return []
+        why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
+        return [*about_judgement(self.judgement, self._ago), *why]
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:
@@ -244,6 +248,9 @@ class Story:
 
     def _ago(self, step: int) -> str:
         return f"{self._end_s - self.recording.scene(step).time_s:.1f} s before, after step {step}"
+
+    def _at(self, step: int) -> str:
+        return f"{self.recording.scene(min(step, self.recording.steps)).time_s:.1f} s"
 
     @property
     def _end_s(self) -> float:

@@ -17,6 +17,7 @@ from ._protocol import (
     HasMap as HasMap,
     HasMeanings as HasMeanings,
     HasWindow as HasWindow,
+    HoldsBack as HoldsBack,
     Info as Info,
     LeavesOut as LeavesOut,
     NamesDanger as NamesDanger,

@@ -28,6 +28,7 @@ __all__ = [
     "HasMap",
     "HasMeanings",
     "HasWindow",
+    "HoldsBack",
     "Info",
     "LeavesOut",
     "NamesDanger",
@@ -101,7 +102,8 @@ class Simulator(Protocol):
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
     `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
-    `LeavesOut` and `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers it.
+    `HoldsBack`, `LeavesOut` and `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers
+    it.
     """
 
     @property
@@ -275,6 +277,19 @@ class Disturbs(Protocol):
         """
 
 
+class HoldsBack(Protocol):
+    """A simulator that can keep one of the others from doing something, to see what hangs on it."""
+
+    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+        """Keep a vehicle from something, from the next step on; None where that cannot be.
+
+        Args:
+            vehicle: its name; it may not be there, and is none of the agents'.
+            what: one of `HELD`. ``keep_speed`` holds the speed whoever is in its way, ``keep_lane`` the lane, and
+                ``gone`` takes it off the road for good.
+        """
+
+
 class LeavesOut(Protocol):
     """A simulator that can leave others than the agents out of an episode, by name."""
 
@@ -308,6 +323,7 @@ FACULTIES: tuple[type, ...] = (
     HasWindow,
     BrakesFully,
     Disturbs,
+    HoldsBack,
     LeavesOut,
     Tidies,
 )

@@ -140,6 +140,14 @@ class ToySimulator:
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
+    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+        """Hold the leader to its speed; there is but one lane, and it stays on it."""
+        return _Steady(self, vehicle) if vehicle == _LEADER and what == "keep_speed" else None
+
+    def keep_speed(self, vehicle: str) -> None:
+        """Have a vehicle go on at its speed in the next step."""
+        self._disturbed[vehicle] = self._v[vehicle]
+
     def brake(self, vehicle: str, deceleration: float) -> None:
         """Have a vehicle brake in the next step, in m/s²."""
         self._disturbed[vehicle] = max(0.0, self._v[vehicle] - deceleration * self.step_length_s)
@@ -222,6 +230,25 @@ class _Braking:
     def keep(self) -> None:
         """Brake in the next step as well."""
         self._toy.brake(self._vehicle, self.how_strong)
+
+    def end(self) -> None:
+        """Drive by itself again."""
+        self._toy.let_go(self._vehicle)
+
+
+class _Steady:
+    """A vehicle that goes on at its speed."""
+
+    how_strong = 1.0
+
+    def __init__(self, toy: ToySimulator, vehicle: str) -> None:
+        self._toy = toy
+        self._vehicle = vehicle
+        self.keep()
+
+    def keep(self) -> None:
+        """Go on so in the next step as well."""
+        self._toy.keep_speed(self._vehicle)
 
     def end(self) -> None:
         """Drive by itself again."""

@@ -6,4 +6,5 @@ from ._groups import (
     group_crashes as group_crashes,
     groups_of as groups_of,
 )
+from ._lanes import LaneMap as LaneMap
 from ._signature import Signature as Signature, signature_of as signature_of

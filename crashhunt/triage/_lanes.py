@@ -23,6 +23,7 @@ _ALONG = math.radians(30)  # a vehicle within so much of a lane's direction driv
 _CROSSES = math.radians(30)  # lanes that differ by more cross each other, where they lie over each other
 _MOVED_M = 0.4  # sideways; less is drifting within a lane
 _OVER_M = 0.1
+_MOVES_M = 0.01  # sideways in a step; who moves less does not change lanes yet
 _END_M = 0.5  # who is nearer to the end of a lane leaves it ahead, not sideways
 
 
@@ -116,6 +117,27 @@ class LaneMap:
             ),
             None,
         )
+
+    def change_began(self, scenes: Sequence[Scene], actor: str) -> int | None:
+        """Return the place of the scene after which an actor began its last lane change; None where it made none.
+
+        One that is not complete in the end counts as well.
+        """
+        poses = _poses(scenes, actor)
+        left = self.left_sideways(scenes, actor)
+        if left is None and not self.reaches_over(scenes, actor):
+            return None
+        places = [place for place, _ in poses]
+        end = places.index(left) if left is not None else len(places) - 1
+        lane = next((found for _, pose in reversed(poses[:end]) if (found := self._driven(pose)) is not None), None)
+        if lane is None:
+            return None
+        asides = [lane.place(point).aside_m for _, (point, _) in poses[: end + 1]]
+        way = math.copysign(1.0, asides[end])
+        begin = end
+        while begin > 0 and (asides[begin] - asides[begin - 1]) * way > _MOVES_M:
+            begin -= 1
+        return places[begin]
 
     def reaches_over(self, scenes: Sequence[Scene], actor: str) -> bool:
         """Whether an actor in the end reaches into the lane beside its own, having moved towards it."""

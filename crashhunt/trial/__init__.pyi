@@ -11,6 +11,7 @@ from ._data import (
 )
 from ._disturbance import (
     CELLS as CELLS,
+    HELD as HELD,
     KINDS as KINDS,
     OF_AGENT as OF_AGENT,
     Disturbance as Disturbance,

@@ -34,6 +34,7 @@ class OverruledData(TypedDict):
     agent: str
     after: int
     manoeuvre: NotRequired[str]
+    keeps: NotRequired[str]
 
 
 class DisturbanceData(TypedDict):

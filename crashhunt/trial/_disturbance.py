@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial._data import DisturbanceData
 
-__all__ = ["CELLS", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of"]
+__all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of"]
 
 
 _PLACES = {
@@ -62,6 +62,13 @@ KINDS: Mapping[str, Kind] = {
 }  # fmt: skip
 """The kinds that come with crashhunt, by name; a simulator of somebody's own may know more."""
 
+HELD: Mapping[str, Kind] = {
+    "keep_speed": Kind("", "{vehicle} is held to its speed for {long:g} s"),
+    "keep_lane": Kind("", "{vehicle} is held in its lane for {long:g} s"),
+    "gone": Kind("", "{vehicle} is taken off the road"),
+}
+"""What another vehicle is kept from, to see what hangs on it: no hunt draws these, and the vehicle is named."""
+
 OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 """Those of them that need nothing of the simulator."""
 
@@ -78,11 +85,12 @@ class Disturbance:
     Args:
         step: in which it begins, from 1.
         who: the place in the grid around the agent, one of `CELLS`, in which the vehicle is when it begins.
-        what: the kind; of those that come with crashhunt, one of `KINDS`.
+        what: the kind; of those that come with crashhunt, one of `KINDS` or `HELD`.
         how_strong: in the unit of its kind: m/s² of a braking, s of a delay, a share of a speed or of what is seen.
         how_long: in s of simulation time.
         agent: around which of the controlled vehicles.
-        vehicle: who turned out to be meant; empty of what is planned, and where nobody was there.
+        vehicle: who turned out to be meant; empty of what is planned, and where nobody was there. Of what a vehicle
+            is kept from (`HELD`), who is meant, from the beginning.
     """
 
     step: int
@@ -107,7 +115,7 @@ class Disturbance:
         """What happens, for people; such as ``main.35 brakes with 4 m/s² for 2 s``."""
         agent = self.agent or "the agent"
         vehicle = self.vehicle or (agent if self.who == "itself" else f"whoever is {self.place}")
-        kind = KINDS.get(self.what)
+        kind = KINDS.get(self.what) or HELD.get(self.what)
         if kind is None:
             return f"{vehicle}: {self.what} {self.how_strong:g} for {self.how_long:g} s"
         always, _, where_strong = kind.words.partition("|")

@@ -24,23 +24,28 @@ EVERYBODY = "*"
 
 @dataclass(frozen=True, slots=True)
 class Overruled:
-    """A trial in which the code of an agent is no longer asked: its vehicle brakes as hard as it can.
+    """A trial in which an agent does not do as its code says: its vehicle brakes as hard as it can, or holds still.
 
     Args:
         agent: whose.
         after: the step after which it brakes; its first decision that is not its own is the one of the next step.
         manoeuvre: ``brake``; ``left`` or ``right`` also changes lanes to that side, in that first decision.
+        keeps: ``lane`` or ``speed``: then the agent is asked on, and only what it says about that is passed over: the
+            vehicle stays in its lane, or holds the speed that it has. There is no manoeuvre then.
     """
 
     agent: str
     after: int
     manoeuvre: str = field(default="brake", metadata=ESSENTIAL)
+    keeps: str = field(default="", metadata=ESSENTIAL)
 
     def to_json(self) -> OverruledData:
         """Return plain data; what is at its default is left out."""
         plain: OverruledData = {"agent": self.agent, "after": self.after}
         if self.manoeuvre != "brake":
             plain["manoeuvre"] = self.manoeuvre
+        if self.keeps:
+            plain["keeps"] = self.keeps
         return plain
 
 

@@ -19,7 +19,7 @@ def test_what_is_found_is_kept_and_told(toy):
     (group,) = toy.crashhunt("crashes", "h", "--json").json["groups"]
     assert (group["fault"], group["avoidable"]) == ("ego", True)  # the hunt has run the brakes
     before = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
-    found = toy.crashhunt("judge", "h", "--runs", "9", "--parallel", "2", "--json")
+    found = toy.crashhunt("judge", "h", "--runs", "9", "--why", "12", "--parallel", "2", "--json")
     (judged,) = found.json["judged"]
     brake = judged["attempts"][0]
     assert judged["avoidable"] is True
@@ -27,6 +27,16 @@ def test_what_is_found_is_kept_and_told(toy):
     assert brake["manoeuvre"] == "brake"
     assert brake["deceleration"] == pytest.approx(8.0)
     assert "by braking (at up to 8.0 m/s²); that was run" in found.err
+    why = {(factor["kind"], factor["name"], factor["what"]): factor for factor in judged["why"]["factors"]}
+    assert (judged["why"]["runs"], judged["why"]["why_not"]) == (12, "")
+    sped_up = why["agent", "ego", "sped up"]
+    assert (sped_up["step"], sped_up["same"], sped_up["needed"]) == (0, 0, True)  # it holds 14 m/s, behind 10
+    seeds = why["seed", "seed", "drawn"]
+    assert seeds["was"] == before["seed"]
+    assert seeds["clear"] == len({run["given"] for run in seeds["runs"]} - {before["seed"]}) >= 3
+    assert seeds["interval"][0] < seeds["crashed"] / seeds["clear"] <= seeds["interval"][1]
+    assert why["other", "leader", "there"]["clear"] == 0  # the toy cannot take it away, and so it is silent
+    assert "ego sped up at 0.0 s; without that (it keeps its speed): no crash" in found.err
     after = json.loads(next((toy.folder / "h").glob("crashes/*/crash.json")).read_text())
     assert {name: value for name, value in after.items() if name not in ("judged", "integrity")} == {
         name: value for name, value in before.items() if name != "integrity"
@@ -47,6 +57,7 @@ def test_what_is_found_is_kept_and_told(toy):
     ("words", "said"),
     [
         (("--runs", "0"), "--runs is 0"),
+        (("--why", "-1"), "--why is -1"),
         (("--parallel", "-1"), "--parallel is -1"),
         (("--all", "--crash", "1"), "contradict"),
     ],

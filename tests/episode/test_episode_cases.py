@@ -11,11 +11,11 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.errors import InvalidEpisodeError, RecorderError, SimulatorError
-from crashhunt.episode import Braking, run_episode, words_of
+from crashhunt.episode import Braking, overruled_agent, run_episode, words_of
 from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
-from crashhunt.simulators import FullBraking, SpeedAndLaneChange
-from crashhunt.trial import CRASHES, Collision, Outcome, TrialSpec
+from crashhunt.simulators import FullBraking, MetaAction, SpeedAndLaneChange
+from crashhunt.trial import CRASHES, Collision, Outcome, Overruled, TrialSpec
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 EGO, SECOND, OTHER = (Actor(name, "passenger", 5.0, 2.0) for name in ("ego", "second", "other"))
@@ -502,3 +502,29 @@ def test_braking_begins_after_a_step():
     for simulator, agent in ((Car(), "second"), (Scripted(), "ego")):
         with pytest.raises(InvalidEpisodeError, match=f"nobody knows how {agent} brakes"):
             Braking(Driver(), simulator, agent, 2)
+
+
+@pytest.mark.parametrize(
+    ("keeps", "form", "decided", "done"),
+    [
+        ("lane", SpeedAndLaneChange(), (30.0, -1), (30.0, 0)),
+        ("speed", SpeedAndLaneChange(), (30.0, -1), (17.0, -1)),
+        ("lane", MetaAction(), 0, 1),
+        ("lane", MetaAction(), 3, 3),
+        ("speed", MetaAction(), 3, 1),
+        ("speed", MetaAction(), 2, 2),
+    ],
+)
+def test_an_agent_is_kept_from_one_thing_after_a_step(keeps, form, decided, done):
+    scene = Scene(0.0, Roster((OTHER, EGO)), [(0.0, 0.0), (9.0, 0.0)], [0.0, 0.0], [3.0, 17.0])
+    car = SimpleNamespace(actions={"ego": form}, scene=lambda: scene)
+    driver = SimpleNamespace(reset=lambda seed: None, act=lambda observation: decided)
+    agent = overruled_agent(driver, car, Overruled("ego", 2, keeps=keeps))
+    agent.reset(1)
+    assert [agent.act("seen") for _ in range(4)] == [decided, decided, done, done]
+
+
+def test_what_nobody_understands_keeps_nobody_from_anything():
+    car = SimpleNamespace(actions={"ego": SimpleNamespace(names=(), space=spaces.Discrete(5))})
+    with pytest.raises(InvalidEpisodeError, match="nobody knows what the actions of ego say"):
+        overruled_agent(SimpleNamespace(), car, Overruled("ego", 2, keeps="lane"))

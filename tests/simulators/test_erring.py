@@ -268,6 +268,47 @@ def test_somebody_ignores_the_red_light(drive):
     assert where[1] in ("north", "gone")
 
 
+def held(step, what, vehicle, long=99.0):
+    return Disturbance(step, "itself", what, 0.0, long, "ego", vehicle)
+
+
+SLOW = """<vType id="slow" sigma="0" maxSpeed="2"/><vType id="eager" sigma="0" speedDev="0" lcSpeedGain="{}"/>
+<vehicle id="eager" type="eager" route="across" depart="0" departPos="60" departLane="0" departSpeed="8"/>
+<vehicle id="slow" type="slow" route="across" depart="0" departPos="{}" departLane="0" departSpeed="2"/>"""
+
+
+def test_who_is_held_to_its_speed_heeds_nobody_and_then_drives_by_itself_again(drive):
+    speeds = []
+    for disturbances in ((), (held(6, "keep_speed", "eager", 2.0),)):
+        episode, watch = drive(*disturbances, traffic=SLOW.format(0, 90))
+        advance(episode, 27)
+        speeds.append(np.array(watch.speeds("eager")))
+    assert (speeds[1][:6] == speeds[0][:6]).all()
+    assert min(speeds[0][6:26]) < speeds[0][5] - 1.0
+    assert (speeds[1][5:26] == speeds[1][5]).all()
+    assert speeds[1][26] < speeds[1][5] - 0.1
+    assert drives_by_itself("eager")
+
+
+def test_who_is_held_in_its_lane_does_not_change_it(drive):
+    lanes = []
+    for disturbances in ((), (held(2, "keep_lane", "eager"),)):
+        episode, _ = drive(*disturbances, traffic=SLOW.format(5, 120))
+        advance(episode, 45)
+        lanes.append(libsumo.vehicle.getLaneIndex("eager"))
+    assert lanes == [1, 0]
+
+
+def test_who_is_taken_off_the_road_is_gone_from_that_step_on(drive):
+    episode, watch = drive(held(6, "gone", "lead"), held(9, "gone", "nobody"))
+    advance(episode, 12)
+    there = ["lead" in scene.roster.index for scene in watch.scenes]
+    assert there == [True] * 6 + [False] * 7
+    assert all(len(scene.points) == len(scene.roster.actors) for scene in watch.scenes)
+    assert [one.vehicle for one in watch.told] == ["lead", ""]
+    assert "follow" in watch.scenes[-1].roster.index
+
+
 def test_sumo_offers_it():
     assert all(hasattr(SumoSimulator, name) for name in ("disturbing_kinds", "whom", "disturb"))
     assert Disturbs is not None

@@ -168,3 +168,26 @@ def test_a_hunt_with_disturbances(shell):
             "run", "h2", "1", "2", "20", "--scenario", "highway", "--disturb", "ignore_priority=1", expect=2
         ).err
     )
+
+
+@pytest.mark.parametrize("accelerate", [True, False])
+def test_others_are_held_to_their_speed_and_lane_or_taken_off_the_road(begin, accelerate):
+    names = [f"vehicle.{number}" for number in (1, 2, 3)]
+    kept = [
+        Disturbance(6, "itself", what, 0.0, 99.0, "ego", name)
+        for what, name in zip(("keep_speed", "keep_lane", "gone"), names, strict=True)
+    ]
+    episode, idle = begin(*kept, Disturbance(7, "itself", "gone", 0.0, 9.0, "ego", "vehicle.99"), accelerate=accelerate)
+    speeds, there = [], []
+    for step in range(12):
+        speeds.append(episode.scene.speeds[episode.scene.roster.index[names[0]]])
+        there.append(names[2] in episode.scene.roster.index)
+        if step == 8:
+            vehicle = episode.simulator._env.road.vehicles[2]
+            assert (vehicle.enable_lane_change, vehicle.target_lane_index) == (False, vehicle.lane_index)
+        assert episode.step() is None
+    assert speeds[5:] == pytest.approx([speeds[5]] * 7)
+    assert there == [True] * 6 + [False] * 6
+    assert sorted((one.what, one.vehicle) for one in idle.told) == [
+        ("gone", ""), ("gone", names[2]), ("keep_lane", names[1]), ("keep_speed", names[0]),
+    ]  # fmt: skip

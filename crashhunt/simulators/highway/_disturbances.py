@@ -79,6 +79,18 @@ class HighwayDisturbances:
         self._erring.append(errs)
         return errs
 
+    def hold(self, vehicle: Any, what: str) -> Disturbing | None:
+        """Keep a vehicle from something until that ends; None of a thing that drives nowhere."""
+        if not isinstance(vehicle, IDMVehicle):
+            return None
+        kind = {"keep_speed": _KeepsSpeed, "keep_lane": _KeepsLane}.get(what)
+        if kind is None:
+            self._road.vehicles.remove(vehicle)
+            return _Errs(vehicle, lambda _: None, 1.0)
+        errs: _Errs = kind(vehicle, self._let_go, 1.0)
+        self._erring.append(errs)
+        return errs
+
     def _let_go(self, errs: _Errs) -> None:
         self._erring.remove(errs)
 
@@ -166,6 +178,31 @@ class _CutsIn(_Errs):
             if other is not None and abs(vehicle.lane_distance_to(other)) <= room:
                 return
         vehicle.target_lane_index = self._lane
+
+    def end(self) -> None:
+        self.vehicle.enable_lane_change = self._before
+        super().end()
+
+
+class _KeepsSpeed(_Errs):
+    """Drives on at its speed, whoever is in its way."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+        super().__init__(vehicle, let_go, how_strong)
+        self._speed = float(vehicle.speed)
+
+    def overrule(self, dt: float) -> None:
+        self.vehicle.action["acceleration"] = (self._speed - float(self.vehicle.speed)) / dt
+
+
+class _KeepsLane(_Errs):
+    """Does not leave the lane that it is in."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+        super().__init__(vehicle, let_go, how_strong)
+        self._before = vehicle.enable_lane_change
+        vehicle.enable_lane_change = False
+        vehicle.target_lane_index = vehicle.lane_index
 
     def end(self) -> None:
         self.vehicle.enable_lane_change = self._before

@@ -184,6 +184,12 @@ class HighwaySimulator:
         thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
+    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+        """Keep a vehicle from something until that ends."""
+        present = {id(thing) for thing in self._env.road.vehicles}
+        found = (thing for thing, actor in self._known.values() if actor.id == vehicle and id(thing) in present)
+        return self._disturbances.hold(next(found, None), what)
+
     def tidy(self) -> None:
         """Undo what the environment has changed in classes."""
         restore_classes()

@@ -172,11 +172,19 @@ class Sight:
             near = _near(self._all_persons, list(map(sumo.person_getPosition, self._all_persons)), eyes)
             persons = tuple([person for person in near if not sumo.person_getVehicle(person)])
         if ids != self._ids or persons != self._persons:
-            self._see(ids)
             self._persons = persons
-            self._roster = Roster((*map(self._actor, ids), *map(self._person, persons)))
-            actors = self._roster.actors[: len(ids)]
-            self._long = [row for row, actor in enumerate(actors) if is_articulated(actor)]
+            self._enlist(ids)
+
+    def lose(self, vehicle: str) -> None:
+        """Take note that somebody has been taken off the road, which SUMO tells of only after the next step."""
+        if vehicle in self._ids:
+            self._enlist(tuple(name for name in self._ids if name != vehicle))
+
+    def _enlist(self, ids: tuple[str, ...]) -> None:
+        self._see(ids)
+        self._roster = Roster((*map(self._actor, ids), *map(self._person, self._persons)))
+        actors = self._roster.actors[: len(ids)]
+        self._long = [row for row, actor in enumerate(actors) if is_articulated(actor)]
 
     def _in_sight(self) -> tuple[tuple[str, ...], list[tuple[float, float]]]:
         """The vehicles in sight, and where the controlled ones are that are there."""

@@ -21,6 +21,7 @@ from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
+from crashhunt.simulators.sumo._holding import held_back
 from crashhunt.simulators.sumo._left_out import LeftOut
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
@@ -218,6 +219,13 @@ class SumoSimulator:
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return self._disturbances.disturb(vehicle, disturbance)
+
+    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+        """Keep a vehicle from something until that ends; for a person there is nothing."""
+        found = held_back(vehicle, what)
+        if what == "gone":
+            self._sight.lose(vehicle)
+        return found
 
     @property
     def entered(self) -> list[str]:

@@ -1,0 +1,102 @@
+"""What a collision hangs on, in words: only what was run is said."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.crashes import Factor, Why
+    from crashhunt.trial import Value
+
+__all__ = ["about_why"]
+
+_LEFT_OUT = {"braked": "it keeps its speed", "sped up": "it keeps its speed", "changed lanes": "it stays in its lane"}
+_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
+
+
+def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
+    """Return what was found out, a sentence each: first what it hangs on, then what makes no difference.
+
+    Args:
+        why: what was run.
+        when: says when a step was, such as ``61.3 s``.
+    """
+    defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
+    drawn = {factor.name for factor in why.factors if (factor.kind, factor.what) == ("argument", "drawn")}
+    sentences, alike = [], []
+    for factor in why.factors:
+        default = defaults.get(factor.name) if factor.kind == "argument" else None
+        if not factor.clear or (factor is default and factor.name in drawn):
+            continue
+        each = [factor, *([default] if default is not None and default is not factor else [])]
+        if all(one.same == one.clear for one in each):
+            alike.append(_short(factor, sum(one.clear for one in each), when))
+        else:
+            sentences.append(f"- {'; '.join(_sentence(one, when) for one in each if one.clear)}.")
+    if sentences:
+        sentences = [f"What it hangs on, in {why.runs} runs with one thing left out in each:", *sentences]
+    if alike:
+        sentences.append(f"No difference, in any run without it: {'; '.join(alike)}.")
+    if why.why_not:
+        sentences.append(f"What it hangs on is not fully known: {why.why_not}.")
+    return sentences
+
+
+def _sentence(factor: Factor, when: Callable[[int], str]) -> str:
+    return f"{_given(factor, when)}: {_outcome(factor)}"
+
+
+def _given(factor: Factor, when: Callable[[int], str]) -> str:
+    who, what = factor.name, factor.what
+    if factor.kind == "argument" and what == "default":
+        return f"{who} at its default {_number(factor.runs[0].given)}"
+    if factor.kind == "argument":
+        return f"other values of {who} (it was {_number(factor.was)})"
+    if factor.kind == "seed":
+        return "other seeds, and so other traffic"
+    if what == "there":
+        return f"without {who} (taken off the road {_steps(factor)})"
+    assert factor.step is not None
+    if factor.kind == "disturbance":
+        return f"without the disturbance {what} of {who} at {when(factor.step)}"
+    return f"{who} {what} at {when(factor.step)}; without that ({_LEFT_OUT[what]})"
+
+
+def _steps(factor: Factor) -> str:
+    steps = sorted(int(run.given) for run in factor.runs)
+    earlier = ", ".join(map(str, steps[:-1]))
+    return f"after step {earlier} or {steps[-1]}" if earlier else f"after step {steps[-1]}"
+
+
+def _outcome(factor: Factor) -> str:
+    of = factor.clear
+    if factor.kind in ("argument", "seed") and of > 1:
+        low, high = factor.interval or (0.0, 1.0)
+        words = f"{factor.crashed} of {of} runs crash ({100 * low:.0f} to {100 * high:.0f} %)"
+        if factor.crashed == factor.same:
+            return words
+        return f"{words}, {factor.same or 'none'} of them with the same one"
+    counts = (("no crash", of - factor.crashed), ("another crash", factor.crashed - factor.same))
+    several = [*counts, ("the same", factor.same)]
+    parts = [f"{words} in {number} of {of} runs" if of > 1 else words for words, number in several if number]
+    into = sorted({run.into for run in factor.runs if run.into})
+    more = f", though {factor.name} then drives into {' or '.join(into)} itself" if into else ""
+    return f"{' and '.join(parts)}{more}"
+
+
+def _short(factor: Factor, runs: int, when: Callable[[int], str]) -> str:
+    who, what = factor.name, factor.what
+    if factor.kind == "argument":
+        return f"the value of {who}, {_number(factor.was)} ({runs} {'other' if runs == 1 else 'others'})"
+    if factor.kind == "seed":
+        return f"the seed ({runs} others)"
+    if what == "there":
+        return who
+    assert factor.step is not None
+    return f"the {_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
+
+
+def _number(value: Value | None) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
