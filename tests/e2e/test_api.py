@@ -74,7 +74,9 @@ def test_results_are_typed_objects_and_arrays(hunt):
 
 
 def test_what_is_not_finished_says_so(hunt):
-    (hunt.folder / "s.toml").write_text("[[hunts]]\nid='a'\nscenario='toy'\n[[hunts]]\nid='b'\nscenario='toy'\n")
+    (hunt.folder / "s.toml").write_text(
+        "[defaults]\nscenario='toy'\ntrials=2\nmax_steps=20\n[[hunts]]\nid='a'\n[[hunts]]\nid='b'\n"
+    )
     suite = crashhunt.Suite.read("s.toml")
     assert repr(suite) == "<suite of 2 hunts, 2 runs: a, b>"
     assert suite.plan("s") == suite.plan("s")

@@ -9,7 +9,7 @@ from conftest import CRASHHUNT, needed
 
 # Everything that bash would set when somebody presses the key at the end of the line.
 ASK = """
-eval "$(crashhunt completion bash)"
+eval "$2"
 COMP_LINE=$1 COMP_POINT=${#1} COMP_TYPE=9
 complete -p crashhunt | grep -q _python_argcomplete || exit 3
 _python_argcomplete crashhunt
@@ -21,11 +21,13 @@ printf '%s\\n' "${COMPREPLY[@]}"
 def press(toy):
     bash = needed("bash")
     environment = {**toy.environment, "PATH": f"{CRASHHUNT.parent}:{toy.environment['PATH']}"}
+    script = toy.crashhunt("completion", "bash").out
 
     def ask(line: str) -> list[str]:
         done = subprocess.run(
-            [bash, "-c", ASK, "bash", line], cwd=toy.folder, env=environment, capture_output=True, text=True, check=True
-        )
+            [bash, "-c", ASK, "bash", line, script], cwd=toy.folder, env=environment, capture_output=True, text=True,
+            check=True,
+        )  # fmt: skip
         assert done.stderr == ""
         return [word.strip() for word in done.stdout.splitlines() if word.strip()]
 

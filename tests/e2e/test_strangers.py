@@ -50,7 +50,7 @@ def changed(source: Path, target: Path, *edits: tuple[str, str, str]) -> Path:
     for name, data in files.items():
         digest = hashlib.blake2b(data, digest_size=16).hexdigest()
         index["files"][name] = {"size": len(data), "blake2b": digest}
-    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+    with zipfile.ZipFile(target, "w") as new:
         for name, data in {**files, "archive.json": json.dumps(index).encode()}.items():
             new.writestr(name, data)
     return target
