@@ -78,6 +78,7 @@ class Prober:
         self.why_not = ""
         self._stress = Stress(1.0)
         self._moment = 0
+        self._goes_on = False  # without any disturbance, from the present moment on: that is asked once
 
     def is_due(self, episode: Episode) -> bool:
         """Whether copies are to be asked after the step that has just been taken."""
@@ -90,6 +91,7 @@ class Prober:
         asked = [(kind, episode.names[number]) for kind in PROBED if kind.what in able for number in episode.acting]
         turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
         self._moment += 1
+        self._goes_on = False
         try:
             for kind, agent in asked[turn:] + asked[:turn]:
                 if self._stress.steps >= BUDGET * episode.steps:
@@ -119,10 +121,10 @@ class Prober:
             outcome, step = self._copy(episode, disturbance)
             if not outcome:
                 low = strength
-            elif high == round(self._stress.margin * _SHARES) and self._copy(episode, None)[0]:
+            elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
             else:
-                high = strength
+                self._goes_on, high = True, strength
                 self._stress = replace(
                     self._stress, margin=high / _SHARES, disturbance=disturbance, outcome=outcome, step=step
                 )

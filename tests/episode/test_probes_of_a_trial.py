@@ -1,0 +1,229 @@
+"""What copies of a trial are asked, and what is made of their answers; these copies are made up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.faculties import members
+from crashhunt.episode import Prober
+from crashhunt.simulators import Disturbs
+from crashhunt.trial import CRASHES, Disturbance, Outcome, TrialResult, TrialSpec
+
+DT = 0.1
+BRAKE, STOP = 6.0, 6.0  # m/s²: the strongest that is plausible
+
+
+@dataclass
+class Road:
+    """A trial at some step, of which a copy crashes if it is disturbed hard enough.
+
+    Args:
+        crashes: what to the share of its kind's greatest strength from which on it makes a copy crash.
+        steps: of the trial, so far.
+        outcome: of copies that crash.
+        after: in how many steps they do.
+        doomed: it crashes without any disturbance.
+        absent: kinds for which nobody is there.
+        answers: whether copies answer at all.
+    """
+
+    crashes: dict[str, float]
+    steps: int = 1000
+    outcome: Outcome = Outcome.COLLISION
+    after: int = 7
+    doomed: bool = False
+    absent: tuple[str, ...] = ()
+    answers: bool = True
+    raised: str = ""
+    names: tuple[str, ...] = ("ego",)
+    acting: tuple[int, ...] = (0,)
+    kinds: tuple[str, ...] = ("brake", "stop")
+    asked: list[Disturbance | None] = field(default_factory=list)
+    taken: list[int] = field(default_factory=list)
+
+    @property
+    def simulator(self):
+        able = {**dict.fromkeys(members(Disturbs), True), "disturbing_kinds": self.kinds} if self.kinds else {}
+        return SimpleNamespace(step_length_s=DT, **able)
+
+    def fork(self, work, *, observed=True):
+        assert not observed
+        copy = _Copy(self)
+        answer = work(copy)
+        self.asked.append(copy.disturbance)
+        self.taken.append(copy.steps - self.steps)
+        return SimpleNamespace(answer=lambda seconds: answer if self.answers else None, raised=self.raised)
+
+
+class _Copy:
+    def __init__(self, road):
+        self.road, self.steps, self.result, self.disturbance = road, road.steps, None, None
+
+    def disturb(self, disturbance):
+        self.disturbance = disturbance
+
+    def takes_place(self, disturbance):
+        return disturbance.what not in self.road.absent
+
+    def step(self):
+        self.steps += 1
+        road, it = self.road, self.disturbance
+        most = {"brake": BRAKE, "stop": STOP, "noisy_observation": 0.2}
+        harmed = it is not None and it.what in road.crashes and it.how_strong >= (
+            road.crashes[it.what] * most.get(it.what, 1.0) - 1e-9
+        )  # fmt: skip
+        if (harmed or road.doomed) and self.steps == road.steps + road.after:
+            self.result = SimpleNamespace(outcome=road.outcome)
+
+
+def prober(crash_on=CRASHES, every_s=2.0):
+    waited = []
+    return Prober(every_s, crash_on, waited.append), waited
+
+
+def stress_of(asker, outcome=Outcome.SURVIVED):
+    return asker.result(TrialResult(TrialSpec(3, 5, {}, {}, 100), outcome)).stress
+
+
+@pytest.mark.parametrize("share", [1, 2, 5, 8, 11, 15])
+def test_the_mildest_is_found_in_few_copies(share):
+    asker, waited = prober()
+    road = Road({"brake": share / 16})
+    asker.ask(road)
+    stress = stress_of(asker)
+    # The strongest that is asked for is a sixteenth less than the strongest that is plausible.
+    assert stress.margin == share / 16
+    assert stress.disturbance == Disturbance(1002, "ahead", "brake", BRAKE * share / 16, 3.0, "ego")
+    assert (stress.outcome, stress.step) == ("collision", 1007)
+    braked = [one.how_strong for one in road.asked if one is not None and one.what == "brake"]
+    assert braked[0] == BRAKE * 15 / 16
+    assert 1 <= len(braked) <= 5
+    assert stress.probes == len(road.asked) == len(waited)
+    assert stress.steps == sum(road.taken)
+    assert min(waited) >= 0
+    # One copy has gone on without any disturbance: the trial would not have crashed anyway.
+    assert road.asked.count(None) == 1
+    assert road.asked.index(None) == 1
+
+
+def test_other_kinds_are_asked_for_what_is_milder_only():
+    asker, _ = prober()
+    road = Road({"brake": 0.5, "stop": 0.25, "noisy_observation": 0.9})
+    asker.ask(road)
+    assert road.asked.count(None) == 1  # at one moment, that says the same of all kinds
+    first = {one.what: one.how_strong for one in reversed(road.asked) if one is not None}
+    assert list(dict.fromkeys(one.what for one in road.asked if one)) == [
+        "brake", "stop", "late_action", "late_observation", "noisy_observation",
+    ]  # fmt: skip
+    assert first["stop"] == pytest.approx(STOP * 7 / 16)
+    assert first["noisy_observation"] == pytest.approx(0.2 * 3 / 16)
+    stress = stress_of(asker)
+    assert (stress.margin, stress.disturbance.what, stress.disturbance.how_long) == (0.25, "stop", 8.0)
+    assert stress.left_out == 0
+
+
+def test_where_nothing_milder_is_left_nobody_else_is_asked():
+    asker, _ = prober()
+    road = Road({"brake": 1 / 16})
+    asker.ask(road)
+    assert {one.what for one in road.asked if one} == {"brake"}
+    again = len(road.asked)
+    asker.ask(road)  # at the next moment: each kind has nothing to ask for
+    assert len(road.asked) == again
+
+
+def test_of_a_trial_that_crashes_anyway_a_disturbance_says_nothing():
+    asker, _ = prober()
+    road = Road({"brake": 0.5}, doomed=True)
+    asker.ask(road)
+    assert road.asked[1] is None
+    assert len(road.asked) == 2
+    stress = stress_of(asker)
+    assert (stress.margin, stress.disturbance) == (1.0, None)
+
+
+def test_a_copy_is_followed_for_five_seconds_and_only_if_somebody_is_there():
+    asker, _ = prober()
+    road = Road({}, absent=("brake",))
+    asker.ask(road)
+    # Nobody was ahead in the step in which it was to begin; the others go on until 5 s after that.
+    assert dict(zip([one.what for one in road.asked], road.taken, strict=True)) == {
+        "brake": 2, "stop": 52, "late_action": 52, "late_observation": 52, "noisy_observation": 52,
+    }  # fmt: skip
+    assert stress_of(asker).steps == 2 + 4 * 52
+
+
+def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_left_out_each_time():
+    asker, _ = prober()
+    road = Road({}, steps=20)  # of which copies may take 80
+    asker.ask(road)
+    assert [one.what for one in road.asked] == ["brake", "stop"]
+    road.asked.clear()
+    road.steps = 40
+    asker.ask(road)
+    assert [one.what for one in road.asked] == ["stop", "late_action"]
+    assert stress_of(asker).left_out == 3 + 3
+    # The next trial has a budget of its own, and begins with the first kind.
+    road.asked.clear()
+    road.steps = 13  # 52 steps
+    asker.ask(road)
+    assert [one.what for one in road.asked] == ["brake"]
+
+
+def test_every_agent_that_drives_is_asked_about():
+    asker, _ = prober()
+    road = Road({}, names=("a", "b", "c"), acting=(0, 2), kinds=())
+    asker.ask(road)
+    assert {one.agent for one in road.asked} == {"a", "c"}
+    assert {one.what for one in road.asked} == {"late_action", "late_observation", "noisy_observation"}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "crash_on"),
+    [(Outcome.SIMULATOR_ERROR, CRASHES), (Outcome.SURVIVED, CRASHES), (Outcome.COLLISION, (Outcome.HANG,))],
+)
+def test_what_is_no_crash_of_the_hunt_is_none_of_a_copy(outcome, crash_on):
+    asker, _ = prober(crash_on)
+    asker.ask(Road({"brake": 0.5, "stop": 0.5}, outcome=outcome))
+    stress = stress_of(asker)
+    assert (stress.margin, stress.disturbance, stress.outcome) == (1.0, None, "")
+
+
+def test_a_trial_that_crashed_has_no_margin_and_one_that_nobody_asked_says_nothing():
+    asker, _ = prober()
+    assert stress_of(asker) is None
+    assert stress_of(asker, Outcome.COLLISION).margin == 0.0
+    asker.ask(Road({"brake": 0.5}))
+    stress = stress_of(asker, Outcome.COLLISION)
+    assert (stress.margin, stress.disturbance, stress.outcome, stress.step) == (0.0, None, "", 0)
+    assert stress.probes > 0
+    assert stress_of(asker) is None  # of the one before
+
+
+def test_it_is_due_every_so_often_until_copies_cannot_be_asked():
+    asker, waited = prober(every_s=0.5)
+    assert [step for step in range(1, 21) if asker.is_due(Road({}, steps=step))] == [5, 10, 15, 20]
+    road = Road({"brake": 0.5}, answers=False, raised="OSError: no")
+    asker.ask(road)
+    assert len(road.asked) == len(waited) == 1
+    assert asker.why_not == "OSError: no"
+    assert not asker.is_due(Road({}, steps=5))
+    asker, _ = prober(every_s=0.5)
+    asker.ask(Road({}, answers=False))
+    assert asker.why_not == "a copy died, or hung"
+
+
+def test_what_has_no_copy_is_told_and_its_time_counts():
+    class Refused(Road):
+        def fork(self, work, *, observed=True):
+            raise CrashhuntError("threads have no copy", fix="none")
+
+    asker, waited = prober()
+    asker.ask(Refused({}))
+    assert asker.why_not == "threads have no copy"
+    assert len(waited) == 1
+    assert stress_of(asker) is None
