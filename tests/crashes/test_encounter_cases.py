@@ -140,6 +140,8 @@ def test_where_the_other_one_is():
     assert at(-8, 0).place == at(-6, -5).place == "behind"
     assert at(0, 3).place == at(4.9, 1.4).place == at(-4.9, 1.4).place == at(5.1, 5.2).place == "left"
     assert at(0, -3).place == at(4.9, -1.4).place == at(5.5, -6).place == "right"
+    narrow = {"own": (5.0, 0.5), "size": (5.0, 0.5)}
+    assert (at(0, 0.8, **narrow).place, at(0, -0.8, **narrow).place) == ("left", "right")
     assert at(4.9, 1.3).place == "ahead"  # more ahead than beside, and it is not 4/3 m aside
     assert at(-4.9, -1.3).place == "behind"
     assert at(3.4, 3, math.pi / 2).place == "left"  # across: their lengths overlap by 3.5 m

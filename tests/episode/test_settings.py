@@ -53,6 +53,14 @@ def test_it_crosses_as_json(settings):
     assert again.scenario.agents["ego"].arguments["speed"].default == 8.0
 
 
+@pytest.mark.parametrize(("name", "value"), [("warm_copies", 3), ("probe_s", 2.5)])
+def test_what_has_come_since_is_told_where_it_is_asked_for_only(settings, name, value):
+    assert name not in plain(settings)
+    asked = replace(settings, **{name: value})
+    assert plain(asked)[name] == value
+    assert WorkerSettings.from_json(plain(asked)) == asked
+
+
 def test_what_is_not_said_is_the_usual(scenario, tmp_path):
     usual = WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=tmp_path)
     facts = (usual.code, usual.argument_files, usual.timeout_s, usual.keep_trials, usual.sealed, usual.find_escapes)

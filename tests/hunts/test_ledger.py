@@ -71,6 +71,13 @@ def test_what_is_recorded_together_is_not_kept_back_while_trials_are_waited_for(
         assert reader.finished() == {1, 2, 3}
         writer.record(result(4), snapshot="")
         assert reader.finished() == {1, 2, 3}
+    now += 1.0  # from here on, each is written by itself
+    with closing(Ledger(path, writable=True)) as writer, closing(Ledger(path)) as reader:
+        with writer.together():
+            writer.record(result(5), snapshot="")
+        now += 1.0
+        writer.record(result(6), snapshot="")
+        assert reader.finished() == {1, 2, 3, 4, 5, 6}
 
 
 def test_what_is_replaced_is_kept(tmp_path):

@@ -154,6 +154,79 @@ def test_a_bridge_is_no_crossing():
     assert dangers([under._replace(heights=heights)], ("ego",), 0.1)[1].danger == 0.0
 
 
+def test_heights_count_from_the_front_and_the_lower_one_is_who_has_to_fit():
+    """Two on crossing ways are on one level if they are less than 3 m apart, or less than the lower one is high."""
+
+    def danger(above, own=1.5, its=1.5):
+        roster = Roster((Actor("ego", "car", LENGTH, WIDTH, own), Actor("other", "truck", LENGTH, WIDTH, its)))
+        both = frame(straight(-50, 0, 0, 10), straight(0, -58, math.pi / 2, 10))._replace(roster=roster)
+        heights = np.zeros((100, 4))
+        heights[:, 1] = above
+        return dangers([both._replace(heights=heights)], ("ego",), 0.1)[1].danger
+
+    assert danger(0.0) == danger(2.9) == danger(-2.9) > 0.3
+    assert danger(3.1) == danger(-3.1) == 0.0
+    assert danger(3.9, own=4.0) > 0.3  # the agent is the lower one, and high
+    assert danger(-3.9, own=4.0) == danger(4.1, own=4.0) == 0.0
+    assert danger(-3.9, its=4.0) > 0.3
+    assert danger(3.9, its=4.0) == danger(-4.1, its=4.0) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_towards_somebody_who_stands_it_is_the_braking_that_it_takes(seed):
+    """Of any size, at any angle: the place of the first touch is found by trying, and the rest is calculated.
+
+    The agent stops 5 m before that from one step to the next, so that nothing else is a danger.
+    """
+    generator = np.random.default_rng(seed)
+    speed, dt, count = generator.uniform(5, 15), 0.1, 200
+    x, y, heading = generator.uniform(40, 70), generator.uniform(-1.2, 1.2), generator.uniform(-math.pi, math.pi)
+    length, width = generator.uniform(0.5, 12), generator.uniform(0.3, 3)
+    other = (x, y, heading, length, width)
+    touch = next(at for at in np.arange(0, 80, 0.02) if outlines_overlap((at, 0.0, 0.0, LENGTH, WIDTH), other))
+    way = straight(0, 0, 0, speed, count)
+    way[:, 0] = np.minimum(way[:, 0], touch - 5)
+    roster = Roster((Actor("ego", "car", LENGTH, WIDTH), Actor("other", "car", length, width)))
+    both = frame(way, np.tile((x, y, heading), (count, 1)))._replace(roster=roster)
+    measured, most = dangers([both], ("ego",), dt)
+    checked = 0
+    for step in range(3, count, 3):
+        room = touch - way[step, 0]
+        if way[step, 0] != speed * dt * step:
+            break
+        later = 3 * dt * np.arange(1, 14)  # within 4 s, as often as it is looked at
+        needed = 2 * (speed * later - room) / later**2
+        needed = np.where(needed * later > speed, speed**2 / (2 * room), needed)
+        expected = max(0.0, float(needed.max()))
+        assert 12 * measured[step] == pytest.approx(min(expected, 12 * 0.999), abs=0.02 + 0.05 * expected), (step, room)
+        checked += expected > 1
+    assert checked
+    assert most.other == "other"
+
+
+def test_who_is_meant_is_the_nearest_of_several():
+    """The nearest in time; of two that are as near in time, the nearer one in space."""
+    row = [straight(x, 0, 0, 10) for x in (0, 35, 20, 50)]
+    steps, most = dangers([frame(*row, names=("ego", "second", "first", "third"))], ("ego",), 0.1)
+    assert most.other == "first"
+    assert steps[:40] == pytest.approx(math.exp(-1.5 / 1.2), abs=0.02)
+    assert dangers([frame(*row[::-1], names=("third", "first", "second", "ego"))], ("ego",), 0.1)[1].other == "first"
+
+
+def test_a_step_has_the_danger_of_the_sample_before_it_and_none_where_the_agent_is_gone():
+    gone = frame(straight(0, 0, 0, 10, 40), straight(15, 0, 0, 10, 40))
+    rest = frame(straight(55, 0, 0, 10, 40), names=("other",))
+    steps, _ = dangers([gone, rest], ("ego",), 0.1)
+    assert len(steps) == 80
+    assert steps[:38] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+    assert not steps[40:].any()
+    later = frame(straight(0, 0, 0, 10, 40), names=("other",))
+    steps, most = dangers([later, gone], ("ego",), 0.1)
+    assert not steps[:39].any()
+    assert steps[43:75] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+    assert most.step >= 40
+
+
 places = st.floats(-40, 40)
 others = st.tuples(places, places, st.floats(-3.1, 3.1), st.floats(2, 20), st.floats(-0.3, 0.3))
 
