@@ -142,10 +142,15 @@ def _commands() -> Commands:
     return Commands(_usual_environment())
 
 
+# Thousands of tests and their modules live to the end: the garbage collector need not walk them each time, neither
+# while they are collected, which takes a quarter of that time, nor later.
+gc.disable()
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Thousands of tests and their modules live to the end: the garbage collector need not walk them each time."""
-    gc.collect()
+    """From here on, there is garbage."""
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -167,9 +167,9 @@ class Bundle:
         }
         if self.is_near_miss:
             found["danger"] = plain.get("danger")
-        if "log_likelihood" in plain:
+        if "log_likelihood" in plain or self.result.spec.disturbances:
             found["disturbed"] = self.result.disturbed
-            found["log_likelihood"] = plain["log_likelihood"]
+            found["log_likelihood"] = plain.get("log_likelihood")
         return found
 
     def write(self, into: Path | None = None) -> None:

@@ -1,3 +1,4 @@
+from ._fixed import FORM as FORM, is_fixed as is_fixed, parse_fixed as parse_fixed, word_of as word_of
 from ._models import (
     Choices as Choices,
     brake as brake,

@@ -16,8 +16,9 @@ from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate, registered
+from crashhunt.disturbances._fixed import FORM, is_fixed
 from crashhunt.disturbances._protocol import Drawn
-from crashhunt.trial import CELLS, OF_AGENT, Disturbance, in_turn
+from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +39,7 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
     """Return how often what happens, from ``NAME=RATE``; what has the rate 0 is left out.
 
     Args:
-        words: as they are given; ``none`` alone for nothing.
+        words: as they are given; ``none`` alone for nothing. Those that fix a disturbance are left aside.
 
     Raises:
         UsageError: a word says no rate, or a name comes twice.
@@ -50,9 +51,11 @@ def parse_rates(words: Iterable[str]) -> dict[str, float]:
             if len(given) > 1:
                 raise UsageError(f"{_SHOWN} {','.join(given)}: none stands alone", fix="leave it or the others out")
             continue
+        if is_fixed(word):
+            continue
         name, equals, text = word.rpartition("=")
         if not equals or not name:
-            fix = "write NAME=RATE with a rate per second, such as brake=0.02"
+            fix = f"write NAME=RATE with a rate per second, such as brake=0.02, or {FORM}"
             raise UsageError(f"{_SHOWN} {word!r} says no rate", fix=fix)
         if name in rates:
             raise UsageError(f"{_SHOWN} gives {name!r} twice", fix="give it once")
@@ -73,7 +76,7 @@ def _rate(name: str, text: str) -> float:
 
 def disturber_of(
     rates: Mapping[str, float], *, agents: Sequence[str], step_length_s: float, known: Sequence[str] | None = None,
-    simulator: str = "the simulator",
+    simulator: str = "the simulator", fixed: Sequence[Disturbance] = (),
 ) -> Disturber:  # fmt: skip
     """Return what draws the disturbances of trials.
 
@@ -83,6 +86,7 @@ def disturber_of(
         step_length_s: in s.
         known: the kinds that the simulator can do; None where nobody knows.
         simulator: how people call it.
+        fixed: what every trial has besides.
 
     Raises:
         PluginError: there is no such model.
@@ -94,16 +98,28 @@ def disturber_of(
         if rate * step_length_s > 1:
             fix = f"give at most {1 / step_length_s:g} a second"
             raise UsageError(f"{_SHOWN} {name}={rate:g}: more than one a step of {step_length_s:g} s", fix=fix)
-        if known is not None and model.what not in known and model.what not in OF_AGENT:
-            able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
-            message = f"{_SHOWN} {name}: {simulator} cannot do {model.what!r}"
-            raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
+        _refuse_what_it_cannot(name, model.what, known, simulator)
         twin = next((other for other, made in models.items() if made.what == model.what), None)
         if twin is not None:
             message = f"{_SHOWN}: {twin} and {name} are both about {model.what!r}"
             raise UsageError(message, fix="choose one of the two")
         models[name] = model
-    return Disturber(models, dict(rates), tuple(agents), step_length_s)
+    for one in fixed:
+        if known is None and one.what not in KINDS:
+            continue  # whose simulator has not said what it can do
+        if one.what not in (*KINDS, *(known or ())):
+            fix = one_of(one.what, sorted({*KINDS, *(known or ())}))
+            raise UsageError(f"{_SHOWN}: there is no kind of disturbance {one.what!r}", fix=fix)
+        _refuse_what_it_cannot(f"{one.what}@{one.step}", one.what, known, simulator)
+    return Disturber(models, dict(rates), tuple(agents), step_length_s, tuple(fixed))
+
+
+def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
+    if known is None or what in known or what in OF_AGENT:
+        return
+    able = sorted(point for point in registered("disturbances") if point in (*known, *OF_AGENT))
+    message = f"{_SHOWN} {name}: {simulator} cannot do {what!r}"
+    raise UsageError(message, fix=f"it can do {', '.join(able)}" if able else "leave it out")
 
 
 def locate_model(name: str) -> DisturbanceModel:
@@ -151,12 +167,14 @@ class Disturber:
         rates: of each, in 1/s.
         agents: around whom.
         step_length_s: in s.
+        fixed: what every trial has besides, whatever is drawn.
     """
 
     models: Mapping[str, DisturbanceModel]
     rates: Mapping[str, float]
     agents: tuple[str, ...]
     step_length_s: float
+    fixed: tuple[Disturbance, ...] = ()
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
         """Return the disturbances of a trial, in order; those of a longer one begin with these.
@@ -171,7 +189,7 @@ class Disturber:
                 key = (_STREAM, number, *name.encode())
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
                 found += self._between(0, max_steps, name, agent, rng)
-        return in_turn(found)
+        return self._with_fixed(found, 0, max_steps)
 
     def draw_another(self, seed: int, number: int, after: int, soon: int, last: int) -> tuple[Disturbance, ...]:
         """Return what else might begin after a step of a trial: at least one disturbance soon, others as ever.
@@ -189,7 +207,13 @@ class Disturber:
         agent, name = places[int(rng.choice(len(places), p=chances / chances.sum()))]
         first = self._one(after + 1 + int(rng.integers(soon)), name, agent, rng)
         others = [one for agent, name in places for one in self._between(first.step, last, name, agent, rng)]
-        return in_turn([first, *others])
+        return self._with_fixed([first, *others], after, last)
+
+    def _with_fixed(self, drawn: Iterable[Disturbance], after: int, last: int) -> tuple[Disturbance, ...]:
+        """What is drawn, and what is there anyway; in its step and of its kind, that alone."""
+        given = [one for one in self.fixed if after < one.step <= last]
+        taken = {_key(one) for one in given}
+        return in_turn([*(one for one in drawn if _key(one) not in taken), *given])
 
     def _between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
         """What a model begins around an agent after a step, up to another one."""
@@ -207,11 +231,14 @@ class Disturber:
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
         """Return the natural logarithm of the probability that just these begin in so many steps.
 
+        What is fixed begins anyway, whatever a model draws for that step.
+
         Args:
             disturbances: as they were drawn; what begins later is left out.
             steps: how many there were.
         """
-        begun = [one for one in disturbances if one.step <= steps]
+        given = {_key(one) for one in self.fixed if one.step <= steps}
+        begun = [one for one in disturbances if one.step <= steps and _key(one) not in given]
         total = 0.0
         for agent in self.agents:
             for name, model in self.models.items():
@@ -219,19 +246,27 @@ class Disturber:
                 mine = [one for one in begun if one.agent == agent and one.what == model.what]
                 for one in mine:
                     total += math.log(chance) + model.log_likelihood(Drawn(one.who, one.how_strong, one.how_long))
-                if len(mine) < steps:
-                    total += (steps - len(mine)) * (math.log1p(-chance) if chance < 1 else -math.inf)
+                free = steps - sum((one_agent, what) == (agent, model.what) for _, one_agent, what in given)
+                if len(mine) < free:
+                    total += (free - len(mine)) * (math.log1p(-chance) if chance < 1 else -math.inf)
         known = {model.what for model in self.models.values()}
         return total if all(one.what in known and one.agent in self.agents for one in begun) else -math.inf
 
-    def log_likelihood_of(self, result: TrialResult) -> float:
+    def log_likelihood_of(self, result: TrialResult) -> float | None:
         """Return the logarithm of the probability that just what took place in a trial begins in its steps.
 
-        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier.
+        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier. None
+        where nothing is drawn at all.
         """
+        if not self.models:
+            return None
         there = {(one.step, one.agent, one.what) for one in result.disturbances}
         drawn = [one for one in result.spec.disturbances if (one.step, one.agent, one.what) in there]
         return self.log_likelihood(drawn, result.steps_begun)
 
     def _chance(self, name: str) -> float:
         return min(1.0, self.rates[name] * self.step_length_s)
+
+
+def _key(one: Disturbance) -> tuple[int, str, str]:
+    return one.step, one.agent, one.what

@@ -182,5 +182,6 @@ class Brancher(Observer):
                 break  # nobody was there
         outcome, likely = "", None
         if copy.result is not None:
-            outcome, likely = str(copy.result.outcome), finite(self._draws_of(copy).log_likelihood_of(copy.result))
+            outcome, found = str(copy.result.outcome), self._draws_of(copy).log_likelihood_of(copy.result)
+            likely = finite(found) if found is not None else None
         return {"steps": copy.steps - began, "step": copy.steps, "outcome": outcome, "log_likelihood": likely}

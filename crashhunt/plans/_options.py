@@ -60,7 +60,8 @@ class Subject(_Options):
     )  # fmt: skip
     ego: str = option(
         "", "which vehicle of a bare ``.sumocfg``",
-        help="for a .sumocfg: the vehicle to control, or route=ID or edges=FROM,TO to add one", unset="the first",
+        help="for a .sumocfg: the vehicle to control; route=ID or edges=FROM,TO to add one; any: another in each trial",
+        unset="any",
         flag="--ego", metavar="VEHICLE", group="what",
     )  # fmt: skip
     action: str = option(
@@ -117,10 +118,12 @@ class TrialOptions(_Options):
         flag="--crash-on", metavar="KIND,…", separator=",",
     )  # fmt: skip
     disturb: Sequence[str] = option(
-        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second",
+        (), "how often others around the agent err, or it sees or acts late: ``NAME=RATE`` with a rate per second; or "
+        "what every trial has in one step, ``KIND@STEP=WHO:HOW_STRONG:HOW_LONG``",
         help="have others around the agent err, or the agent see or act late, so often a second, as in "
-        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, ignore_priority, unseen, "
-        "late_observation, noisy_observation, late_action or module:attribute; none for nothing at all",
+        "brake=0.02,cut_in=0.01: brake, stop, dawdle, speed, cut_in, late_merge, step_out, ignore_priority, unseen, "
+        "late_observation, noisy_observation, late_action or module:attribute; or in every trial from one step on, as "
+        "in brake@124=ahead:4:2 for 4 m/s² and 2 s; none for nothing at all",
         unset="as the scenario says, and nothing where it is silent",
         flag="--disturb", metavar="NAME=RATE,…", separator=",",
     )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
-from crashhunt.disturbances import disturber_of, parse_rates
+from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
@@ -131,14 +131,14 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
 
     Args:
         scenario: in which they take place.
-        disturb: how often what happens: ``NAME=RATE`` each.
+        disturb: how often what happens: ``NAME=RATE`` each; or what happens when.
         agents: around whom.
 
     Raises:
         CrashhuntError: there is no such disturbance, or the simulator cannot do it.
     """
-    rates = parse_rates(disturb)
-    if not rates:
+    rates, fixed = parse_rates(disturb), parse_fixed(disturb, tuple(agents))
+    if not rates and not fixed:
         return None
     backend = scenario.backend
     return disturber_of(
@@ -147,6 +147,7 @@ def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str])
         step_length_s=backend.step_length_s(scenario),
         known=backend.disturbances,
         simulator=backend.title or "the simulator",
+        fixed=fixed,
     )
 
 
@@ -163,12 +164,21 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
     """What is asked for, or else what the scenario says."""
-    words = request.disturb or tuple(f"{name}={rate!r}" for name, rate in scenario.disturbances.items())
-    return tuple(f"{name}={rate!r}" for name, rate in parse_rates(words).items())
+    words = request.disturb or tuple(f"{name}={rate}" for name, rate in scenario.disturbances.items())
+    agents = tuple(scenario.agents)
+    fixed = parse_fixed(words, agents)
+    late = next((one for one in fixed if one.step > request.max_steps), None) if request.disturb else None
+    if late is not None:
+        fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
+        raise UsageError(f"--disturb {late.what}@{late.step}: a trial has {request.max_steps} steps", fix=fix)
+    return (
+        *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
+        *(word_of(one, agents) for one in fixed),
+    )
 
 
 def _check_branch(settings: HuntSettings) -> None:
-    if settings.branch and not settings.disturb:
+    if settings.branch and not parse_rates(settings.disturb):
         fix = "say what may happen there, such as --disturb brake=0.02,cut_in=0.02"
         raise UsageError("--branch has copies of trials go on with other disturbances, and there are none", fix=fix)
     if settings.branch and sys.platform != "linux":

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
+    from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
 __all__ = ["SceneView"]
@@ -84,6 +85,8 @@ class SceneView:
         order = range(len(scene.roster))
         for other in sorted(order, key=scene.heights.__getitem__) if scene.heights else order:
             self._draw_actor(draw, scene, other, self._color(scene.roster.actors[other].id))
+        for one in self._going(step):
+            self._ring(draw, scene, one.vehicle)
         if step == self._crash_step and row is not None:
             x, y = self._place(np.array([scene.points[row]]))[0]
             for radius in (34, 38):
@@ -137,6 +140,21 @@ class SceneView:
                  for share, side in ((0.22, 0.38), (0.34, 0.42), (0.34, -0.42), (0.22, -0.38))]  # fmt: skip
         draw.polygon(np.array(glass).ravel().tolist(), fill=dark)
 
+    def _going(self, step: int) -> list[Disturbance]:
+        """The disturbances that go on, of those for which somebody was there."""
+        step_length_s = self._recording.prologue.step_length_s
+        return [one for one in self._recording.disturbances if one.vehicle and one.goes_on(step, step_length_s)]
+
+    def _ring(self, draw: ImageDraw.ImageDraw, scene: Scene, name: str) -> None:
+        """Mark an actor that errs, or that is not seen."""
+        row = scene.roster.index.get(name)
+        if row is None:
+            return
+        outline = self._place(corners(scene, row))
+        x, y = (outline.min(axis=0) + outline.max(axis=0)) / 2
+        radius = max(_PERSON_PIXELS * _FINE, float(np.ptp(outline, axis=0).max()) / 2) + 5 * _FINE
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_DISTURBED, width=2 * _FINE)
+
     def _color(self, name: str) -> tuple[int, int, int]:
         if name == self._agent:
             return _EGO
@@ -153,11 +171,9 @@ class SceneView:
             top = 36 + _LEGEND_STEP * place
             draw.rectangle((13, top + 3, 25, top + 15), fill=color)
             draw.text((32, top), name, INK, font(13))
-        told = (one for one in self._recording.disturbances if one.vehicle)
-        going = [one.words for one in told if one.goes_on(step, self._recording.prologue.step_length_s)]
-        for place, words in enumerate(going):
+        for place, one in enumerate(self._going(step)):
             top = 40 + _LEGEND_STEP * (len([name for name, _ in names if name]) + place)
-            draw.text((12, top), words.replace("²", "^2"), _DISTURBED, font(13))  # the font has no ²
+            draw.text((12, top), one.words.replace("²", "^2"), _DISTURBED, font(13))  # the font has no ²
         if step == self._crash_step:
             draw.text((self.width / 2, 14), "CRASH", _CRASH, font(26), anchor="ma")
         if not self._recording.actors:

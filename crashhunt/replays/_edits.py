@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError
 from crashhunt.plans import Owners, Takes, takes_of
-from crashhunt.replays._disturbances import edited_disturbances, is_about_disturbances
+from crashhunt.replays._disturbances import NAME, edited_disturbances, is_about_disturbances, with_other_words
 from crashhunt.trial import Constant, Value, parse_spec
 
 if TYPE_CHECKING:
@@ -78,10 +78,12 @@ def edited_spec(
         if before_it != now:
             longer = name == "max_steps" and now > before_it  # which leaves nothing out
             (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
-    disturbances = recorded.disturbances
+    vehicles = tuple(recorded.arguments) or tuple(settings.agents)
+    disturbances, said, unheard = with_other_words(recorded.disturbances, original.disturb, settings.disturb, vehicles)
+    others += said
     for name, text in changes.items():
-        if is_about_disturbances(name) and recorded.disturbances:
-            disturbances, said = edited_disturbances(disturbances, name, text)
+        if is_about_disturbances(name) and name not in recorded.scenario_arguments:
+            disturbances, said = edited_disturbances(disturbances, name, text, vehicles)
             others += said
             continue
         key = _find(name, recorded, settings, code)
@@ -105,10 +107,14 @@ def edited_spec(
     )
     kept = [
         f"{name} was {_plain(was)} and is {_plain(now)} in hunt.toml; a replay keeps that of the recorded trial"
-        for name in ("seed", "scenario", "disturb")
+        for name in ("seed", "scenario")
         if (was := getattr(original, name)) != (now := getattr(settings, name))
     ]
-    return trial, Edits(tuple(agents), tuple(others), tuple(kept))
+    late = next((one for one in disturbances if one.step > max_steps and one not in recorded.disturbances), None)
+    if late is not None:
+        fix = f"give a step up to {max_steps}"
+        raise ArgumentError(f"{NAME}: {late.what}@{late.step} is never, as the trial has {max_steps} steps", fix=fix)
+    return trial, Edits(tuple(agents), tuple(others), (*kept, *unheard))
 
 
 def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:

@@ -119,6 +119,9 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     runs = None if code == "log" or not options.trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
+    if not options.scenario and (odd := _kind_it_cannot_do(scenario, spec)):
+        able = ", ".join((*(scenario.backend.disturbances or ()), *OF_AGENT))
+        raise UsageError(f"{scenario.backend.title} cannot do the disturbance {odd!r}", fix=f"it can do {able}")
     if code == "log":
         if edits.all:
             raise UsageError(
@@ -177,8 +180,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.backend.step_length_s(other)
-    able = other.backend.disturbances
-    odd = next((one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT)), "")
+    odd = _kind_it_cannot_do(other, spec)
     if odd:
         message = f"--scenario {name!r}: {other.backend.title} cannot do the disturbance {odd!r}"
         raise UsageError(message, fix="replay with --set disturbances=none as well")
@@ -193,3 +195,10 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
             for one in spec.disturbances
         ),
     )
+
+
+def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
+    """The first kind of disturbance of a trial that a scenario's simulator cannot do; empty where there is none."""
+    able = scenario.backend.disturbances
+    odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *OF_AGENT))
+    return next(odd, "")

@@ -12,7 +12,14 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.trial import Disturbance, TrialResult
 
-__all__ = ["about_disturbances", "by_likelihood", "describe_disturbances", "told_disturbances"]
+__all__ = [
+    "about_disturbances",
+    "by_likelihood",
+    "describe_disturbances",
+    "likeliest",
+    "told_disturbances",
+    "traffic_of",
+]
 
 
 def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
@@ -38,30 +45,56 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
 
 def told_disturbances(result: TrialResult) -> list[str]:
     """Return a line for each disturbance of a trial, and one for how likely all of it was."""
-    if result.log_likelihood is None and not result.disturbances:
+    if not _may_be_disturbed(result):
         return []
     lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
-    lines = lines or ["in undisturbed traffic: nothing that was drawn had begun"]
+    lines = lines or ["in undisturbed traffic: nothing that was planned had begun"]
     if result.log_likelihood is not None:
-        lines.append(f"log-likelihood of these disturbances and no others: {result.log_likelihood:.2f}")
+        lines.append(f"log-likelihood of those that were drawn, and no others: {result.log_likelihood:.2f}")
     return lines
 
 
 def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
     """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
-    if not any(bundle.result.log_likelihood is not None for bundle in crashes):
+    if not any(_may_be_disturbed(bundle.result) for bundle in crashes):
         return []
     disturbed = [bundle for bundle in crashes if bundle.result.disturbed]
     lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
-    if disturbed:
-        first = by_likelihood(disturbed)[0]
+    first = likeliest(crashes)
+    if first is not None:
         lines.append(f"The likeliest of those with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
     return lines
+
+
+def likeliest(crashes: Sequence[Bundle]) -> Bundle | None:
+    """Return the likeliest of the crashes with disturbances; None where none of them was drawn."""
+    drawn = [bundle for bundle in crashes if bundle.result.disturbed and math.isfinite(_likely(bundle))]
+    return by_likelihood(drawn)[0] if drawn else None
+
+
+def traffic_of(bundle: Bundle, crashes: Sequence[Bundle]) -> str:
+    """Return which traffic a crash took place in, in words; empty where its hunt has no disturbances.
+
+    Args:
+        bundle: the crash.
+        crashes: all of the hunt.
+    """
+    if not _may_be_disturbed(bundle.result):
+        return ""
+    if not bundle.result.disturbed:
+        return "in undisturbed traffic"
+    likely = f", log-likelihood {_likely(bundle):.1f}" * math.isfinite(_likely(bundle))
+    return f"with disturbances{likely}{': the likeliest' * (bundle is likeliest(crashes))}"
 
 
 def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
     """Return crashes in order: those in undisturbed traffic as they are, then the others, the likeliest first."""
     return sorted(crashes, key=lambda bundle: (1, -_likely(bundle)) if bundle.result.disturbed else (0, 0.0))
+
+
+def _may_be_disturbed(result: TrialResult) -> bool:
+    """Whether its hunt has disturbances, whatever of them took place."""
+    return result.log_likelihood is not None or bool(result.spec.disturbances)
 
 
 def _likely(bundle: Bundle) -> float:

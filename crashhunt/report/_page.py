@@ -18,7 +18,7 @@ from crashhunt.base.watching import watched
 from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
-from crashhunt.report._disturbances import by_likelihood
+from crashhunt.report._disturbances import by_likelihood, traffic_of
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
@@ -101,7 +101,7 @@ def _crashes(bundles: Sequence[Bundle], watch: Watch | None) -> dict[str, object
     crashes, signed, place = [], [], {}
     for number, bundle in enumerate(watched(by_likelihood(bundles), len(bundles), watch)):
         story = Story(bundle)
-        crashes.append(_crash(bundle, story))
+        crashes.append({**_crash(bundle, story), "traffic": traffic_of(bundle, bundles)})
         signed.append((signature_of(bundle, story.recording), bundle))
         place[bundle.path] = number
     kinds = [
@@ -194,7 +194,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
         **({} if story.encounter is None else {"gap": _gap_to_other(story.encounter, recording)}),
         "lanes": _lanes(bundle, recording),
         "disturbances": [
-            [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words]
+            [one.step, one.step + steps_of(one.how_long, recording.prologue.step_length_s) - 1, one.words, one.vehicle]
             for one in result.disturbances
         ],
     }
@@ -202,10 +202,11 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
 
 def _disturbances(result: TrialResult) -> dict[str, str]:
     """What the page says of disturbances, which the words tell one by one."""
-    if result.log_likelihood is None:
+    if result.log_likelihood is None and not result.spec.disturbances:
         return {}
     said = f"{len(result.disturbances)} took place" if result.disturbed else "none: in undisturbed traffic"
-    return {"disturbances": said, "log-likelihood": f"{result.log_likelihood:.2f}"}
+    likely = {} if result.log_likelihood is None else {"log-likelihood": f"{result.log_likelihood:.2f}"}
+    return {"disturbances": said, **likely}
 
 
 def _scenes(recording: Recording, agent: str) -> dict[str, object]:

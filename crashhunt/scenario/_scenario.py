@@ -60,7 +60,7 @@ class Scenario:
     agents: dict[str, AgentSetup] = field(default_factory=lambda: {"ego": AgentSetup()})
     tables: dict[str, object] = field(default_factory=dict)
     events: dict[str, float] = field(default_factory=dict)
-    disturbances: dict[str, float] = field(default_factory=dict)
+    disturbances: dict[str, float | str] = field(default_factory=dict)
     schema: Literal[1] = 1
     name: str = ""
     folder: Path = Path()

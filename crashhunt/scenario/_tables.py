@@ -50,10 +50,13 @@ class AgentSetup:
     Args:
         agent: ``module:attribute``, or the name of a registered agent.
         existing: take over the vehicle ID of the traffic; otherwise one with that id is added.
+        replaces: the name of a scenario argument that names a vehicle of the traffic: when that has entered, this one
+            drives on in its place.
         type: the vehicle type of the added one.
         route: the route of the added one, by its id.
         edges: or the edges that it drives along (two: the way between them is looked up).
-        depart_s: when it enters, in s of simulation time; the end of the warm-up by default.
+        depart_s: when it enters, in s of simulation time; the end of the warm-up by default. Of one that ``replaces``
+            another, the latest time at which that may be expected.
         depart_lane: as SUMO's departLane.
         depart_pos: as SUMO's departPos.
         depart_speed: as SUMO's departSpeed.
@@ -65,6 +68,7 @@ class AgentSetup:
 
     agent: str = DEFAULT_AGENT
     existing: bool = False
+    replaces: str = ""
     type: str = "DEFAULT_VEHTYPE"
     route: str = ""
     edges: tuple[str, ...] = ()

@@ -17,6 +17,7 @@ from ._disturbance import (
     Disturbance as Disturbance,
     in_turn as in_turn,
     steps_of as steps_of,
+    why_not as why_not,
 )
 from ._evidence import Collision as Collision, Escape as Escape, Failure as Failure
 from ._outcome import (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 
     from crashhunt.trial._data import DisturbanceData
 
-__all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of"]
+__all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of", "why_not"]
 
 
 _PLACES = {
@@ -39,24 +40,26 @@ class Kind:
         words: what happens, a sentence; ``share`` stands for the strength in per cent. What is behind a ``|`` is only
             said where there is any strength.
         of_agent: whether it is the agent's own eyes or hands that err: then every simulator can do it.
+        most: the strongest that means anything, such as the whole of a speed.
     """
 
     unit: str
     words: str
     of_agent: bool = False
+    most: float = math.inf
 
 
 KINDS: Mapping[str, Kind] = {
     "brake": Kind("m/s²", "{vehicle} brakes with {strong:.3g} m/s² for {long:g} s"),
     "stop": Kind("m/s²", "{vehicle} stops with {strong:.3g} m/s² and stands, for {long:g} s in all"),
-    "dawdle": Kind("", "{vehicle} drives {share:.0f} % slower than it did for {long:g} s"),
+    "dawdle": Kind("", "{vehicle} drives {share:.0f} % slower than it did for {long:g} s", most=1.0),
     "speed": Kind("", "{vehicle} wants to drive {share:.0f} % faster for {long:g} s"),
     "cut_in": Kind("m/s²", "{vehicle} cuts in on {agent} within {long:g} s| and brakes with {strong:.3g} m/s²"),
     "late_merge": Kind("m", "{vehicle} merges only in the last {strong:.3g} m of its lane, for {long:g} s"),
     "step_out": Kind("m/s", "{vehicle} steps out onto the road with {strong:.3g} m/s, and is back after {long:g} s"),
     "ignore_priority": Kind("", "{vehicle} heeds neither red lights nor priority for {long:g} s"),
     "late_observation": Kind("s", "{agent} sees everything {strong:g} s late for {long:g} s", of_agent=True),
-    "noisy_observation": Kind("", "what {agent} sees is up to {share:.0f} % off for {long:g} s", of_agent=True),
+    "noisy_observation": Kind("", "what {agent} sees is up to {share:.0f} % off for {long:g} s", True, most=1.0),
     "unseen": Kind("", "{agent} does not see {vehicle} for {long:g} s"),
     "late_action": Kind("s", "what {agent} does takes effect {strong:g} s late for {long:g} s", of_agent=True),
 }  # fmt: skip
@@ -152,6 +155,27 @@ class Disturbance:
     def from_json(cls, data: DisturbanceData) -> Disturbance:
         """Rebuild it from plain data."""
         return cls(**known_values(cls, data))
+
+
+def why_not(one: Disturbance) -> tuple[str, str] | None:
+    """Return why nobody can mean such a disturbance, and the fix; None where somebody can.
+
+    Args:
+        one: planned, of whatever kind; the step is not looked at.
+    """
+    kind = KINDS.get(one.what)
+    if not 0 <= one.how_strong < math.inf:
+        return f"{one.how_strong:g} is no strength", "give a number from 0 on"
+    if not 0 < one.how_long < math.inf:
+        return f"{one.how_long:g} is no length", "give seconds above 0"
+    if kind is None:
+        return None
+    if one.how_strong > kind.most:
+        return f"{one.what} of {one.how_strong:g} is more than all", f"give a share of at most {kind.most:g}"
+    if kind.of_agent != (one.who == "itself"):
+        whose = "itself" if kind.of_agent else f"one of {', '.join(cell for cell in CELLS if cell != 'itself')}"
+        return f"{one.what} is not about {one.who!r}", f"it is about {whose}"
+    return None
 
 
 def in_turn(disturbances: Iterable[Disturbance]) -> tuple[Disturbance, ...]:

@@ -120,6 +120,8 @@ def hunt_refused(shell, *more):
         ("brake=11", "more than one a step of 0.1 s"),
         ("cut_in=0.1", "cannot do 'cut_in'; it can do brake, late_action"),
         ("none,brake=1", "none stands alone"),
+        ("brake@101=ahead:4:2", "brake@101: a trial has 9 steps"),
+        ("cut_in@5=left:4:2", "cannot do 'cut_in'; it can do brake, late_action"),
     ],
 )
 def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
@@ -134,6 +136,11 @@ def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
         ("disturbances.{step}.how=2", "'how' is nothing to change"),
         ("disturbances.{step}.how_long=0", "give a number above 0"),
         ("disturbances.{step}.who=above", "'above' is no place"),
+        ("disturbances.{step}.who=itself", "brake is not about 'itself'"),
+        ("disturbances.stop@{step}=none", "none begins at step '7'; they begin at brake@7"),
+        ("disturbances.{step}=ahead:4:2", "is not none; write none, or disturbances.KIND@STEP="),
+        ("disturbances.stop@{step}=ahead:4", "is no disturbance; write KIND@STEP="),
+        ("disturbances=brake@{step}=above:4:2", "'above' is no place"),
     ],
 )
 def test_edits_that_cannot_be_meant(toy, change, says):
@@ -155,3 +162,83 @@ def test_a_stronger_one_and_none(toy):
     assert [one.how_strong for one in found] == [2.0, 6.0]
     assert words == ["disturbances.9.how_strong was 2.0 and is 6.0"]
     assert edited_disturbances(planned, "disturbances", "none") == ((), ["disturbances were 2 and are none"])
+
+
+def test_one_is_added_replaced_and_taken_out():
+    from crashhunt.errors import ArgumentError
+    from crashhunt.replays import edited_disturbances
+    from crashhunt.trial import Disturbance
+
+    planned = (Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego"), Disturbance(7, "ahead", "stop", 2.0, 8.0, "ego"))
+    with pytest.raises(ArgumentError, match=r"brake@7 and stop@7 begin there; write disturbances.brake@7.how_long"):
+        edited_disturbances(planned, "disturbances.7.how_long", "2")
+    found, words = edited_disturbances(planned, "disturbances.brake@7", "none")
+    assert (found, words) == (planned[1:], ["disturbances.brake@7 was brake@7=ahead:2.0:1.0 and is none"])
+    assert edited_disturbances(planned, "disturbances.7", "none")[0] == ()
+    found, words = edited_disturbances(planned, "disturbances.stop@7", "ahead:6:8")
+    assert [one.how_strong for one in found] == [2.0, 6.0]
+    new = Disturbance(3, "left ahead", "cut_in", 4.0, 2.0, "ego")
+    assert edited_disturbances(planned, "disturbances.cut_in@3", "left_ahead:4:2")[0] == (new, *planned)
+    assert edited_disturbances((), "disturbances.cut_in@3", "left ahead:4:2", ["ego"])[0] == (new,)
+    assert edited_disturbances(planned, "disturbances", "cut_in@3=left_ahead:4:2")[0] == (new,)
+    assert edited_disturbances(planned, "disturbances.stop@7", "ahead:2:8") == (planned, [])
+
+
+@pytest.mark.parametrize(
+    ("after", "left", "says", "ignored"),
+    [
+        (["brake=0.3", "stop@20=ahead:1:2"], ["brake", "stop"], "is brake=0.3,stop@20=ahead:1:2", ""),
+        (["brake=0.3", "late_action=1"], ["brake", "drawn"], "is brake=0.3,late_action=1", ""),
+        (["stop@20=ahead:6:8"], ["stop"], "is stop@20=ahead:6:8", ""),
+        (["late_action=1", "stop@20=ahead:6:8"], ["stop", "drawn"], "is late_action=1,stop@20", ""),
+        (["brake=0.1", "late_action=1", "stop@20=ahead:6:8"], ["brake", "stop", "drawn"], "", "was brake=0.3,late"),
+        ([], [], "is none", ""),
+    ],
+)
+def test_disturb_is_edited_in_the_hunts_file(after, left, says, ignored):
+    from crashhunt.replays import with_other_words
+    from crashhunt.trial import Disturbance
+
+    planned = (
+        Disturbance(7, "ahead", "brake", 2.0, 1.0, "ego"),
+        Disturbance(20, "ahead", "stop", 6.0, 8.0, "ego"),
+        Disturbance(30, "itself", "late_action", 0.2, 1.0, "ego"),
+    )
+    before = ("brake=0.3", "late_action=1", "stop@20=ahead:6:8")
+    found, changed, unheard = with_other_words(planned, before, after, ["ego"])
+    assert [{"late_action": "drawn"}.get(one.what, one.what) for one in found if one.what] == left
+    assert bool(changed) == bool(says)
+    assert all(says in words for words in changed)
+    assert bool(unheard) == bool(ignored)
+    assert all(ignored in words for words in unheard)
+    assert with_other_words(planned, before, before, ["ego"]) == (planned, [], [])
+
+
+def test_what_every_trial_has_in_the_hunt_the_scenario_and_the_replay(toy):
+    words = "stop@30=ahead:6:8"
+    done = hunt(toy, "--disturb", words, "--set", "gap_m=5", trials="1")
+    (crash,) = done.json["crashes"]
+    assert crash["disturbed"]
+    assert "log-likelihood" not in done.err
+    assert "Crashes: 0 in undisturbed traffic, 1 with disturbances." in done.err
+    file = toy.folder / "h" / "hunt.toml"
+    assert 'disturb = [\n    "stop@30=ahead:6.0:8.0",\n]' in file.read_text()
+    assert toy.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
+    for change, said in (
+        ("disturbances.30.how_strong=0", "disturbances.30.how_strong was 6.0 and is 0.0"),
+        ("disturbances.stop@30=none", "disturbances.stop@30 was stop@30=ahead:6.0:8.0 and is none"),
+        ("disturbances.brake@40=ahead:1:1", "disturbances.brake@40 was none and is brake@40=ahead:1.0:1.0"),
+    ):
+        assert said in toy.crashhunt("replay", "h", "--set", change, expect=None).out
+    for change, said in (
+        ("disturbances.brake@101=ahead:1:1", "brake@101 is never, as the trial has 100 steps"),
+        ("disturbances.cut_in@40=left:1:1", "the toy cannot do the disturbance 'cut_in'; it can do brake, stop"),
+    ):
+        assert said in toy.crashhunt("replay", "h", "--set", change, expect=2).err
+    file.write_text(file.read_text().replace("stop@30=ahead:6.0", "stop@30=ahead:1.0"))
+    assert "disturb was stop@30=ahead:6.0:8.0 and is" in toy.crashhunt("replay", "h", expect=None).out
+
+    scenario = toy.folder / "toy" / "scenario.toml"
+    scenario.write_text(f'{scenario.read_text()}\n[disturbances]\nbrake = 1\n"stop@30" = "ahead:6:8"\n')
+    hunt(toy, "--overwrite", "--set", "gap_m=5", trials="1")
+    assert '"brake=1.0",\n    "stop@30=ahead:6.0:8.0",' in file.read_text()

@@ -12,7 +12,6 @@ import subprocess
 import time
 from contextlib import closing
 
-import polars as pl
 import pytest
 from conftest import CRASHHUNT, keeps_going
 
@@ -208,6 +207,8 @@ def test_tables_of_trials(toy, made_once):
     assert rows(toy, "h", "--outcome", "collision") == crashes
     said = toy.crashhunt("trials", "h", "--format", "parquet", "--out", "t.parquet")
     assert "t.parquet has 25 trials" in said.err
+    import polars as pl  # which takes a while, wherever this is not run
+
     frame = pl.read_parquet(toy.folder / "t.parquet")
     assert frame["number"].to_list() == list(range(25))
     assert frame["ego.speed"].to_list() == [row["ego.speed"] for row in table]

@@ -10,13 +10,14 @@ import signal
 import sqlite3
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from ray_cluster import head, nodes
 
-pytest.importorskip("ray", reason="Ray is not installed: pip install 'crashhunt[ray]'")
-
+if find_spec("ray") is None:  # to import it takes a while, wherever its tests are not run
+    pytest.skip("Ray is not installed: pip install 'crashhunt[ray]'", allow_module_level=True)
 
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.episode import WorkerSettings

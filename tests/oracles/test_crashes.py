@@ -145,6 +145,22 @@ def test_whoever_turns_within_a_step_is_looked_at_with_what_that_sweeps():
         assert hits(Overlap(), at(0.0, place, 0.0)) == hits(Overlap(), at(math.pi / 2, place, 0.0)) == []
 
 
+@pytest.mark.parametrize("same", [True, False], ids=["as before", "somebody came"])
+def test_whoever_drives_through_early_in_a_step_and_is_far_away_at_its_end_has_hit(same):
+    before = scene(("ego", 0, 0, 0, 0), ("other", -8, 0, 0, 60))
+    fresh = [] if same else [("new", 0, 30, 0, 0)]
+    after = scene(*fresh, ("ego", 0, 0, 0, 0), ("other", 52, 0, 0, 60), time_s=1.0, swept=True)
+    if same:
+        after.roster = before.roster
+    (hit,) = hits(Overlap(), before, after)
+    assert (hit.collider, hit.victim) == ("other", "ego")
+    assert hit.time_s == pytest.approx(3 / 60)
+    # Beside it, and no nearer at any time, nobody is hit.
+    before = scene(("ego", 0, 0, 0, 0), ("other", -8, 2.5, 0, 60))
+    after = scene(*fresh, ("ego", 0, 0, 0, 0), ("other", 52, 2.5, 0, 60), time_s=1.0, swept=True)
+    assert hits(Overlap(), before, after) == []
+
+
 def test_the_nearest_comes_first():
     (first, second) = hits(Overlap(), scene(("ego", 0, 0, 0, 1), ("a", 4.5, 0, 0, 1), ("b", 3, 1, 0, 1)))
     assert (first.victim, second.victim) == ("b", "a")

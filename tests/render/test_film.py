@@ -53,6 +53,11 @@ def test_what_disturbs_is_told_while_it_goes_on():
     pairs = zip(film(plain, panels=False), film(disturbed, panels=False), strict=True)
     changed = [number for number, (was, now) in enumerate(pairs) if (was != now).any()]
     assert changed == [5, 6, 7, 8, 9]
+    words_only = shot()
+    words_only.recording.disturbances = (Disturbance(5, "ahead", "brake", 4.0, 0.5, "ego", "truck.2"),)  # it has left
+    purple = (128, 62, 158)
+    ringed, told = film(disturbed, panels=False)[7], film(words_only, panels=False)[7]
+    assert count(ringed, purple) > count(told, purple) + 20
 
 
 def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:

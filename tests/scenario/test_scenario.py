@@ -193,8 +193,8 @@ def test_a_bare_sumocfg_is_a_scenario(town):
         '<random_number><seed value="7"/></random_number><gui_only><start value="true"/></gui_only>',
     )
     scenario = load_scenario(path)
-    assert list(scenario.agents) == ["odd name #1"]  # departs first
-    assert scenario.agents["odd name #1"].existing
+    assert scenario.agents["ego"].replaces == "vehicle"
+    assert scenario.arguments["vehicle"].range == "late.0|late.1|late.2"  # the first departs before there is traffic
     assert scenario.step_length_s == 0.5
     assert scenario.table(SumoSetup).options == {
         "begin": 5.0,
@@ -203,7 +203,30 @@ def test_a_bare_sumocfg_is_a_scenario(town):
         "time-to-teleport": "300",
     }
     assert scenario.arguments["scale"].option == "scale"
-    assert "odd name #1" in scenario.notes[0]
+    assert "drawn from 3 that depart from 50 to 57 s" in scenario.notes[0]
+
+
+def test_whom_a_controlled_vehicle_may_replace(town):
+    """Whoever departs when there is traffic, on a road, and can be named; of very many, as many as can be looked at."""
+    path = sumocfg(town, '<input><n v="net.net.xml"/><r v="r.rou.xml"/></input>')
+
+    def drawn(demand: str) -> list[str]:
+        (town / "r.rou.xml").write_text(f'<routes><vType id="tram" vClass="tram"/>{demand}</routes>')
+        scenario = load_scenario(path, ego="any")
+        return scenario.arguments["vehicle"].range.split("|") if "vehicle" in scenario.arguments else []
+
+    trips = [f'<trip id="t{at}" depart="{at}" from="a" to="b"/>' for at in range(0, 1000, 10)]
+    assert drawn("".join(trips)) == [f"t{at}" for at in range(200, 501, 10)]
+    assert drawn("".join(trips[:7])) == ["t20", "t30", "t40", "t50", "t60"]  # less of a warm-up
+    tram, odd = '<trip id="x" type="tram" depart="0"/>', '<trip id="a|b" depart="1"/>'
+    assert drawn(trips[0] + tram + odd) == []  # only one is left
+    flow = '<flow id="f" begin="0" end="3600" period="0.5" from="a" to="b"/>'
+    many = drawn(flow)
+    assert len(many) == len(set(many)) == 200
+    assert (many[0], many[-1]) == ("f.400", "f.997")
+    assert drawn('<flow id="f" begin="0" period="9" number="3" from="a" to="b"/>') == ["f.1", "f.2"]
+    (town / "r.rou.xml").write_text("<routes><vehicle id='ego' depart='0'/><vehicle id='b' depart='0'/></routes>")
+    assert list(load_scenario(path).agents) == ["crashhunt.ego"]  # there is one of that name
 
 
 @pytest.mark.parametrize(
@@ -249,7 +272,7 @@ def test_files_beside_and_above_and_compressed(town):
     assert scenario.origin == str(path)
     assert scenario.folder == town
     assert sorted(scenario.files()) == ["net.net.xml", "r.rou.xml.gz"]
-    assert list(scenario.agents) == ["odd name #1"]
+    assert "late.0" in scenario.arguments["vehicle"].range
 
 
 @pytest.mark.parametrize(

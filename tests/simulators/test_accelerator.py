@@ -10,6 +10,11 @@ import subprocess
 import sys
 import weakref
 
+# First: this imports highway-env without what takes most of that time.
+from crashhunt.simulators.highway import HighwaySimulator, restore_classes
+
+# isort: split
+
 import gymnasium
 import highway_env
 import numpy as np
@@ -32,8 +37,8 @@ from crashhunt.simulators.accelerator import (
     switch_off,
     switch_on,
 )
-from crashhunt.simulators.highway import restore_classes
 
+assert HighwaySimulator
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
 BEHAVIOR = "highway_env.vehicle.behavior"
 FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"]

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import closing
 from pathlib import Path
 
+import libsumo
 import numpy as np
 import pytest
 
 from crashhunt.recording import read_log
-from crashhunt.scenario import ObservationSetup, shipped_folder
+from crashhunt.scenario import ObservationSetup, load_scenario, shipped_folder
 from crashhunt.simulators import Kinematics
+from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.world import Actor, Roster, Scene
 
 AGENTS = """
@@ -49,22 +52,55 @@ def town(shell):
     return shell
 
 
-EGOS = {"odd.name#1.0": (), "odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-south,-north")}
+EGOS = {"odd.name#1.2": ("--ego", "odd.name#1.2"), "ego": ("--ego", "edges=-south,-north")}
 
 
-@pytest.mark.parametrize(("agent", "ego"), EGOS.items(), ids=["first", "named", "added"])
+@pytest.mark.parametrize(("agent", "ego"), EGOS.items(), ids=["named", "added"])
 def test_a_network_that_nobody_wrote_for_us(town, agent, ego):
     before = sorted(path.name for path in town.folder.iterdir())
     words = ("run", "h", "2", "3", "100", "--scenario", "town.sumocfg", *ego, "--arg", "speed=5:9", "--keep-going")
     done = town.crashhunt(*words, "--keep-trials", "--json")
     assert done.json["trials_run"] == 3
     assert "invalid" not in done.json["outcomes"]
-    if not ego:
-        assert f"the controlled vehicle is '{agent}'" in done.err
     params = json.loads((town.folder / "h" / "trials" / "000000" / "params.json").read_text())
     assert list(params["spec"]["arguments"]) == [agent]
     # What SUMO writes beside its input files must not end up beside the user's.
     assert sorted(path.name for path in town.folder.iterdir() if path.name != "__pycache__") == sorted([*before, "h"])
+
+
+def test_another_vehicle_is_driven_in_each_trial(town):
+    words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
+    done = town.crashhunt("run", "h", "2", "6", "100", *words, "--json")
+    assert "invalid" not in done.json["outcomes"]
+    assert "takes the place of another one, drawn from 3" in done.err
+    specs = [json.loads(path.read_text())["spec"] for path in (town.folder / "h" / "trials").glob("*/params.json")]
+    assert {"ego"} == {agent for spec in specs for agent in spec["arguments"]}
+    assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1
+    town.crashhunt("run", "one", "1", "1", "20", *words, "--set", "vehicle=odd.name#1.2", "--json")
+    (params,) = (town.folder / "one" / "trials").glob("*/params.json")
+    assert json.loads(params.read_text())["spec"]["scenario_arguments"]["vehicle"] == "odd.name#1.2"
+    nobody = town.crashhunt("run", "none", "1", "1", "20", *words, "--set", "vehicle=nobody", "--json", expect=3)
+    assert "the vehicle 'nobody' was not on the road" in nobody.err
+
+
+def test_who_takes_the_place_of_another_drives_on_from_there(town, tmp_path):
+    """The same traffic as with the other, whose way goes on, one step later, where it was."""
+    scenes = {}
+    for ego in ("odd.name#1.2", "any"):
+        scenario = load_scenario(town.folder / "town.sumocfg", ego=ego)
+        (agent,) = scenario.agents
+        with closing(SumoSimulator(scenario, tmp_path)) as simulator:
+            simulator.reset(seed=4, options={"arguments": {"scale": 1.0, "vehicle": "odd.name#1.2"}})
+            scenes[ego] = scene = simulator.scene()
+            row = scene.roster.index[agent]
+            assert libsumo.vehicle.getRoute(agent) == ("south", "east", "north", "west")
+            if ego == "any":
+                assert "odd.name#1.2" not in libsumo.vehicle.getIDList()
+                was = scenes["odd.name#1.2"]
+                before = was.roster.index["odd.name#1.2"]
+                assert scene.time_s == pytest.approx(was.time_s + scenario.step_length_s)
+                assert scene.points[row] == pytest.approx(was.points[before], abs=3.0)
+                assert scene.speeds[row] == pytest.approx(was.speeds[before], abs=1.0)
 
 
 def test_a_vehicle_that_never_enters_is_invalid(town):

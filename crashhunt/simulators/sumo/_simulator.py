@@ -21,6 +21,7 @@ from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
+from crashhunt.simulators.sumo._entering import enter, replaced_by
 from crashhunt.simulators.sumo._holding import held_back
 from crashhunt.simulators.sumo._left_out import LeftOut
 from crashhunt.simulators.sumo._sight import Sight
@@ -124,7 +125,8 @@ class SumoSimulator:
         global _current
         options = options or {}
         arguments, only = options.get("arguments", {}), options.get("only")
-        self._left_out = None if only is None else LeftOut((*only, *self._scenario.agents))
+        replaced = replaced_by(self._scenario.agents, arguments)
+        self._left_out = None if only is None else LeftOut((*only, *self._scenario.agents, *replaced))
         command = self._files.arguments(seed, arguments)
         try:
             if libsumo.isLoaded():
@@ -133,7 +135,7 @@ class SumoSimulator:
                 libsumo.start([*self._program, *command])
                 _keep_xml_ready()
             _current = weakref.ref(self)
-            self._enter()
+            enter(self._scenario, replaced, self._left_out)
         except _TRACI_ERRORS as error:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._scenario.agents)
@@ -241,63 +243,6 @@ class SumoSimulator:
         """How wide the network is, which the window shows whole at first."""
         (left, _), (right, _) = libsumo.simulation.getNetBoundary()
         return float(right - left)
-
-    def _enter(self) -> None:
-        """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road."""
-        setups = self._scenario.agents
-        begin = libsumo.simulation.getTime()
-        if self._scenario.warmup_s > 0:
-            if self._left_out is not None:
-                self._left_out.warm_up(begin + self._scenario.warmup_s)
-            else:
-                libsumo.simulationStep(begin + self._scenario.warmup_s)
-        for agent, setup in setups.items():
-            if not setup.existing:
-                self._add(agent, setup)
-        waiting = set(setups) - set(sumo.vehicle_getIDList())
-        latest = max((setup.depart_s or 0.0 for setup in setups.values()), default=0.0)
-        deadline = max(libsumo.simulation.getTime(), latest) + self._scenario.insertion_timeout_s
-        while waiting:
-            if libsumo.simulation.getTime() >= deadline:
-                raise InvalidEpisodeError(
-                    f"the vehicle {min(waiting)!r} was not on the road {self._scenario.insertion_timeout_s:g} s after "
-                    "it should have entered",
-                    fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
-                )
-            libsumo.simulationStep()
-            if self._left_out is not None:
-                self._left_out.remove()
-            waiting -= set(libsumo.simulation.getDepartedIDList())
-        gone = set(setups) - set(sumo.vehicle_getIDList())
-        if gone:
-            raise InvalidEpisodeError(
-                f"the vehicle {min(gone)!r} had left again before all controlled vehicles were on the road",
-                fix="let them enter closer together",
-            )
-        for agent, setup in setups.items():
-            sumo.vehicle_setSpeedMode(agent, setup.speed_mode)
-            sumo.vehicle_setLaneChangeMode(agent, 0)
-
-    def _add(self, agent: str, setup: AgentSetup) -> None:
-        route = setup.route
-        if not route:
-            edges = list(setup.edges)
-            if len(edges) == 2:
-                edges = list(libsumo.simulation.findRoute(edges[0], edges[1], setup.type).edges)
-                if not edges:
-                    raise InvalidEpisodeError(f"there is no way from {setup.edges[0]!r} to {setup.edges[1]!r}")
-            route = f"crashhunt.{agent}"
-            libsumo.route.add(route, edges)
-        depart = "now" if setup.depart_s is None else str(max(setup.depart_s, libsumo.simulation.getTime()))
-        libsumo.vehicle.add(
-            agent,
-            route,
-            setup.type,
-            depart=depart,
-            departLane=setup.depart_lane,
-            departPos=setup.depart_pos,
-            departSpeed=setup.depart_speed,
-        )
 
     def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
         setup = self._scenario.agents[agent]

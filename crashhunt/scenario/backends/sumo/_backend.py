@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BACKEND"]
 
-_VEHICLE = ("existing", "type", "route", "edges", "depart_s", "depart_lane", "depart_pos", "depart_speed")
+_VEHICLE = ("existing", "replaces", "type", "route", "edges", "depart_s", "depart_lane", "depart_pos", "depart_speed")
 _DRIVING = ("action", "target_speeds", "speed_mode")
 
 
@@ -131,7 +131,7 @@ BACKEND = Backend(
     told_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
-    configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale",)),),
+    configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     explained=_explained,
     side_effect=_side_effect,

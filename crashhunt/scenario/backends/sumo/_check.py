@@ -39,10 +39,13 @@ def check(scenario: Scenario, where: str) -> None:
                 message = f"has no {name!r}, which {file} asks for"
                 refuse(where, "arguments", sorted(scenario.arguments), message, "declare it")
     for agent, setup in scenario.agents.items():
-        named = [key for key in ("existing", "route", "edges") if getattr(setup, key)]
+        named = [key for key in ("existing", "route", "edges", "replaces") if getattr(setup, key)]
         if len(named) != 1:
-            message = "must have one of existing, route, edges"
+            message = "must have one of existing, route, edges, replaces"
             refuse(where, f"agents.{agent}", named, message, "give exactly one of them")
+        if setup.replaces and setup.replaces not in scenario.arguments:
+            message = "is no scenario argument"
+            refuse(where, f"agents.{agent}.replaces", setup.replaces, message, "declare it: a vehicle's name as a text")
         speeds = setup.target_speeds
         if not speeds or list(speeds) != sorted(set(speeds)):
             refuse(where, f"agents.{agent}.target_speeds", speeds, "does not rise", "list speeds from low to high")

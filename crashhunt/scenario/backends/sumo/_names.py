@@ -47,6 +47,8 @@ def check_names(scenario: Scenario, ego: str = "") -> None:
         if not open_ended:
             if setup.existing:
                 _check_vehicle(agent, demand, f"--ego {ego!r}" if ego else key, scenario.origin)
+            elif setup.replaces:
+                _check_replaced(scenario, setup, demand)
             elif not setup.type.startswith("DEFAULT_"):
                 _check(f"{key}.type", "type", setup.type, demand, scenario.origin)
             if setup.route and not setup.route.startswith("!"):  # SUMO's own name for the route of a vehicle
@@ -63,6 +65,13 @@ def line_of(name: str, files: Iterable[Path]) -> str:
             line = text.count(b"\n", 0, found.start()) + 1
             return f"{file}, line {line}"
     return ""
+
+
+def _check_replaced(scenario: Scenario, setup: AgentSetup, demand: list[bytes]) -> None:
+    """Look up the default alone: a range may name hundreds, and whoever is not there costs a trial, which says so."""
+    name = scenario.arguments[setup.replaces].default
+    if isinstance(name, str):
+        _check_vehicle(name, demand, f"arguments.{setup.replaces}.default", scenario.origin)
 
 
 def _check_edges(scenario: Scenario, setup: AgentSetup, key: str) -> None:

@@ -1,0 +1,230 @@
+"""Who is controlled in a bare ``.sumocfg``: a vehicle that ``--ego`` names or adds, or another one in each trial."""
+
+from __future__ import annotations
+
+import io
+import os
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+from crashhunt.base.errors import ScenarioError
+from crashhunt.scenario._tables import AgentSetup, ArgumentSetup
+from crashhunt.scenario.backends.sumo._xml import nested_files, read_xml
+
+__all__ = ["Ego", "choose_ego", "number", "seconds"]
+
+_EGO = "ego"
+_VEHICLE = "vehicle"  # the argument that says whose place the controlled vehicle takes
+_BUSY_AFTER_S, _WINDOW_S = 200.0, 300.0
+"""Whoever departs in an empty town meets nobody; and what is simulated before a trial is paid in every trial."""
+_MANY = 10_000  # of one flow
+_AT_MOST = 200  # vehicles to draw from, spread over the window
+_NO_ROAD = {"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car", "ship", "aircraft"}
+
+
+@dataclass(frozen=True, slots=True)
+class Ego:
+    """Who is controlled.
+
+    Args:
+        agent: its id.
+        setup: how it gets there.
+        note: what to tell the user.
+        arguments: those of the scenario that it needs.
+    """
+
+    agent: str
+    setup: AgentSetup
+    note: str
+    arguments: dict[str, ArgumentSetup]
+
+
+@dataclass(frozen=True, slots=True)
+class _Departure:
+    """A vehicle that the route files promise."""
+
+    vehicle: str
+    depart_s: float
+
+
+def number(text: str, option: str, path: Path) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ScenarioError(f"{option} = {text!r} is not a number", fix="give a number", where=str(path)) from None
+
+
+def seconds(text: str, path: Path) -> float:
+    try:
+        parts = [float(part) for part in text.split(":")]
+    except ValueError:
+        raise ScenarioError(f"{text!r} is not a time", fix="give seconds", where=str(path)) from None
+    return sum((part * 60.0**power for power, part in enumerate(reversed(parts))), 0.0)
+
+
+def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
+    """Return who is controlled.
+
+    Args:
+        ego: ``VEHICLE``, ``vehicle=ID``, ``route=ID``, ``edges=FROM,TO`` or ``any``; empty: any, if one departs.
+        files: routes and additional files.
+        begin: of the simulation, in s.
+        path: the configuration, for errors.
+
+    Raises:
+        ScenarioError: it says something else, or there is nobody.
+    """
+    kind, _, value = ego.partition("=")
+    if kind == "any" and not value:
+        return _anybody(files, begin, path, "")
+    if ego and not value:
+        kind, value = "vehicle", ego
+    if kind == "route":
+        return Ego(_EGO, AgentSetup(route=value), f"the controlled vehicle is added on the route {value!r}", {})
+    if kind == "edges":
+        edges = tuple(edge for edge in value.split(",") if edge)
+        note = f"the controlled vehicle is added on the edges {', '.join(edges)}"
+        return Ego(_EGO, AgentSetup(edges=edges), note, {})
+    if kind == "vehicle":
+        depart = _departure_of(value, files)
+        return Ego(
+            value, AgentSetup(existing=True, depart_s=depart), f"the controlled vehicle is the vehicle {value!r}", {}
+        )
+    if kind:
+        raise ScenarioError(
+            f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
+        )
+    try:
+        return _anybody(files, begin, path, "no --ego was given: ")
+    except ScenarioError:
+        for route in _elements(files, "route"):
+            if route.get("id"):
+                note = f"no --ego was given and no vehicle departs: one is added on the route {route.get('id')!r}"
+                return Ego(_EGO, AgentSetup(route=str(route.get("id"))), note, {})
+        raise
+
+
+def _anybody(files: list[Path], begin: float, path: Path, why: str) -> Ego:
+    """Draw the vehicle in each trial, of those that depart when there is traffic."""
+    # Who would have departed before the simulation begins never does.
+    known = sorted((one for one in _departures(files) if one.depart_s >= begin), key=lambda one: one.depart_s)
+    if not known:
+        raise ScenarioError(
+            "no vehicle and no route is defined in its files", fix="give --ego edges=FROM,TO", where=str(path)
+        )
+    first, last = known[0].depart_s, known[-1].depart_s
+    since = first + min(_BUSY_AFTER_S, (last - first) / 3)
+    found = [one for one in known if since <= one.depart_s <= since + _WINDOW_S] or known
+    names = list(dict.fromkeys(one.vehicle for one in found if "|" not in one.vehicle)) or [known[0].vehicle]
+    count = len(names)
+    if count == 1:
+        depart = next(one.depart_s for one in known if one.vehicle == names[0])
+        note = f"{why}the controlled vehicle is {names[0]!r}, the only one that departs"
+        return Ego(names[0], AgentSetup(existing=True, depart_s=depart), note, {})
+    if count > _AT_MOST:
+        names = [names[index * count // _AT_MOST] for index in range(_AT_MOST)]
+    agent = next(name for name in (_EGO, f"crashhunt.{_EGO}") if all(one.vehicle != name for one in known))
+    note = (
+        f"{why}in each trial the controlled vehicle takes the place of another one, drawn from {len(names)} that "
+        f"depart from {found[0].depart_s:.0f} to {found[-1].depart_s:.0f} s"
+    )
+    return Ego(
+        agent,
+        AgentSetup(replaces=_VEHICLE, depart_s=found[-1].depart_s),
+        note,
+        {
+            _VEHICLE: ArgumentSetup(
+                range="|".join(names),
+                default=names[0],
+                help="whose place the controlled vehicle takes",
+            )
+        },
+    )
+
+
+def _departures(files: list[Path]) -> list[_Departure]:
+    """The vehicles of the road that can be named before the simulation has run; of a flow, the first."""
+    found = []
+    elements = _elements(files, "vehicle", "trip", "flow", "vType")
+    elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _NO_ROAD}
+    for element in elements:
+        name, begin = element.get("id", ""), element.get("depart", element.get("begin", "0"))
+        if not name or element.tag == "vType" or element.get("type") in elsewhere:  # no name: the flow of a calibrator
+            continue
+        try:
+            depart = seconds(begin, Path())
+        except ScenarioError:  # "triggered" and the like: nobody knows when
+            continue
+        if element.tag == "flow":
+            found += _of_flow(element, name, depart)
+        else:
+            found.append(_Departure(name, depart))
+    return found
+
+
+def _of_flow(flow: ET.Element, name: str, begin: float) -> list[_Departure]:
+    """The vehicles of a flow that depart until whoever is drawn has."""
+    try:
+        interval = _interval(flow, begin)
+        end = seconds(flow.get("end", "inf"), Path())
+        most = int(number(flow.get("number", "inf"), "number", Path())) if "number" in flow.attrib else _MANY
+        span = min(end - begin, 2 * (_BUSY_AFTER_S + _WINDOW_S))
+        count = max(1, min(most, _MANY, int(span / interval) if interval > 0 else 1))
+    except (ScenarioError, ZeroDivisionError, OverflowError, ValueError):
+        return [_Departure(f"{name}.0", begin)]
+    return [_Departure(f"{name}.{index}", begin + index * interval) for index in range(count)]
+
+
+def _departure_of(vehicle: str, files: list[Path]) -> float:
+    """When a vehicle departs, as far as its files tell; SUMO calls the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
+    flow, _, number = vehicle.rpartition(".")
+    for element in _elements(files, "flow"):
+        if element.get("id") == flow and number.isdecimal():
+            try:
+                begin = seconds(element.get("begin", "0"), Path())
+                return begin + int(number) * _interval(element, begin)
+            except (ScenarioError, ZeroDivisionError):
+                return 0.0
+    return next((found.depart_s for found in _departures(files) if found.vehicle == vehicle), 0.0)
+
+
+def _interval(flow: ET.Element, begin: float) -> float:
+    """The mean time from one vehicle of a flow to the next, in s."""
+
+    def value(attribute: str) -> float:
+        return number(flow.get(attribute, "").removeprefix("exp(").removesuffix(")"), attribute, Path())
+
+    for attribute in ("vehsPerHour", "perHour"):
+        if attribute in flow.keys():  # noqa: SIM118 - an element is no mapping
+            return 3600.0 / value(attribute)
+    if "probability" in flow.keys():  # noqa: SIM118
+        return 1.0 / value("probability")
+    if "number" in flow.keys() and "end" in flow.keys():  # noqa: SIM118
+        return (seconds(flow.get("end", ""), Path()) - begin) / value("number")
+    if flow.get("period", "").startswith("exp("):
+        return 1.0 / value("period")  # exp(rate), in 1/s
+    return value("period")
+
+
+def _elements(files: list[Path], *tags: str) -> list[ET.Element]:
+    found = []
+    for file in (*files, *_nested(files)):
+        try:
+            for _, element in ET.iterparse(io.BytesIO(read_xml(file))):
+                if element.tag in tags:
+                    found.append(element)
+                elif element.tag not in ("routes", "additional"):
+                    element.clear()
+        except (ET.ParseError, LookupError, ValueError) as error:
+            raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=str(file)) from None
+    return found
+
+
+def _nested(files: list[Path]) -> list[Path]:
+    if not files:
+        return []
+    folder = files[0].parent
+    names = tuple(os.path.relpath(file, folder) for file in files)
+    # Vehicles come with <include> only; what else is read is small, and may be no XML at all.
+    return [path for name in nested_files(folder, names) if (path := folder / name).suffix in (".xml", ".gz")]

@@ -1,0 +1,109 @@
+"""How controlled vehicles get onto the road: after the warm-up, added, taken over, or in the place of another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.base.errors import InvalidEpisodeError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.simulators.sumo._left_out import LeftOut
+    from crashhunt.trial import Value
+
+__all__ = ["enter", "replaced_by"]
+
+
+def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
+    """Return the vehicles of the traffic whose places are taken, each with the agent that takes it."""
+    return {str(arguments.get(setup.replaces, "")): agent for agent, setup in agents.items() if setup.replaces}
+
+
+def enter(scenario: Scenario, replaced: Mapping[str, str], left_out: LeftOut | None) -> None:
+    """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road.
+
+    Args:
+        scenario: whose agents.
+        replaced: vehicles of the traffic to the agents that take their places.
+        left_out: who of the traffic takes no part; None where all do.
+
+    Raises:
+        InvalidEpisodeError: one of them did not enter in time, or had left again.
+    """
+    setups = scenario.agents
+    begin = libsumo.simulation.getTime()
+    if scenario.warmup_s > 0:
+        if left_out is not None:
+            left_out.warm_up(begin + scenario.warmup_s)
+        else:
+            libsumo.simulationStep(begin + scenario.warmup_s)
+    for agent, setup in setups.items():
+        if not setup.existing and not setup.replaces:
+            _add(agent, setup)
+    waiting = set(setups) - set(sumo.vehicle_getIDList())
+    latest = max((setup.depart_s or 0.0 for setup in setups.values()), default=0.0)
+    deadline = max(libsumo.simulation.getTime(), latest) + scenario.insertion_timeout_s
+    while waiting:
+        if libsumo.simulation.getTime() >= deadline:
+            name = min(waiting)
+            name = next((vehicle for vehicle, agent in replaced.items() if agent == name), name)
+            raise InvalidEpisodeError(
+                f"the vehicle {name!r} was not on the road {scenario.insertion_timeout_s:g} s after "
+                "it should have entered",
+                fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
+            )
+        libsumo.simulationStep()
+        if left_out is not None:
+            left_out.remove()
+        departed = set(libsumo.simulation.getDepartedIDList())
+        waiting -= departed
+        for vehicle in departed & replaced.keys():
+            _replace(vehicle, replaced[vehicle])
+    gone = set(setups) - set(sumo.vehicle_getIDList())
+    if gone:
+        raise InvalidEpisodeError(
+            f"the vehicle {min(gone)!r} had left again before all controlled vehicles were on the road",
+            fix="let them enter closer together",
+        )
+    for agent, setup in setups.items():
+        sumo.vehicle_setSpeedMode(agent, setup.speed_mode)
+        sumo.vehicle_setLaneChangeMode(agent, 0)
+
+
+def _add(agent: str, setup: AgentSetup) -> None:
+    route = setup.route
+    if not route:
+        edges = list(setup.edges)
+        if len(edges) == 2:
+            edges = list(libsumo.simulation.findRoute(edges[0], edges[1], setup.type).edges)
+            if not edges:
+                raise InvalidEpisodeError(f"there is no way from {setup.edges[0]!r} to {setup.edges[1]!r}")
+        route = f"crashhunt.{agent}"
+        libsumo.route.add(route, edges)
+    depart = "now" if setup.depart_s is None else str(max(setup.depart_s, libsumo.simulation.getTime()))
+    libsumo.vehicle.add(
+        agent,
+        route,
+        setup.type,
+        depart=depart,
+        departLane=setup.depart_lane,
+        departPos=setup.depart_pos,
+        departSpeed=setup.depart_speed,
+    )
+
+
+def _replace(vehicle: str, agent: str) -> None:
+    """Let an agent drive on from where a vehicle of the traffic is, from the next step on."""
+    route, kind = f"crashhunt.{agent}", libsumo.vehicle.getTypeID(vehicle)
+    lane, place = libsumo.vehicle.getLaneIndex(vehicle), libsumo.vehicle.getLanePosition(vehicle)
+    speed = libsumo.vehicle.getSpeed(vehicle)
+    libsumo.route.add(route, libsumo.vehicle.getRoute(vehicle))
+    libsumo.vehicle.remove(vehicle)
+    libsumo.vehicle.add(
+        agent, route, kind, departLane=str(lane), departPos=repr(place), departSpeed=repr(speed), depart="now"
+    )

@@ -1,0 +1,112 @@
+"""What every trial has in a step that somebody has chosen."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, strategies as st
+
+from crashhunt.disturbances import disturber_of, is_fixed, parse_fixed, parse_rates, word_of
+from crashhunt.errors import UsageError
+from crashhunt.trial import CELLS, KINDS, Disturbance, TrialResult, TrialSpec, why_not
+
+STOP = Disturbance(20, "ahead", "stop", 6.0, 8.0, "ego")
+disturbances = st.builds(
+    Disturbance, st.integers(1, 10**6), st.sampled_from(CELLS), st.sampled_from(list(KINDS)), st.floats(0, 100),
+    st.floats(1e-3, 1e3), st.sampled_from(["ego", "van.2"]),
+).filter(lambda one: why_not(one) is None)  # fmt: skip
+
+
+def disturber(fixed, **rates):
+    return disturber_of(rates, agents=("ego",), step_length_s=0.1, known=("brake", "stop"), fixed=fixed)
+
+
+@given(st.lists(disturbances, unique_by=lambda one: (one.step, one.agent, one.what), max_size=4))
+def test_words_and_disturbances_say_the_same(some):
+    agents = ("ego", "van.2")
+    words = [word_of(one, agents) for one in some]
+    assert parse_fixed(words, agents) == tuple(sorted(some, key=lambda one: (one.step, one.agent, one.what)))
+    assert all(map(is_fixed, words))
+    assert not any(" " in word or "," in word for word in words)
+    assert parse_rates(words) == {}
+
+
+@given(st.text(max_size=30))
+def test_any_word_is_a_disturbance_or_refused(text):
+    try:
+        found = parse_fixed([f"@{text}"], ("ego",))
+        found += parse_fixed([f"brake@{text}"], ("ego",))
+    except UsageError as error:
+        assert error.fix
+    else:
+        assert all(why_not(one) is None and one.step >= 1 for one in found)
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("brake@124", "'brake@124' is no disturbance; write KIND@STEP="),
+        ("brake@0=ahead:4:2", "is no disturbance"),
+        ("brake@-1=ahead:4:2", "is no disturbance"),
+        ("brake@9=ahead:4", "is no disturbance"),
+        ("@9=ahead:4:2", "is no disturbance"),
+        ("brake@9=above:4:2", "'above' is no place"),
+        ("brake@9=ahead:-4:2", "-4 is no strength"),
+        ("brake@9=ahead:much:2", "nan is no strength"),
+        ("brake@9=ahead:4:0", "0 is no length"),
+        ("dawdle@9=ahead:1.5:2", "dawdle of 1.5 is more than all"),
+        ("late_action@9=ahead:1:2", "late_action is not about 'ahead'; it is about itself"),
+        ("brake@9=itself:4:2", "brake is not about 'itself'"),
+        ("van.brake@9=ahead:4:2", "there is no controlled vehicle 'van'"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(word, says):
+    with pytest.raises(UsageError) as caught:
+        parse_fixed([word], ("ego",))
+    assert says in str(caught.value)
+    assert word in str(caught.value)
+
+
+def test_whose_it_is_must_be_said_where_there_are_several():
+    with pytest.raises(UsageError, match=r"does not say around whom.*ego.stop@…"):
+        parse_fixed(["stop@20=ahead:6:8"], ("ego", "van.2"))
+    assert parse_fixed(["van.2.stop@20=ahead:6:8"], ("ego", "van.2"))[0].agent == "van.2"
+    with pytest.raises(UsageError, match="stop begins twice at step 20"):
+        parse_fixed(["stop@20=ahead:6:8", "ego.stop@20=ahead:1:8"], ("ego",))
+
+
+@pytest.mark.parametrize(
+    ("what", "says"), [("cut_in", "cannot do 'cut_in'; it can do brake"), ("hop", "no kind of disturbance 'hop'")]
+)
+def test_what_the_simulator_cannot_do_is_refused(what, says):
+    with pytest.raises(UsageError, match=says):
+        disturber([Disturbance(1, "ahead", what, 1.0, 1.0, "ego")])
+
+
+def test_every_trial_has_it_and_what_is_drawn_besides_is_what_it_was():
+    alone, both = disturber((), brake=1.0).draw(7, 100), disturber((STOP,), brake=1.0).draw(7, 100)
+    assert set(both) == {*alone, STOP}
+    assert list(both) == sorted(both, key=lambda one: one.step)
+    assert STOP not in disturber((STOP,), brake=1.0).draw(7, 19)
+
+
+def test_what_is_fixed_is_no_part_of_the_likelihood():
+    alone, both = disturber((), brake=1.0), disturber((STOP,), brake=1.0)
+    drawn = alone.draw(7, 60)
+    assert math.isclose(both.log_likelihood([*drawn, STOP], 60), alone.log_likelihood(drawn, 60))
+    nothing = disturber((STOP,))
+    result = TrialResult(TrialSpec(0, 1, {}, {}, 60, disturbances=(STOP,)), "survived", steps=60)
+    assert nothing.log_likelihood_of(result) is None
+
+
+def test_where_it_is_fixed_whether_it_is_drawn_as_well_makes_no_difference():
+    """With a rate of one a step, it is drawn in every one; the fixed one is there instead of the drawn."""
+    fixed = Disturbance(3, "ahead", "brake", 9.0, 9.0, "ego")
+    always = disturber((fixed,), brake=10.0)
+    drawn = always.draw(1, 5)
+    assert [one.how_strong == 9.0 for one in drawn] == [False, False, True, False, False]
+    without = [one for one in disturber((), brake=10.0).draw(1, 5) if one.step != 3]
+    model = always.models["brake"]
+    expected = sum(model.log_likelihood(one) for one in without)
+    assert math.isclose(always.log_likelihood(drawn, 5), expected)
