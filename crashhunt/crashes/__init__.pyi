@@ -28,10 +28,12 @@ from ._judgement import (
     AttemptData as AttemptData,
     Judgement as Judgement,
     JudgementData as JudgementData,
+    JudgementVerdict as JudgementVerdict,
     judgement_of as judgement_of,
     with_judgement as with_judgement,
 )
 from ._side_effects import refuse_side_effects as refuse_side_effects
+from ._visible import visible_from as visible_from
 from ._why import (
     Factor as Factor,
     FactorData as FactorData,

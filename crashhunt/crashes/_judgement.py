@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
 
 from crashhunt.base.integrity import typed
 from crashhunt.crashes._why import why_from
@@ -15,12 +15,25 @@ if TYPE_CHECKING:
     from crashhunt.crashes._escape import Ending
     from crashhunt.crashes._why import Why, WhyData
 
-__all__ = ["INTERRUPTED", "Attempt", "AttemptData", "Judgement", "JudgementData", "judgement_of", "with_judgement"]
+__all__ = [
+    "INTERRUPTED",
+    "Attempt",
+    "AttemptData",
+    "Judgement",
+    "JudgementData",
+    "JudgementVerdict",
+    "judgement_of",
+    "with_judgement",
+]
 
 INTERRUPTED = "it was interrupted"
 """Why there is no whole answer where somebody has stopped it."""
 
 _KEY = "judged"
+
+JudgementVerdict = Literal["avoidable", "too late when visible", "invalid", "unknown"]
+"""It could be avoided when the agent could see the other one, or not any more, or never: then the agent was put into
+it, and the trial says nothing about it. Unknown is what the runs do not settle."""
 
 
 class AttemptData(TypedDict):
@@ -43,6 +56,8 @@ class JudgementData(TypedDict):
     runs: int
     why_not: str
     attempts: list[AttemptData]
+    verdict: JudgementVerdict
+    visible_step: int | None
     why: NotRequired[WhyData]
 
 
@@ -79,8 +94,11 @@ class Attempt:
     @property
     def all_later_run(self) -> bool:
         """Whether every step after the last one was run, up to the one before the crash, and ended in a crash."""
-        first = -1 if self.last_step is None else self.last_step
-        return all(self.endings.get(step) in ("hit", "other") for step in range(first + 1, self.end))
+        return self.in_vain_from(0 if self.last_step is None else self.last_step + 1)
+
+    def in_vain_from(self, step: int) -> bool:
+        """Whether it was run from every step from this one on, up to the one before the crash, and each crashed."""
+        return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
     def to_json(self) -> AttemptData:
         """Return plain data."""
@@ -102,11 +120,25 @@ class Judgement:
         attempts: a manoeuvre each.
         why_not: why there is no answer, or not a whole one; empty where there is.
         why: what the collision hangs on; None where nobody asked.
+        visible_step: after which the agent was first shown the other one; None where nobody knows.
     """
 
     attempts: tuple[Attempt, ...] = ()
     why_not: str = ""
     why: Why | None = None
+    visible_step: int | None = None
+
+    @property
+    def verdict(self) -> JudgementVerdict:
+        """Whether it could be avoided, as far as the agent could see what was coming."""
+        best, visible = self.best, self.visible_step
+        if self.avoidable is False and all(attempt.endings[0] == "hit" for attempt in self.attempts):
+            return "invalid"
+        if visible is not None and best is not None and (best.last_step or 0) >= visible:
+            return "avoidable"
+        if visible and self.attempts and all(attempt.in_vain_from(visible) for attempt in self.attempts):
+            return "too late when visible"
+        return "avoidable" if best is not None and visible is None else "unknown"
 
     @property
     def runs(self) -> int:
@@ -138,6 +170,8 @@ class Judgement:
             "runs": self.runs,
             "why_not": self.why_not,
             "attempts": [attempt.to_json() for attempt in self.attempts],
+            "verdict": self.verdict,
+            "visible_step": self.visible_step,
         }
         if self.why is not None:
             found["why"] = self.why.to_json()
@@ -153,7 +187,9 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
             typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
             endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
             attempts.append(Attempt(each["manoeuvre"], bundle.result.steps, endings, each["deceleration"]))
-        return Judgement(tuple(attempts), str(data.get("why_not", "")), why_from(data.get("why")))
+        visible = data.get("visible_step")
+        seen = int(visible) if visible is not None else None
+        return Judgement(tuple(attempts), str(data.get("why_not", "")), why_from(data.get("why")), seen)
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
-from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing
+from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing, visible_from
 from crashhunt.replays._avoiding import CannotError, Search, Tried
 from crashhunt.replays._prepare import ReplayOptions, prepare
 from crashhunt.replays._warm import Reruns, StoppedError
@@ -87,7 +87,7 @@ def judge(
             search.why_not = INTERRUPTED
         finally:
             reruns.close()
-    return replace(search.judgement(), why=found)
+    return replace(search.judgement(), why=found, visible_step=visible_from(rerun.recorded, hit.agent, hit.other))
 
 
 @dataclass(slots=True)

@@ -18,12 +18,14 @@ _BY = {
 }
 
 
-def about_judgement(judgement: Judgement, ago: Callable[[int], str]) -> list[str]:
+def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
     """Return what was found out, a sentence each.
 
     Args:
         judgement: of the crash.
         ago: says when a step was, such as ``0.4 s before, after step 68``.
+        agent: the controlled vehicle.
+        other: whom it collided with.
     """
     best, runs = judgement.best, f"{judgement.runs} {'run' if judgement.runs == 1 else 'runs'}"
     sentences = []
@@ -37,6 +39,16 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str]) -> list[str
             sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
     elif judgement.runs:
         sentences = [f"None of {runs} avoided it, and they do not say that nothing could have."]
+    visible = judgement.visible_step
+    if judgement.verdict == "invalid":
+        sentences.append(f"{agent} was put into it: that is an invalid trial, and says nothing about it.")
+    elif visible is not None and judgement.verdict == "too late when visible":
+        sentences.append(
+            f"When {agent} was first shown {other}, {ago(visible)}, it could not be avoided any more: it was run from "
+            "each step from then on."
+        )
+    elif visible is not None and judgement.runs:
+        sentences.append(f"{agent} was shown {other} {'all the time' if visible == 0 else f'from {ago(visible)}, on'}.")
     if judgement.why_not:
         sentences.append(f"Whether it could have been avoided is not fully known: {judgement.why_not}.")
     return sentences

@@ -232,7 +232,7 @@ class Story:
         if self.judgement is None:
             return []
         why = about_why(self.judgement.why, self._at) if self.judgement.why is not None else []
-        return [*about_judgement(self.judgement, self._ago), *why]
+        return [*about_judgement(self.judgement, self._ago, self.agent, self.other), *why]
 
     def _calculated(self, braking: float) -> str:
         if self.escape is None:

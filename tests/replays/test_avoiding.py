@@ -101,4 +101,23 @@ def test_json_says_what_was_run():
             {"manoeuvre": "brake", "endings": {"7": "avoided", "8": "hit"}, "last_step": 7, "too_late_step": 8,
              "all_later_run": True, "deceleration": 8.0},
         ],
+        "verdict": "avoidable", "visible_step": None,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("endings", "visible", "verdict"),
+    [
+        ({7: "avoided", 8: "hit"}, 7, "avoidable"),
+        ({7: "avoided", 8: "hit"}, 8, "too late when visible"),
+        ({6: "avoided", 8: "hit"}, 7, "unknown"),  # nobody has run what is between
+        ({0: "hit", 7: "hit", 8: "other"}, 7, "invalid"),
+        ({0: "other", 8: "hit"}, 0, "unknown"),  # it could at least have crashed otherwise
+        ({7: "hit", 8: "hit"}, 7, "too late when visible"),
+        ({7: "hit", 8: "unclear"}, 7, "unknown"),
+        ({8: "hit"}, None, "unknown"),
+    ],
+)
+def test_what_came_too_late_to_be_seen_is_told_apart(endings, visible, verdict):
+    judgement = Judgement((Attempt("brake", 9, endings),), visible_step=visible)
+    assert judgement.verdict == verdict
