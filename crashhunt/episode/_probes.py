@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, Literal, cast
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
@@ -27,36 +27,70 @@ __all__ = ["BUDGET", "PROBED", "Probed", "Prober"]
 BUDGET: Final = 4
 """Steps that copies may take for each step of their trial."""
 _HORIZON_S = 5.0  # of simulation time, for which a copy is followed
-_SHARES = 16  # of the strongest, to which the mildest is found
+_SHARES = 16  # of the worst, to which the mildest is found
+_HALF = _SHARES // 2
 _PATIENCE_S = 30.0  # of wall time, for a copy
 _BEGINS = 2  # steps on: what an agent sees late is noticed a step before
 
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A kind of disturbance that copies are asked for.
+    """A kind of disturbance that copies are asked for, and what is milder or worse of it.
 
     Args:
         what: the kind.
-        who: the place in the grid around the agent.
+        who: the places in the grid around the agent, of which one after another is asked.
         most: the strongest that is plausible, in the unit of its kind.
-        how_long: in s.
+        how_long: the longest, in s.
+        least: what is as good as nothing, in the unit of its kind.
+        grade: what is varied: its strength, its length, or nothing: then it happens, which counts as half, or not.
     """
 
     what: str
-    who: str
+    who: tuple[str, ...]
     most: float
     how_long: float
+    least: float = 0.0
+    grade: Literal["strength", "length", "whether"] = "strength"
 
+    def disturbance(self, share: float, who: str, agent: str, step: int) -> Disturbance:
+        """Return one.
+
+        Args:
+            share: how much of it, from 0 to 1.
+            who: which of the places.
+            agent: around whom.
+            step: in which it begins.
+        """
+        strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
+        long = share * self.how_long if self.grade == "length" else self.how_long
+        return Disturbance(step, who, self.what, strong, long, agent)
+
+
+_ANY_SIDE = ("left ahead", "right ahead", "left", "right")
 
 PROBED: Final = (
-    Probed("brake", "ahead", 6.0, 3.0),
-    Probed("stop", "ahead", 6.0, 8.0),
-    Probed("late_action", "itself", 1.0, 3.0),
-    Probed("late_observation", "itself", 1.0, 3.0),
-    Probed("noisy_observation", "itself", 0.2, 3.0),
+    Probed("brake", ("ahead",), 6.0, 3.0),
+    Probed("stop", ("ahead",), 6.0, 8.0),
+    Probed("late_action", ("itself",), 1.0, 3.0),
+    Probed("late_observation", ("itself",), 1.0, 3.0),
+    Probed("noisy_observation", ("itself",), 0.2, 3.0),
+    Probed("cut_in", _ANY_SIDE, 0.0, 4.0, grade="whether"),
+    Probed("unseen", ("ahead", *_ANY_SIDE), 1.0, 4.0, grade="length"),
+    Probed("ignore_priority", _ANY_SIDE, 1.0, 5.0, grade="length"),
+    Probed("late_merge", _ANY_SIDE, 5.0, 10.0, least=50.0),
+    Probed("step_out", ("right ahead", "left ahead"), 1.4, 6.0, grade="whether"),
+    Probed("dawdle", ("ahead",), 0.5, 10.0),
+    Probed("speed", ("behind",), 0.5, 10.0),
 )
-"""Those whose strength begins at nothing, as strong as the models draw them at most."""
+"""All that come with crashhunt, as strong and as long as the models draw them at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    kind: Probed
+    who: str
+    agent: str
 
 
 class Prober:
@@ -86,20 +120,48 @@ class Prober:
 
     def ask(self, episode: Episode) -> None:
         """Find the mildest disturbance of each kind with which the episode crashes soon, if there is a milder one."""
-        simulator = episode.simulator
-        able = (*(simulator.disturbing_kinds if offers(simulator, Disturbs) else ()), *OF_AGENT)
-        asked = [(kind, episode.names[number]) for kind in PROBED if kind.what in able for number in episode.acting]
-        turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
-        self._moment += 1
         self._goes_on = False
+        if self._stress.margin <= 1 / _SHARES:
+            return
         try:
-            for kind, agent in asked[turn:] + asked[:turn]:
-                if self._stress.steps >= BUDGET * episode.steps:
+            asked = self._questions(episode)
+            turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
+            self._moment += 1
+            for question in asked[turn:] + asked[:turn]:
+                if self._is_spent(episode):
                     self._stress = replace(self._stress, left_out=self._stress.left_out + 1)
-                elif not self._mildest(episode, kind, agent):
+                elif not self._mildest(episode, question):
                     return
         except CrashhuntError as error:
             self.why_not = error.message
+
+    def _is_spent(self, episode: Episode) -> bool:
+        return self._stress.steps >= BUDGET * episode.steps
+
+    def _questions(self, episode: Episode) -> list[_Question]:
+        """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""
+        simulator = episode.simulator
+        kinds = simulator.disturbing_kinds if offers(simulator, Disturbs) else ()
+        every = [
+            _Question(kind, who, episode.names[number])
+            for kind in PROBED
+            if kind.what in kinds or kind.what in OF_AGENT
+            for who in kind.who
+            for number in episode.acting
+        ]
+        others = [] if self._is_spent(episode) else [one for one in every if one.kind.what not in OF_AGENT]
+
+        def look(copy: Episode) -> Plain:
+            who = [one.kind.disturbance(1.0, one.who, one.agent, copy.steps + 1) for one in others]
+            return {
+                "there": [bool(copy.simulator.whom(one)) for one in who] if offers(copy.simulator, Disturbs) else []
+            }
+
+        there = self._in_copy(episode, look).get("there", []) if others else []
+        if self.why_not:
+            return []
+        absent = {one for one, is_there in zip(others, cast("list[bool]", there), strict=False) if not is_there}
+        return [one for one in every if one not in absent]
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the trial with what has been found out; the next one begins."""
@@ -110,27 +172,28 @@ class Prober:
             return result  # nobody was asked, which says nothing
         return replace(result, stress=stress)
 
-    def _mildest(self, episode: Episode, kind: Probed, agent: str) -> bool:
-        """Ask for one kind; return whether there is any point in asking for another."""
+    def _mildest(self, episode: Episode, question: _Question) -> bool:
+        """Ask one question; return whether there is any point in asking another."""
+        kind, step = question.kind, episode.steps + _BEGINS
         low, high = 0, round(self._stress.margin * _SHARES)
-        strength = high - 1
-        while strength > low:
-            disturbance = Disturbance(
-                episode.steps + _BEGINS, kind.who, kind.what, kind.most * strength / _SHARES, kind.how_long, agent
-            )
-            outcome, step = self._copy(episode, disturbance)
+        share = high - 1
+        if kind.grade == "whether":
+            low, share = (_HALF - 1, _HALF) if high > _HALF else (high - 1, high - 1)
+        while share > low:
+            disturbance = kind.disturbance(share / _SHARES, question.who, question.agent, step)
+            outcome, ended = self._copy(episode, disturbance)
             if not outcome:
-                low = strength
+                low = share
             elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
             else:
-                self._goes_on, high = True, strength
+                self._goes_on, high = True, share
                 self._stress = replace(
-                    self._stress, margin=high / _SHARES, disturbance=disturbance, outcome=outcome, step=step
+                    self._stress, margin=high / _SHARES, disturbance=disturbance, outcome=outcome, step=ended
                 )
-            if self.why_not or low == high - 1:
+            if self.why_not or low == high - 1 or kind.grade == "whether":
                 break
-            strength = (low + high) // 2
+            share = (low + high) // 2
         return not self.why_not and self._stress.margin > 1 / _SHARES
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:
@@ -148,16 +211,23 @@ class Prober:
             outcome = str(copy.result.outcome) if copy.result is not None else ""
             return {"steps": copy.steps - began, "step": copy.steps, "outcome": outcome}
 
-        began = time.monotonic()
-        try:
-            asked = episode.fork(follow, observed=False)
-            answer = asked.answer(_PATIENCE_S)
-        finally:
-            self._delay(time.monotonic() - began)
-        if answer is None:
-            self.why_not = asked.raised or "a copy died, or hung"
+        answer = self._in_copy(episode, follow)
+        if not answer:
             return "", 0
         steps, outcome = cast(int, answer["steps"]), str(answer["outcome"])
         self._stress = replace(self._stress, probes=self._stress.probes + 1, steps=self._stress.steps + steps)
         crashed = outcome in self._crashes and outcome != Outcome.SIMULATOR_ERROR
         return (outcome, cast(int, answer["step"])) if crashed else ("", 0)
+
+    def _in_copy(self, episode: Episode, work: Callable[[Episode], Plain]) -> Plain:
+        """Return what a copy answers; nothing where it does not, and then there are no more."""
+        began = time.monotonic()
+        try:
+            asked = episode.fork(work, observed=False)
+            answer = asked.answer(_PATIENCE_S)
+        finally:
+            self._delay(time.monotonic() - began)
+        if answer is None:
+            self.why_not = asked.raised or "a copy died, or hung"
+            return {}
+        return answer

@@ -27,7 +27,8 @@ class Road:
         outcome: of copies that crash.
         after: in how many steps they do.
         doomed: it crashes without any disturbance.
-        absent: kinds for which nobody is there.
+        absent: kinds for which nobody is there when they begin.
+        away: kinds for which nobody is there already before.
         answers: whether copies answer at all.
     """
 
@@ -37,6 +38,7 @@ class Road:
     after: int = 7
     doomed: bool = False
     absent: tuple[str, ...] = ()
+    away: tuple[str, ...] = ()
     answers: bool = True
     raised: str = ""
     names: tuple[str, ...] = ("ego",)
@@ -48,20 +50,26 @@ class Road:
     @property
     def simulator(self):
         able = {**dict.fromkeys(members(Disturbs), True), "disturbing_kinds": self.kinds} if self.kinds else {}
+        if self.kinds:
+            able["whom"] = lambda one: "" if one.what in self.away else "somebody"
         return SimpleNamespace(step_length_s=DT, **able)
 
     def fork(self, work, *, observed=True):
         assert not observed
         copy = _Copy(self)
         answer = work(copy)
-        self.asked.append(copy.disturbance)
-        self.taken.append(copy.steps - self.steps)
+        if "there" in answer:  # who is, which takes no step
+            assert copy.steps == self.steps
+        else:
+            self.asked.append(copy.disturbance)
+            self.taken.append(copy.steps - self.steps)
         return SimpleNamespace(answer=lambda seconds: answer if self.answers else None, raised=self.raised)
 
 
 class _Copy:
     def __init__(self, road):
         self.road, self.steps, self.result, self.disturbance = road, road.steps, None, None
+        self.simulator = road.simulator
 
     def disturb(self, disturbance):
         self.disturbance = disturbance
@@ -102,7 +110,7 @@ def test_the_mildest_is_found_in_few_copies(share):
     braked = [one.how_strong for one in road.asked if one is not None and one.what == "brake"]
     assert braked[0] == BRAKE * 15 / 16
     assert 1 <= len(braked) <= 5
-    assert stress.probes == len(road.asked) == len(waited)
+    assert stress.probes == len(road.asked) == len(waited) - 1  # which was asked who is there
     assert stress.steps == sum(road.taken)
     assert min(waited) >= 0
     # One copy has gone on without any disturbance: the trial would not have crashed anyway.
@@ -157,6 +165,14 @@ def test_a_copy_is_followed_for_five_seconds_and_only_if_somebody_is_there():
     assert stress_of(asker).steps == 2 + 4 * 52
 
 
+def test_who_is_not_there_is_asked_for_nothing():
+    asker, _ = prober()
+    road = Road({}, away=("brake",))
+    asker.ask(road)
+    assert "brake" not in [one.what for one in road.asked]
+    assert len(road.asked) == 4
+
+
 def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_left_out_each_time():
     asker, _ = prober()
     road = Road({}, steps=20)  # of which copies may take 80
@@ -209,7 +225,7 @@ def test_it_is_due_every_so_often_until_copies_cannot_be_asked():
     assert [step for step in range(1, 21) if asker.is_due(Road({}, steps=step))] == [5, 10, 15, 20]
     road = Road({"brake": 0.5}, answers=False, raised="OSError: no")
     asker.ask(road)
-    assert len(road.asked) == len(waited) == 1
+    assert (road.asked, len(waited)) == ([], 1)  # who is there is not answered already
     assert asker.why_not == "OSError: no"
     assert not asker.is_due(Road({}, steps=5))
     asker, _ = prober(every_s=0.5)
