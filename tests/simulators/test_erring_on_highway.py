@@ -10,25 +10,26 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import Episode, Observer
-from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.scenario import AgentSetup, ObservationSetup, Scenario
 from crashhunt.scenario.backends.highway import HighwaySetup
 from crashhunt.simulators.highway import HighwaySimulator
-from crashhunt.trial import Disturbance, TrialSpec
+from crashhunt.trial import CELLS, Disturbance, TrialSpec
 
 CONFIG = {"simulation_frequency": 5, "policy_frequency": 5, "vehicles_count": 12, "lanes_count": 3, "duration": 999}
-RATES = {"brake": 1.0, "stop": 0.2, "dawdle": 0.5, "speed": 1.0, "cut_in": 1.0}
+RATES = {"brake": 1.0, "stop": 0.2, "dawdle": 0.5, "speed": 1.0, "cut_in": 1.0, "unseen": 1.0}
 
 
 class Idle(Observer):
     """Goes on as it is, and keeps what takes place."""
 
     def __init__(self):
-        self.scenes, self.told = [], []
+        self.scenes, self.told, self.seen = [], [], []
 
     def reset(self, seed):
         pass
 
     def act(self, observation):
+        self.seen.append(observation)
         return 1
 
     def scene(self, step, scene, rewards):
@@ -38,9 +39,11 @@ class Idle(Observer):
         self.told.append(disturbance)
 
 
-def scenario(*, accelerate=True, **config):
-    setup = HighwaySetup(id="highway-fast-v0", config={**CONFIG, **config}, accelerate=accelerate)
-    return Scenario(simulator="highway", agents={"ego": AgentSetup()}, tables={"highway": setup})
+def scenario(*, accelerate=True, env="highway-fast-v0", observation=None, **config):
+    usual = CONFIG if env == "highway-fast-v0" else {"simulation_frequency": 10, "policy_frequency": 5}
+    setup = HighwaySetup(id=env, config={**usual, **config}, accelerate=accelerate)
+    tables = {"highway": setup}
+    return Scenario(simulator="highway", agents={"ego": AgentSetup()}, tables=tables, observation=observation)
 
 
 @pytest.fixture
@@ -146,6 +149,90 @@ def test_somebody_cuts_in_and_nobody_into_a_side(begin):
     assert other.lane_index[2] == 0
 
 
+@pytest.mark.parametrize("observation", [None, ObservationSetup(vehicles=3, features=("presence", "x", "y"))])
+def test_somebody_is_not_seen_for_a_while(begin, observation):
+    """Whoever makes the observation: highway-env itself, or crashhunt's own layout."""
+    episode, idle = begin(planned(3, "unseen", "ahead", 1.0, 0.6), observation=observation)
+    other = place(episode, 1, 40.0)
+    follow(episode, other, 9)
+    seen = [bool(shown[1][0]) for shown in idle.seen[1:]]  # the first was before the others were put away
+    assert seen == [True, True, False, False, False, True, True, True]
+    assert idle.told[0].vehicle
+
+
+def crossing(episode, other_road, meters):
+    """Put the agent before the junction and another one on a road of it, both about to drive straight on."""
+    env = episode.simulator._env
+    road, agent = env.road, env.vehicle
+    for vehicle, (start, inside), along in ((agent, ("o0", "ir0"), 80.0), (None, other_road, meters)):
+        lane = road.network.get_lane((start, inside, 0))
+        if vehicle is None:
+            vehicle = IDMVehicle(
+                road, lane.position(along, 0.0), lane.heading_at(along), 9.0, target_speed=9.0, timer=0
+            )
+        vehicle.position, vehicle.heading = np.array(lane.position(along, 0.0)), lane.heading_at(along)
+        vehicle.speed = 9.0
+        vehicle.lane_index = vehicle.target_lane_index = (start, inside, 0)
+        vehicle.lane = lane
+        vehicle.plan_route_to(f"o{(int(start[1]) + 2) % 4}")
+    road.vehicles[:] = [agent, vehicle]
+    episode.simulator._look(())
+    return vehicle
+
+
+JUNCTION = {"env": "intersection-v0", "initial_vehicle_count": 0, "spawn_probability": 0.0}
+
+
+def test_somebody_ignores_that_others_have_priority(begin):
+    """Of two that come to the junction at once, the one from the minor road gives way, or does not."""
+    least = {}
+    for what in ("ignore_priority", "late_action"):
+        who = "left ahead" if what == "ignore_priority" else "itself"
+        episode, idle = begin(planned(1, what, who, 1.0, 6.0), **JUNCTION)
+        other = crossing(episode, ("o1", "ir1"), 80.0)
+        other.lane.priority = -1
+        episode.simulator._env.vehicle.lane.priority = 3
+        least[what] = min(follow(episode, other, 12))
+        assert bool(idle.told[0].vehicle)
+        assert not (what == "ignore_priority" and getattr(other, "is_yielding", False))
+    assert least["late_action"] < 7.0
+    assert least["ignore_priority"] > 8.5
+
+
+@pytest.mark.parametrize(
+    ("road", "who", "found"),
+    [(("o1", "ir1"), "left ahead", True), (("o3", "ir3"), "right ahead", True), (("o2", "ir2"), "ahead", False)],
+)
+def test_who_crosses_the_agents_way(begin, road, who, found):
+    episode, _ = begin(**JUNCTION)
+    crossing(episode, road, 70.0)
+    places = {cell for cell in CELLS if episode.simulator.whom(planned(1, "ignore_priority", cell, 1.0))}
+    assert places == ({who} if found else set())
+
+
+def test_a_vehicle_merges_only_where_its_lane_ends(begin):
+    episode, idle = begin(planned(2, "late_merge", "right ahead", 15.0, 9.0), env="merge-v0")
+    road, agent = episode.simulator._env.road, episode.simulator._env.vehicle
+    lane = road.network.get_lane(("b", "c", 2))
+    agent.position, agent.lane_index = np.array([235.0, 4.0]), ("b", "c", 1)
+    agent.target_lane_index, agent.lane = agent.lane_index, road.network.get_lane(agent.lane_index)
+    agent.speed = agent.target_speed = 10.0
+    other = IDMVehicle(road, lane.position(20.0, 0.0), 0.0, 15.0, target_speed=15.0, timer=0.0)
+    other.lane_index = other.target_lane_index = ("b", "c", 2)
+    other.lane = lane
+    road.vehicles[:] = [agent, other]
+    episode.simulator._look(())
+    merged = []
+    for _ in range(30):
+        episode.step()
+        if other.target_lane_index[2] == 1 and not merged:
+            merged.append(lane.length - lane.local_coordinates(other.position)[0])
+    assert idle.told[0].vehicle
+    assert merged
+    assert merged[0] <= 15.0
+    assert episode.simulator.disturb(idle.told[0].vehicle, planned(9, "late_merge")) is None  # it is over
+
+
 def test_the_same_with_and_without_the_accelerator(begin):
     drawn = disturber_of(RATES, agents=("ego",), step_length_s=0.2).draw(3, 40)
     found = []
@@ -163,9 +250,9 @@ def test_a_hunt_with_disturbances(shell):
     done = shell.crashhunt("run", "h", "1", "2", "20", *words)
     assert done.json["trials_run"] == 2
     assert (
-        "cannot do 'ignore_priority'"
+        "cannot do 'step_out'"
         in shell.crashhunt(
-            "run", "h2", "1", "2", "20", "--scenario", "highway", "--disturb", "ignore_priority=1", expect=2
+            "run", "h2", "1", "2", "20", "--scenario", "highway", "--disturb", "step_out=1", expect=2
         ).err
     )
 

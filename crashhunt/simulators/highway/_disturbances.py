@@ -7,7 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from highway_env.road.regulation import RegulatedRoad
 from highway_env.vehicle.behavior import IDMVehicle
+
+from crashhunt.simulators.highway._ways import crosses, place_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwayDisturbances"]
 
-_IN_LANE_M, _BESIDE_M = 100.0, 50.0  # who is further away than that is not meant
+_IN_LANE_M, _BESIDE_M, _CROSSING_M = 100.0, 50.0, 80.0  # who is further away than that is not meant
 _GENTLY = 1.5  # m/s²; how a dawdler slows down
 
 
@@ -41,6 +44,32 @@ class HighwayDisturbances:
         for errs in self._erring:
             if not errs.vehicle.crashed:
                 errs.overrule(dt)
+
+    def after_moving(self) -> None:
+        """Undo what the rules of the road have told erring vehicles, before they decide again."""
+        for errs in self._erring:
+            errs.after()
+
+    def whom(self, agent: Any, disturbance: Disturbance) -> Any | None:
+        """Return who is meant; None where nobody is there."""
+        if disturbance.what == "ignore_priority":
+            return self._crossing(agent, disturbance.who)
+        return self.at(agent, disturbance.who)
+
+    def _crossing(self, agent: Any, who: str) -> Any | None:
+        """The nearest one at a place as the crow flies, on a way that crosses the agent's."""
+        if not isinstance(self._road, RegulatedRoad):
+            return None  # where nobody gives way anyway
+        near = []
+        for other in self._road.vehicles:
+            if not isinstance(other, IDMVehicle) or any(other is vehicle for vehicle in self._controlled):
+                continue
+            dx, dy = (other.position - agent.position).tolist()
+            squared = dx * dx + dy * dy
+            if squared <= _CROSSING_M**2 and place_of(agent, other) == who:
+                near.append((squared, other))
+        near.sort(key=lambda found: found[0])
+        return next((other for _, other in near if crosses(self._road.network, agent, other)), None)
 
     def at(self, agent: Any, who: str) -> Any | None:
         """Return the vehicle at a place around an agent, along its lane and those beside it; None where nobody is."""
@@ -68,9 +97,16 @@ class HighwayDisturbances:
         if disturbance.what in ("brake", "stop"):
             errs = _Slows(vehicle, self._let_go, hardest, hardest)
         elif disturbance.what == "dawdle":
-            errs = _Slows(vehicle, self._let_go, strong, _GENTLY, target=(1.0 - strong) * float(vehicle.speed))
+            errs = _Slows(vehicle, self._let_go, strong, _GENTLY, target=max(0.0, 1.0 - strong) * float(vehicle.speed))
         elif disturbance.what == "speed":
             errs = _Speeds(vehicle, self._let_go, strong)
+        elif disturbance.what == "ignore_priority":
+            errs = _Ignores(vehicle, self._let_go, 1.0)
+        elif disturbance.what == "late_merge":
+            left = self._left_of_lane(vehicle)
+            if left is None or vehicle.lane_index != vehicle.target_lane_index:
+                return None
+            errs = _MergesLate(vehicle, self._let_go, min(strong, left))
         else:
             same_road = vehicle.lane_index[:2] == agent.lane_index[:2]
             if not same_road or vehicle.lane_index != vehicle.target_lane_index:
@@ -91,6 +127,14 @@ class HighwayDisturbances:
         self._erring.append(errs)
         return errs
 
+    def _left_of_lane(self, vehicle: Any) -> float | None:
+        """What is left of a lane that ends, in m: lanes are counted from the left, and fewer come after it."""
+        _, end, number = vehicle.lane_index
+        after = self._road.network.graph.get(end, {})
+        if not number or not after or number < min(len(lanes) for lanes in after.values()):
+            return None
+        return _left(vehicle)
+
     def _let_go(self, errs: _Errs) -> None:
         self._erring.remove(errs)
 
@@ -105,6 +149,9 @@ class _Errs:
 
     def overrule(self, dt: float) -> None:
         """Change what it has decided for a sub-step of so many s."""
+
+    def after(self) -> None:
+        """Change what it has been told in a sub-step that is over."""
 
     def keep(self) -> None:
         """Go on; it is overruled in every sub-step anyway."""
@@ -172,12 +219,7 @@ class _CutsIn(_Errs):
             self._brake(self.how_strong, dt)
 
     def _begin(self) -> None:
-        vehicle = self.vehicle
-        for other in vehicle.road.neighbour_vehicles(vehicle, self._lane):
-            room = (vehicle.LENGTH + other.LENGTH) / 2 if other is not None else 0.0
-            if other is not None and abs(vehicle.lane_distance_to(other)) <= room:
-                return
-        vehicle.target_lane_index = self._lane
+        _change(self.vehicle, self._lane)
 
     def end(self) -> None:
         self.vehicle.enable_lane_change = self._before
@@ -207,3 +249,52 @@ class _KeepsLane(_Errs):
     def end(self) -> None:
         self.vehicle.enable_lane_change = self._before
         super().end()
+
+
+class _MergesLate(_Errs):
+    """Stays in a lane that ends until little of it is left, and then changes as soon as nobody is in the very place."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], left: float) -> None:
+        super().__init__(vehicle, let_go, left)
+        start, end, number = self._ending = vehicle.lane_index
+        self._lane = (start, end, number - 1)
+        self._before = vehicle.enable_lane_change
+        vehicle.enable_lane_change = False
+
+    def overrule(self, dt: float) -> None:
+        vehicle = self.vehicle
+        if vehicle.target_lane_index == self._ending and _left(vehicle) <= self.how_strong:
+            _change(vehicle, self._lane)
+
+    def end(self) -> None:
+        self.vehicle.enable_lane_change = self._before
+        super().end()
+
+
+class _Ignores(_Errs):
+    """Goes on as if it had priority: whenever the rules stop it, it drives on."""
+
+    def __init__(self, vehicle: Any, let_go: Callable[[_Errs], None], how_strong: float) -> None:
+        super().__init__(vehicle, let_go, how_strong)
+        self.after()
+
+    def after(self) -> None:
+        vehicle = self.vehicle
+        if getattr(vehicle, "is_yielding", False):  # as `RegulatedRoad` lets it go
+            vehicle.target_speed = vehicle.lane.speed_limit
+            del vehicle.color
+            vehicle.is_yielding = False
+
+
+def _left(vehicle: Any) -> float:
+    """How far it is to the end of its lane, in m."""
+    return float(vehicle.lane.length - vehicle.lane.local_coordinates(vehicle.position)[0])
+
+
+def _change(vehicle: Any, lane: Any) -> None:
+    """Have it change lanes, unless somebody is in the very place."""
+    for other in vehicle.road.neighbour_vehicles(vehicle, lane):
+        room = (vehicle.LENGTH + other.LENGTH) / 2 if other is not None else 0.0
+        if other is not None and abs(vehicle.lane_distance_to(other)) <= room:
+            return
+    vehicle.target_lane_index = lane

@@ -31,9 +31,11 @@ from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, n
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._standstill import Standstill
+from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
+from crashhunt.simulators.highway._left_out import LeftOut
 from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
 
 if TYPE_CHECKING:
@@ -175,13 +177,17 @@ class HighwaySimulator:
         return None
 
     def whom(self, disturbance: Disturbance) -> str:
-        """Return who is at a place around an agent, along the lanes."""
-        found = self._disturbances.at(self._controlled[disturbance.agent], disturbance.who)
+        """Return who is at a place around an agent, along the lanes; of who crosses its way, as the crow flies."""
+        found = self._disturbances.whom(self._controlled[disturbance.agent], disturbance)
         return "" if found is None else self._actor(found).id
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
         """Overrule a vehicle until its disturbance ends."""
         thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
+        if disturbance.what == "unseen":
+            if self._kinematics is not None:
+                return Unseen(self._kinematics, disturbance.agent, vehicle)
+            return LeftOut(self._env.road, self._seeing[disturbance.agent], thing)
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
     def hold(self, vehicle: str, what: str) -> Disturbing | None:
@@ -228,6 +234,8 @@ class HighwaySimulator:
         self._many_see = isinstance(env.observation_type, MultiAgentObservation)
         kinds = env.action_type.agents_action_types if self._many_act else [env.action_type]
         seen = env.observation_space.spaces if self._many_see else [env.observation_space]
+        eyes = env.observation_type.agents_observation_types if self._many_see else [env.observation_type]
+        self._seeing = dict(zip(self._possible, eyes, strict=False))
         self._controlled = dict(zip(self._possible, env.controlled_vehicles, strict=True))
         self._kinds = dict(zip(self._possible, kinds, strict=True))
         self.actions: dict[str, ActionForm] = {agent: _form(kind) for agent, kind in self._kinds.items()}
@@ -287,6 +295,7 @@ class HighwaySimulator:
         def step(dt: float) -> None:
             erring.before_moving(dt)
             advance(dt)
+            erring.after_moving()
             for agent, vehicle in self._controlled.items():
                 if vehicle.crashed and agent not in self._crashed:
                     self._crashed.add(agent)

@@ -76,7 +76,7 @@ class SumoDisturbances:
             if disturbance.what in ("brake", "stop"):
                 return _Slows(vehicle, min(strong, decel), self._dt, how_strong=min(strong, decel))
             if disturbance.what == "dawdle":
-                target = (1.0 - strong) * sumo.vehicle_getSpeed(vehicle)
+                target = max(0.0, 1.0 - strong) * sumo.vehicle_getSpeed(vehicle)
                 return _Slows(vehicle, min(_GENTLY, decel), self._dt, how_strong=strong, target=target)
             if disturbance.what == "speed":
                 return _Speeds(vehicle, strong)
