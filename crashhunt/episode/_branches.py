@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.memory import FREE, free_memory
 from crashhunt.base.plain import finite
-from crashhunt.disturbances import disturber_of, parse_rates
+from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._observer import Observer
 from crashhunt.trial import Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import dangers
@@ -56,7 +56,7 @@ class Brancher(Observer):
     """Has copies of one episode after another go on with other disturbances.
 
     Args:
-        rates: how often what disturbs: ``NAME=RATE`` each.
+        words: how often what disturbs, ``NAME=RATE`` each, or what does in which step.
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
 
@@ -64,8 +64,8 @@ class Brancher(Observer):
         why_not: why there are no branches any more, in words; empty where there are.
     """
 
-    def __init__(self, rates: Sequence[str], crash_on: Sequence[Outcome], delay: Callable[[float], None]) -> None:
-        self._rates = parse_rates(rates)
+    def __init__(self, words: Sequence[str], crash_on: Sequence[Outcome], delay: Callable[[float], None]) -> None:
+        self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
         self.why_not = ""
@@ -125,7 +125,8 @@ class Brancher(Observer):
     def _draws_of(self, episode: Episode) -> Disturber:
         names, dt = episode.names, episode.simulator.step_length_s
         if self._disturber is None or (self._disturber.agents, self._disturber.step_length_s) != (names, dt):
-            self._disturber = disturber_of(self._rates, agents=names, step_length_s=dt)
+            rates, fixed = parse_rates(self._words), parse_fixed(self._words, names)
+            self._disturber = disturber_of(rates, agents=names, step_length_s=dt, fixed=fixed)
         return self._disturber
 
     def _look(self, episode: Episode, now: int) -> None:
