@@ -53,6 +53,8 @@ class Recorder(Observer):
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:
         self._box = box
         self._numbers: dict[Actor, int] = {}
+        self._same: dict[int, int] = {}
+        self._kept: list[Actor] = []
         self._roster: Roster | None = None
         # Where nobody looks for events, none having happened says nothing.
         self._events: Counter[str] | None = Counter() if offers(simulator, TellsEvents) else None
@@ -87,13 +89,7 @@ class Recorder(Observer):
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record a scene, and before it whatever is new about it."""
         if scene.roster is not self._roster:
-            fresh = [actor for actor in scene.roster.actors if actor not in self._numbers]
-            if fresh:
-                self._numbers.update(zip(fresh, itertools.count(len(self._numbers)), strict=False))
-                self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
-            numbers = np.array([self._numbers[actor] for actor in scene.roster.actors], "<u4")
-            self._box.append(Tag.ROSTER, 0, numbers.tobytes())
-            self._roster = scene.roster
+            self._note_roster(scene.roster)
         if scene.lanes:
             self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
         if scene.contacts or scene.off_road:
@@ -107,6 +103,22 @@ class Recorder(Observer):
             if self._events is not None:
                 self._events.update([event.kind for event in scene.events])
         self._box.step(step, scene, rewards)
+
+    def _note_roster(self, roster: Roster) -> None:
+        actors = roster.actors
+        # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
+        numbers = list(map(self._same.get, map(id, actors)))
+        if None in numbers:
+            others = [actor for actor, number in zip(actors, numbers, strict=True) if number is None]
+            fresh = [actor for actor in others if actor not in self._numbers]
+            if fresh:
+                self._numbers.update(zip(fresh, itertools.count(len(self._numbers)), strict=False))
+                self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
+            self._same.update({id(actor): self._numbers[actor] for actor in others})
+            self._kept += others  # so that nobody else gets their identities
+            numbers = [self._same[id(actor)] for actor in actors]
+        self._box.append(Tag.ROSTER, 0, np.array(numbers, "<u4").tobytes())
+        self._roster = roster
 
     def copied(self) -> None:
         """Record elsewhere from now on, after a copy of what there is."""

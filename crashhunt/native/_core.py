@@ -9,23 +9,50 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Core", "Vehicles", "core_for", "why_not"]
+__all__ = ["Columns", "Core", "Part", "Vehicles", "core_for", "why_not"]
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 3
+_INTERFACE = 4
 """Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
 
 Points = list[tuple[float, float]]
+Part = tuple[object, int, list[float], list[float], list[int]]
+"""Successive scenes: the columns of a `Frame`, the row of the agent or -1, of each actor length, width and a number."""
+
+
+class Columns(Protocol):
+    """The numbers of one scene, as they are recorded."""
+
+    points: Points
+    """x and y (m), as new lists, as the others are."""
+    headings: list[float]
+    """In rad."""
+    speeds: list[float]
+    """In m/s."""
+
+    def speed(self, row: int, /) -> float:
+        """Return the speed of an actor, in m/s."""
 
 
 class Vehicles(Protocol):
-    """Some vehicles of the running simulation."""
+    """Some vehicles of the running simulation, and the sizes of all who are with them in a scene."""
 
-    def read(self) -> tuple[Points, list[float], list[float]] | None:
-        """Return points (m), headings (rad) and speeds (m/s); None where libsumo refuses, as its getters will."""
+    def read(self) -> Columns | None:
+        """Return where they are; None where libsumo refuses, as its getters will."""
+
+    def look(self, controlled: Vehicles, squared: float, /) -> Columns | tuple[str, ...] | None:
+        """Return where they are; None where somebody has come, gone, collided, or is on foot.
+
+        Args:
+            controlled: those around whom these vehicles are.
+            squared: where it is not 0 and others are nearer to them than its root, the ids of these, in m².
+        """
+
+
+_Vehicles = Vehicles  # the core has something of the same name
 
 
 class Core(Protocol):
@@ -40,59 +67,95 @@ class Core(Protocol):
             OSError: one is not there.
         """
 
-    def Vehicles(self, ids: tuple[str, ...]) -> Vehicles:  # noqa: N802 - a class
-        """Return vehicles by their ids."""
+    def Vehicles(  # noqa: N802 - a class
+        self, ids: tuple[str, ...], lengths: list[float], widths: list[float], reaches: list[float], /
+    ) -> _Vehicles:
+        """Return vehicles by their ids, with the sizes of all actors of a scene, as `Roster` has them."""
+
+    def columns(
+        self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /
+    ) -> Columns | None:
+        """Return the numbers of a scene in which others than vehicles are; None where they are no lists of numbers."""
 
     def is_coming_or_going(self) -> bool | None:
         """Whether a vehicle has entered or left in the last step."""
 
-    def in_sight(self, controlled: object, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
+    def in_sight(self, controlled: _Vehicles, squared: float, /) -> tuple[tuple[str, ...], Points] | None:
         """Return the ids of all vehicles near some, and where these are; None where libsumo refuses.
 
         Args:
-            controlled: `Vehicles`; those that are not there are left out.
+            controlled: those that are not there are left out.
             squared: the distance below which somebody is near, squared, in m².
         """
 
     def observe(
-        self, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], lengths: list[float],
-        row: int, others: int, distance: float, from_left: float, lateral_speed: float, /,
-    ) -> bytes | None:  # fmt: skip
+        self, columns: Columns, row: int, others: int, distance: float, from_left: float, lateral_speed: float, /
+    ) -> bytes | None:
         """Return the usual observation of `Kinematics`, as float32."""
 
     def within_reach(
-        self, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float],
-        earlier_points: Sequence[object], earlier_headings: Sequence[float], earlier_speeds: Sequence[float],
-        lengths: list[float], widths: list[float], reaches: list[float], row: int, further: float, limit: float, /,
-    ) -> list[int] | None:  # fmt: skip
-        """Return the rows that the oracle ``overlap`` looks at, nearest first."""
+        self, columns: Columns, earlier: Columns, row: int, step_s: float, hardest: float, /
+    ) -> list[int] | None:
+        """Return the rows that the oracle ``overlap`` looks at, nearest first.
+
+        Args:
+            columns: of a scene.
+            earlier: of the same actors, in the scene before.
+            row: whom they may touch.
+            step_s: the time between the two, in s.
+            hardest: what nobody has braked with more, in m/s².
+        """
 
     def may_be_near(
-        self, columns: object, actors: int, row: int, lengths: list[float], widths: list[float], gap: float,
-        horizon: float, /,
-    ) -> bytes | None:  # fmt: skip
-        """Return who has a part in the closest approach, and perhaps some who have not: int64, scene * actors + row.
+        self, parts: list[Part], gap: float, horizon: float, gap_so_far: float, time_so_far: float,
+        braking_so_far: float, /,
+    ) -> tuple[bytes, bytes] | None:  # fmt: skip
+        """Return who has a part in the closest approach, and perhaps some who have not.
 
         In each scene that has anybody, the agent comes first.
 
         Args:
-            columns: of a `Frame`.
-            actors: how many.
-            row: the agent.
-            lengths: of each, in m.
-            widths: likewise.
+            parts: of an episode, in order.
             gap: what is further apart does not count, in m.
             horizon: what touches later does not count, in s.
+            gap_so_far: who is further apart may be left out, in m.
+            time_so_far: who touches later may be left out, in s,
+            braking_so_far: if that takes less braking than this as well, in m/s².
+
+        Returns:
+            Columns one after another, float64 and int64: x, y, heading, speed, half the length, half the width; the
+            number of the scene, and where the agent is among those found.
         """
 
-    def least_change(self, earlier: Sequence[float], later: Sequence[float], /) -> float | None:
-        """Return the least difference between two lists of numbers; 0 for empty ones."""
+    def tracks(
+        self, parts: list[Part], every: int, within: float, /
+    ) -> tuple[tuple[bytes, bytes], tuple[bytes, bytes]] | None:
+        """Return where an agent was, and who was near it.
+
+        Args:
+            parts: of an episode, in order.
+            every: of how many scenes one is looked at.
+            within: how near, between fronts and without the lengths of both, in m.
+
+        Returns:
+            Twice columns one after another, float64 and int64, for the agent and for the others: x, y, heading, half
+            the length, half the width; of the agent the number of each scene, of the others which of these scenes, and
+            whose number.
+        """
+
+    def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
+        """Return the least change of speed (m/s) between two scenes; 0 where nobody is there."""
 
     def write_step(
         self, buffer: object, offset: int, tag: int, step: int, time_s: float, rewards: tuple[float, ...],
-        points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /,
+        columns: Columns, phase: int, /,
     ) -> int | None:  # fmt: skip
-        """Write the record of a step; return where it ends."""
+        """Write the record of a step, and where the process is; return where the record ends."""
+
+    def write_array(
+        self, buffer: object, offset: int, tag: int, agent: int, array: object, step: int, phase: int, /
+    ) -> int | None:
+        """Write the record of an array, and where the process is; return where the record ends."""
 
 
 @cache

@@ -39,10 +39,20 @@ typedef double (*NumberOf)(const std::string &);
 typedef int (*Count)();
 typedef std::vector<std::string> (*Names)();
 
+// libsumo::TraCICollision: only whether there is one is asked, but who is given one has to do away with it.
+struct Collision {
+    std::string collider, victim, collider_type, victim_type;
+    double collider_speed, victim_speed;
+    std::string type, lane;
+    double position;
+};
+typedef std::vector<Collision> (*Collisions)();
+
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    Count departed, arrived, vanishing, appearing;
+    Count departed, arrived, vanishing, appearing, on_foot;
+    Collisions collisions;
     Names everybody;
     bool bound;
 };
@@ -77,6 +87,8 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo10Simulation17getDepartedNumberEv", found.departed) &&
                  find(library, "_ZN7libsumo10Simulation16getArrivedNumberEv", found.arrived) &&
                  find(library, "_ZN7libsumo10Simulation25getStartingTeleportNumberEv", found.vanishing) &&
+                 find(library, "_ZN7libsumo6Person10getIDCountEv", found.on_foot) &&
+                 find(library, "_ZN7libsumo10Simulation13getCollisionsEv", found.collisions) &&
                  find(library, "_ZN7libsumo10Simulation23getEndingTeleportNumberEv", found.appearing);
     dlclose(library); // Python keeps it loaded
     if (!whole) {
@@ -94,169 +106,36 @@ bool unbound() {
     return !sumo.bound;
 }
 
+bool coming_or_going() {
+    return sumo.departed() || sumo.arrived() || sumo.vanishing() || sumo.appearing();
+}
+
 PyObject *is_coming_or_going(PyObject *, PyObject *) {
     if (unbound()) {
         return nullptr;
     }
     try {
-        return PyBool_FromLong(sumo.departed() || sumo.arrived() || sumo.vanishing() || sumo.appearing());
+        return PyBool_FromLong(coming_or_going());
     } catch (...) {
         Py_RETURN_NONE;
     }
 }
 
-// ------------------------------------------------------------------------------------------------- vehicles of a scene
+// --------------------------------------------------------------------------------------------- vehicles, and a scene
 
-struct Vehicles {
-    PyObject_HEAD std::vector<std::string> *ids;
-};
-
-PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *names;
-    if (!PyArg_ParseTuple(arguments, "O!", &PyTuple_Type, &names)) {
-        return nullptr;
-    }
-    Vehicles *self = reinterpret_cast<Vehicles *>(type->tp_alloc(type, 0));
-    if (!self) {
-        return nullptr;
-    }
-    self->ids = new std::vector<std::string>();
-    for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(names); row++) {
-        // As libsumo's own getters take names.
-        PyObject *text = PyUnicode_AsEncodedString(PyTuple_GET_ITEM(names, row), "utf-8", "surrogateescape");
-        if (!text) {
-            Py_DECREF(self);
-            return nullptr;
-        }
-        self->ids->emplace_back(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
-        Py_DECREF(text);
-    }
-    return reinterpret_cast<PyObject *>(self);
-}
-
-void vehicles_free(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete reinterpret_cast<Vehicles *>(object)->ids;
-    type->tp_free(object);
-    Py_DECREF(type);
-}
-
-// A list of which a part has been filled must not be seen by anybody; the garbage collector knows what is empty in it.
-PyObject *vehicles_read(PyObject *object, PyObject *) {
-    if (unbound()) {
-        return nullptr;
-    }
-    const std::vector<std::string> &ids = *reinterpret_cast<Vehicles *>(object)->ids;
-    const Py_ssize_t count = static_cast<Py_ssize_t>(ids.size());
-    PyObject *points = PyList_New(count), *headings = PyList_New(count), *speeds = PyList_New(count);
-    bool good = points && headings && speeds, ours = true;
-    try {
-        for (Py_ssize_t row = 0; good && row < count; row++) {
-            const std::string &id = ids[static_cast<size_t>(row)];
-            const Position place = sumo.position(id, false);
-            // SUMO's angles are in degrees, clockwise from north.
-            const double heading = (90.0 - sumo.angle(id)) * (3.141592653589793 / 180.0), speed = sumo.speed(id);
-            PyObject *x = PyFloat_FromDouble(place.x), *y = PyFloat_FromDouble(place.y);
-            PyObject *point = x && y ? PyTuple_New(2) : nullptr;
-            if (point) {
-                PyTuple_SET_ITEM(point, 0, x);
-                PyTuple_SET_ITEM(point, 1, y);
-            } else {
-                Py_XDECREF(x);
-                Py_XDECREF(y);
-            }
-            PyList_SET_ITEM(points, row, point);
-            PyList_SET_ITEM(headings, row, PyFloat_FromDouble(heading));
-            PyList_SET_ITEM(speeds, row, PyFloat_FromDouble(speed));
-            good = point && PyList_GET_ITEM(headings, row) && PyList_GET_ITEM(speeds, row);
-        }
-    } catch (...) { // libsumo's own exceptions: its getters raise the same, as Python's
-        good = ours = false;
-    }
-    PyObject *found = good ? PyTuple_Pack(3, points, headings, speeds) : nullptr;
-    Py_XDECREF(points);
-    Py_XDECREF(headings);
-    Py_XDECREF(speeds);
-    if (!ours) {
-        Py_RETURN_NONE;
-    }
-    return found;
-}
-
-// in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
-// As Sight._look_around of crashhunt/simulators/sumo/_sight.py: who is near one of the controlled vehicles, and where
-// these are.
-PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 2 || strcmp(Py_TYPE(given[0])->tp_name, "_crashhunt_core.Vehicles") != 0) {
-        PyErr_SetString(PyExc_TypeError, "in_sight takes vehicles and a number");
-        return nullptr;
-    }
-    const double within = PyFloat_AsDouble(given[1]);
-    if (unbound() || PyErr_Occurred()) {
-        return nullptr;
-    }
-    static std::vector<std::string> names;
-    static std::vector<double> places;
-    std::vector<size_t> eyes;
-    places.clear();
-    try {
-        names = sumo.everybody();
-        for (const std::string &name : names) {
-            const Position place = sumo.position(name, false);
-            places.push_back(place.x);
-            places.push_back(place.y);
-        }
-    } catch (...) {
-        Py_RETURN_NONE;
-    }
-    for (const std::string &eye : *reinterpret_cast<Vehicles *>(given[0])->ids) {
-        const size_t row = static_cast<size_t>(std::find(names.begin(), names.end(), eye) - names.begin());
-        if (row < names.size()) {
-            eyes.push_back(row);
-        }
-    }
-    PyObject *ids = PyList_New(0), *points = PyList_New(0);
-    bool good = ids && points;
-    for (size_t eye : eyes) {
-        PyObject *point = good ? Py_BuildValue("(dd)", places[2 * eye], places[2 * eye + 1]) : nullptr;
-        good = point && PyList_Append(points, point) == 0;
-        Py_XDECREF(point);
-    }
-    for (size_t row = 0; good && row < names.size(); row++) {
-        for (size_t eye : eyes) {
-            const double dx = places[2 * row] - places[2 * eye], dy = places[2 * row + 1] - places[2 * eye + 1];
-            if (dx * dx + dy * dy < within) {
-                PyObject *id = PyUnicode_DecodeUTF8(names[row].data(), static_cast<Py_ssize_t>(names[row].size()),
-                                                    "surrogateescape");
-                good = id && PyList_Append(ids, id) == 0;
-                Py_XDECREF(id);
-                break;
-            }
-        }
-    }
-    PyObject *whole = good ? PyList_AsTuple(ids) : nullptr;
-    PyObject *found = whole ? PyTuple_Pack(2, whole, points) : nullptr;
-    Py_XDECREF(whole);
-    Py_XDECREF(ids);
-    Py_XDECREF(points);
-    return found;
-}
-
-// ------------------------------------------------------------------------------------------------------ plain numbers
+PyTypeObject *vehicles_type = nullptr, *columns_type = nullptr; // those of the module that was loaded last
 
 // Numbers of a Python list of floats; anything else is none of ours.
-bool numbers(PyObject *list, std::vector<double> &values) {
+bool numbers_of(PyObject *list, std::vector<double> &values) {
     if (!PyList_CheckExact(list)) {
         return false;
     }
-    const Py_ssize_t count = PyList_GET_SIZE(list);
-    values.resize(static_cast<size_t>(count));
-    for (Py_ssize_t row = 0; row < count; row++) {
+    for (Py_ssize_t row = 0; row < PyList_GET_SIZE(list); row++) {
         PyObject *value = PyList_GET_ITEM(list, row);
         if (!PyFloat_CheckExact(value)) {
             return false;
         }
-        values[static_cast<size_t>(row)] = PyFloat_AS_DOUBLE(value);
+        values.push_back(PyFloat_AS_DOUBLE(value));
     }
     return true;
 }
@@ -266,9 +145,7 @@ bool pairs(PyObject *list, std::vector<double> &values) {
     if (!PyList_CheckExact(list)) {
         return false;
     }
-    const Py_ssize_t count = PyList_GET_SIZE(list);
-    values.resize(static_cast<size_t>(2 * count));
-    for (Py_ssize_t row = 0; row < count; row++) {
+    for (Py_ssize_t row = 0; row < PyList_GET_SIZE(list); row++) {
         PyObject *point = PyList_GET_ITEM(list, row);
         if (!PyTuple_CheckExact(point) || PyTuple_GET_SIZE(point) != 2) {
             return false;
@@ -278,26 +155,348 @@ bool pairs(PyObject *list, std::vector<double> &values) {
             if (!PyFloat_CheckExact(value)) {
                 return false;
             }
-            values[static_cast<size_t>(2 * row + place)] = PyFloat_AS_DOUBLE(value);
+            values.push_back(PyFloat_AS_DOUBLE(value));
         }
     }
     return true;
 }
 
-// One scene; the vectors are used again, as steps are many and scenes are alike.
-struct Scene {
-    std::vector<double> points, headings, speeds;
+// Who may be in a scene: the ids of the vehicles among them, and the sizes of all.
+struct Roster {
+    std::vector<std::string> ids;
+    std::vector<double> lengths, widths, reaches;
+};
+struct Vehicles {
+    PyObject_HEAD Roster *roster;
+};
 
-    bool read(PyObject *points_, PyObject *headings_, PyObject *speeds_) {
-        return pairs(points_, points) && numbers(headings_, headings) && numbers(speeds_, speeds) &&
-               points.size() == 2 * headings.size() && headings.size() == speeds.size();
-    }
-    size_t size() const { return headings.size(); }
+// Numbers of one scene as they are recorded: x and y alternating, all headings, all speeds.
+struct Columns {
+    PyObject_HEAD Vehicles *vehicles;
+    std::vector<double> *values;
+};
+
+struct Scene {
+    size_t size;
+    const double *points, *headings, *speeds;
+    const Roster *roster;
+
+    explicit Scene(const Columns *columns)
+        : size(columns->values->size() / 4), points(columns->values->data()), headings(points + 2 * size),
+          speeds(headings + size), roster(columns->vehicles->roster) {}
     double x(size_t row) const { return points[2 * row]; }
     double y(size_t row) const { return points[2 * row + 1]; }
+    bool sized() const { return roster->lengths.size() == size; }
 };
-Scene present, previous;
-std::vector<double> lengths, widths, reaches;
+
+// Vehicles(ids, lengths, widths, reaches)
+PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
+    PyObject *names, *lengths, *widths, *reaches;
+    if (!PyArg_ParseTuple(arguments, "O!OOO", &PyTuple_Type, &names, &lengths, &widths, &reaches)) {
+        return nullptr;
+    }
+    Vehicles *self = reinterpret_cast<Vehicles *>(type->tp_alloc(type, 0));
+    if (!self) {
+        return nullptr;
+    }
+    Roster *roster = self->roster = new Roster();
+    for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(names); row++) {
+        // As libsumo's own getters take names.
+        PyObject *text = PyUnicode_AsEncodedString(PyTuple_GET_ITEM(names, row), "utf-8", "surrogateescape");
+        if (!text) {
+            Py_DECREF(self);
+            return nullptr;
+        }
+        roster->ids.emplace_back(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
+        Py_DECREF(text);
+    }
+    if (!numbers_of(lengths, roster->lengths) || !numbers_of(widths, roster->widths) || !numbers_of(reaches, roster->reaches) ||
+        roster->lengths.size() != roster->widths.size() || roster->lengths.size() != roster->reaches.size()) {
+        Py_DECREF(self);
+        PyErr_SetString(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
+        return nullptr;
+    }
+    return reinterpret_cast<PyObject *>(self);
+}
+
+void vehicles_free(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    delete reinterpret_cast<Vehicles *>(object)->roster;
+    type->tp_free(object);
+    Py_DECREF(type);
+}
+
+Vehicles *vehicles_of(PyObject *object) {
+    if (Py_TYPE(object) != vehicles_type) {
+        PyErr_SetString(PyExc_TypeError, "these are no vehicles of the core");
+        return nullptr;
+    }
+    return reinterpret_cast<Vehicles *>(object);
+}
+
+Columns *new_columns(Vehicles *vehicles, std::vector<double> &&values) {
+    Columns *self = reinterpret_cast<Columns *>(columns_type->tp_alloc(columns_type, 0));
+    if (self) {
+        Py_INCREF(vehicles);
+        self->vehicles = vehicles;
+        self->values = new std::vector<double>(std::move(values));
+    }
+    return self;
+}
+
+void columns_free(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    Columns *self = reinterpret_cast<Columns *>(object);
+    delete self->values;
+    Py_XDECREF(self->vehicles);
+    type->tp_free(object);
+    Py_DECREF(type);
+}
+
+Columns *columns_of(PyObject *object) {
+    if (Py_TYPE(object) != columns_type) {
+        PyErr_SetString(PyExc_TypeError, "these are no columns of the core");
+        return nullptr;
+    }
+    return reinterpret_cast<Columns *>(object);
+}
+
+// columns(vehicles, points, headings, speeds) -> Columns | None
+PyObject *columns(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    Vehicles *vehicles = count == 4 ? vehicles_of(given[0]) : nullptr;
+    if (!vehicles) {
+        PyErr_SetString(PyExc_TypeError, "columns takes vehicles and three lists");
+        return nullptr;
+    }
+    std::vector<double> values;
+    const bool known = pairs(given[1], values) && numbers_of(given[2], values) && numbers_of(given[3], values);
+    if (!known || PyList_GET_SIZE(given[1]) != PyList_GET_SIZE(given[2]) ||
+        PyList_GET_SIZE(given[1]) != PyList_GET_SIZE(given[3])) {
+        Py_RETURN_NONE;
+    }
+    return reinterpret_cast<PyObject *>(new_columns(vehicles, std::move(values)));
+}
+
+// A list of which a part has been filled must not be seen by anybody; the garbage collector knows what is empty in it.
+PyObject *list_of(const double *values, size_t size) {
+    PyObject *list = PyList_New(static_cast<Py_ssize_t>(size));
+    for (size_t row = 0; list && row < size; row++) {
+        PyObject *value = PyFloat_FromDouble(values[row]);
+        if (!value) {
+            Py_CLEAR(list);
+        } else {
+            PyList_SET_ITEM(list, static_cast<Py_ssize_t>(row), value);
+        }
+    }
+    return list;
+}
+
+PyObject *columns_points(PyObject *object, void *) {
+    const Scene scene(reinterpret_cast<Columns *>(object));
+    PyObject *list = PyList_New(static_cast<Py_ssize_t>(scene.size));
+    for (size_t row = 0; list && row < scene.size; row++) {
+        PyObject *x = PyFloat_FromDouble(scene.x(row)), *y = PyFloat_FromDouble(scene.y(row));
+        PyObject *point = x && y ? PyTuple_New(2) : nullptr;
+        if (!point) {
+            Py_XDECREF(x);
+            Py_XDECREF(y);
+            Py_CLEAR(list);
+            break;
+        }
+        PyTuple_SET_ITEM(point, 0, x);
+        PyTuple_SET_ITEM(point, 1, y);
+        PyList_SET_ITEM(list, static_cast<Py_ssize_t>(row), point);
+    }
+    return list;
+}
+
+PyObject *columns_headings(PyObject *object, void *) {
+    const Scene scene(reinterpret_cast<Columns *>(object));
+    return list_of(scene.headings, scene.size);
+}
+
+PyObject *columns_speeds(PyObject *object, void *) {
+    const Scene scene(reinterpret_cast<Columns *>(object));
+    return list_of(scene.speeds, scene.size);
+}
+
+PyObject *columns_speed(PyObject *object, PyObject *number) {
+    const Scene scene(reinterpret_cast<Columns *>(object));
+    const Py_ssize_t row = PyLong_AsSsize_t(number);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    if (row < 0 || static_cast<size_t>(row) >= scene.size) {
+        PyErr_SetString(PyExc_IndexError, "nobody has this row");
+        return nullptr;
+    }
+    return PyFloat_FromDouble(scene.speeds[row]);
+}
+
+// As max(speeds) of Python's, also of what is not a number.
+double fastest(const Scene &scene) {
+    double most = scene.speeds[0];
+    for (size_t row = 1; row < scene.size; row++) {
+        if (scene.speeds[row] > most) {
+            most = scene.speeds[row];
+        }
+    }
+    return most;
+}
+
+// What libsumo says about vehicles now; throws what its getters throw.
+std::vector<double> read_now(const Roster &roster) {
+    const size_t count = roster.ids.size();
+    std::vector<double> values(4 * count);
+    for (size_t row = 0; row < count; row++) {
+        const std::string &id = roster.ids[row];
+        const Position place = sumo.position(id, false);
+        values[2 * row] = place.x;
+        values[2 * row + 1] = place.y;
+        // SUMO's angles are in degrees, clockwise from north.
+        values[2 * count + row] = (90.0 - sumo.angle(id)) * (3.141592653589793 / 180.0);
+        values[3 * count + row] = sumo.speed(id);
+    }
+    return values;
+}
+
+PyObject *vehicles_read(PyObject *object, PyObject *) {
+    if (unbound()) {
+        return nullptr;
+    }
+    Vehicles *self = reinterpret_cast<Vehicles *>(object);
+    try {
+        return reinterpret_cast<PyObject *>(new_columns(self, read_now(*self->roster)));
+    } catch (...) { // libsumo's own exceptions: its getters raise the same, as Python's
+        Py_RETURN_NONE;
+    }
+}
+
+// Who is near one of some vehicles, as numbers of the names, and the numbers of these vehicles.
+struct Surroundings {
+    std::vector<std::string> names;
+    std::vector<double> places;
+    std::vector<size_t> eyes, near;
+
+    void look(const Roster &controlled, double within) {
+        names = sumo.everybody();
+        places.clear();
+        eyes.clear();
+        near.clear();
+        for (const std::string &name : names) {
+            const Position place = sumo.position(name, false);
+            places.push_back(place.x);
+            places.push_back(place.y);
+        }
+        for (const std::string &eye : controlled.ids) {
+            const size_t row = static_cast<size_t>(std::find(names.begin(), names.end(), eye) - names.begin());
+            if (row < names.size()) {
+                eyes.push_back(row);
+            }
+        }
+        for (size_t row = 0; row < names.size(); row++) {
+            for (size_t eye : eyes) {
+                const double dx = places[2 * row] - places[2 * eye], dy = places[2 * row + 1] - places[2 * eye + 1];
+                if (dx * dx + dy * dy < within) {
+                    near.push_back(row);
+                    break;
+                }
+            }
+        }
+    }
+
+    bool same(const Roster &roster) const {
+        if (near.size() != roster.ids.size()) {
+            return false;
+        }
+        for (size_t number = 0; number < near.size(); number++) {
+            if (names[near[number]] != roster.ids[number]) {
+                return false;
+            }
+        }
+        return true;
+    }
+};
+Surroundings around; // used again: looks are many and alike
+
+// The names of those near, as Python has them.
+PyObject *near_names() {
+    PyObject *ids = PyTuple_New(static_cast<Py_ssize_t>(around.near.size()));
+    for (size_t number = 0; ids && number < around.near.size(); number++) {
+        const std::string &name = around.names[around.near[number]];
+        PyObject *id = PyUnicode_DecodeUTF8(name.data(), static_cast<Py_ssize_t>(name.size()), "surrogateescape");
+        if (!id) {
+            Py_CLEAR(ids);
+        } else {
+            PyTuple_SET_ITEM(ids, static_cast<Py_ssize_t>(number), id);
+        }
+    }
+    return ids;
+}
+
+// Vehicles.look(controlled: Vehicles, distance squared) -> Columns | ids | None
+// What most steps come to: nobody has come or gone, nobody is on foot, nobody has collided. None where any of this is
+// otherwise; the ids of all who are near, where there is a distance and these are others than before.
+PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t count) {
+    Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
+    if (!controlled) {
+        PyErr_SetString(PyExc_TypeError, "look takes vehicles and a number");
+        return nullptr;
+    }
+    const double within = PyFloat_AsDouble(given[1]);
+    if (unbound() || PyErr_Occurred()) {
+        return nullptr;
+    }
+    Vehicles *self = reinterpret_cast<Vehicles *>(object);
+    try {
+        if (coming_or_going() || sumo.on_foot() || !sumo.collisions().empty()) {
+            Py_RETURN_NONE;
+        }
+        if (within > 0) {
+            around.look(*controlled->roster, within);
+            if (!around.same(*self->roster)) {
+                return near_names();
+            }
+        }
+        return reinterpret_cast<PyObject *>(new_columns(self, read_now(*self->roster)));
+    } catch (...) {
+        Py_RETURN_NONE;
+    }
+}
+
+// in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
+// As Sight._in_sight of crashhunt/simulators/sumo/_sight.py: who is near one of the controlled vehicles, and where
+// these are.
+PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
+    if (!controlled) {
+        PyErr_SetString(PyExc_TypeError, "in_sight takes vehicles and a number");
+        return nullptr;
+    }
+    const double within = PyFloat_AsDouble(given[1]);
+    if (unbound() || PyErr_Occurred()) {
+        return nullptr;
+    }
+    try {
+        around.look(*controlled->roster, within);
+    } catch (...) {
+        Py_RETURN_NONE;
+    }
+    PyObject *ids = near_names(), *points = PyList_New(0);
+    bool good = ids && points;
+    for (size_t eye : around.eyes) {
+        PyObject *point = good ? Py_BuildValue("(dd)", around.places[2 * eye], around.places[2 * eye + 1]) : nullptr;
+        good = point && PyList_Append(points, point) == 0;
+        Py_XDECREF(point);
+    }
+    PyObject *found = good ? PyTuple_Pack(2, ids, points) : nullptr;
+    Py_XDECREF(ids);
+    Py_XDECREF(points);
+    return found;
+}
+
+// ----------------------------------------------------------------------------------------------- those near to each other
+
 typedef std::pair<double, size_t> Near; // squared distance of front bumpers, row; sorted as Python sorts such tuples
 std::vector<Near> nearest;
 
@@ -305,7 +504,7 @@ std::vector<Near> nearest;
 bool find_nearest(const Scene &scene, size_t row, double below, size_t wanted) {
     nearest.clear();
     const double x = scene.x(row), y = scene.y(row);
-    for (size_t other = 0; other < scene.size(); other++) {
+    for (size_t other = 0; other < scene.size; other++) {
         const double dx = scene.x(other) - x, dy = scene.y(other) - y;
         const double squared = dx * dx + dy * dy;
         if (std::isnan(squared)) {
@@ -322,24 +521,24 @@ bool find_nearest(const Scene &scene, size_t row, double below, size_t wanted) {
 
 // --------------------------------------------------------------------------------------------------- the observation
 
-// observe(points, headings, speeds, lengths, row, others, distance, from_left, lateral_speed) -> bytes | None
+// observe(columns, row, others, distance, from_left, lateral_speed) -> bytes | None
 PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 9) {
-        PyErr_SetString(PyExc_TypeError, "observe takes nine arguments");
+    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
+    if (!columns) {
+        PyErr_SetString(PyExc_TypeError, "observe takes columns and five numbers");
         return nullptr;
     }
-    const Py_ssize_t asked = PyLong_AsSsize_t(given[4]), others = PyLong_AsSsize_t(given[5]);
-    const double distance = PyFloat_AsDouble(given[6]), from_left = PyFloat_AsDouble(given[7]);
-    const double lateral_speed = PyFloat_AsDouble(given[8]);
+    const Py_ssize_t asked = PyLong_AsSsize_t(given[1]), others = PyLong_AsSsize_t(given[2]);
+    const double distance = PyFloat_AsDouble(given[3]), from_left = PyFloat_AsDouble(given[4]);
+    const double lateral_speed = PyFloat_AsDouble(given[5]);
     if (PyErr_Occurred()) {
         return nullptr;
     }
-    if (!present.read(given[0], given[1], given[2]) || !numbers(given[3], lengths) ||
-        lengths.size() != present.size() || asked < 0 || others < 0 || static_cast<size_t>(asked) >= present.size()) {
-        Py_RETURN_NONE;
-    }
+    const Scene present(columns);
+    const std::vector<double> &lengths = present.roster->lengths;
     const size_t row = static_cast<size_t>(asked), shown = static_cast<size_t>(others);
-    if (!find_nearest(present, row, HUGE_VAL, shown)) {
+    if (!present.sized() || asked < 0 || others < 0 || row >= present.size ||
+        !find_nearest(present, row, HUGE_VAL, shown)) {
         Py_RETURN_NONE;
     }
     const double heading = present.headings[row], speed = present.speeds[row];
@@ -409,7 +608,8 @@ bool overlap(const Rectangle &one, const Rectangle &two, double margin) {
 }
 
 Rectangle outline(const Scene &scene, size_t row) {
-    return {scene.x(row), scene.y(row), scene.headings[row], lengths[row], widths[row]};
+    const Roster &roster = *scene.roster;
+    return {scene.x(row), scene.y(row), scene.headings[row], roster.lengths[row], roster.widths[row]};
 }
 
 struct Moved {
@@ -417,41 +617,47 @@ struct Moved {
 };
 
 // As _moved of crashhunt/oracles/_crashes.py.
-Moved moved(size_t row) {
+Moved moved(const Scene &previous, const Scene &present, size_t row) {
     const double heading = previous.headings[row];
     const double dx = present.x(row) - previous.x(row), dy = present.y(row) - previous.y(row);
     double aside = 2 * fabs(dy * cos(heading) - dx * sin(heading));
     const double turn = present.headings[row] - heading;
     if (turn != 0.0) {
-        aside += fabs(remainder(turn, TAU)) * (reaches[row] + fabs(dx) + fabs(dy));
+        aside += fabs(remainder(turn, TAU)) * (present.roster->reaches[row] + fabs(dx) + fabs(dy));
     }
     return {dx, dy, aside};
 }
 
-// within_reach(points, headings, speeds, earlier points, earlier headings, earlier speeds,
-//              lengths, widths, reaches, row, further, limit) -> list of rows | None
+// within_reach(columns, earlier columns, row, step_s, hardest) -> list of rows | None
+// As _within_reach of crashhunt/oracles/_crashes.py.
 PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 12) {
-        PyErr_SetString(PyExc_TypeError, "within_reach takes twelve arguments");
+    Columns *columns = count == 5 ? columns_of(given[0]) : nullptr;
+    Columns *earlier = columns ? columns_of(given[1]) : nullptr;
+    if (!earlier) {
+        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice and three numbers");
         return nullptr;
     }
-    const Py_ssize_t asked = PyLong_AsSsize_t(given[9]);
-    const double further = PyFloat_AsDouble(given[10]), limit = PyFloat_AsDouble(given[11]);
+    const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
+    const double step_s = PyFloat_AsDouble(given[3]), hardest = PyFloat_AsDouble(given[4]);
     if (PyErr_Occurred()) {
         return nullptr;
     }
-    const bool known = present.read(given[0], given[1], given[2]) && previous.read(given[3], given[4], given[5]) &&
-                       numbers(given[6], lengths) && numbers(given[7], widths) && numbers(given[8], reaches);
-    const size_t size = present.size(), row = static_cast<size_t>(asked);
-    if (!known || previous.size() != size || lengths.size() != size || widths.size() != size ||
-        reaches.size() != size || asked < 0 || row >= size || !find_nearest(present, row, limit, size)) {
+    const Scene present(columns), previous(earlier);
+    const std::vector<double> &reaches = present.roster->reaches;
+    const size_t size = present.size, row = static_cast<size_t>(asked);
+    if (previous.size != size || !present.sized() || !previous.sized() || asked < 0 || row >= size) {
+        Py_RETURN_NONE;
+    }
+    const double further = 2 * (1.5 * (fastest(present) + hardest * step_s) * step_s + 1.0); // as reachable_m has it
+    const double most = 2 * *std::max_element(reaches.begin(), reaches.end()) + further;
+    if (!find_nearest(present, row, most * most, size)) {
         Py_RETURN_NONE;
     }
     PyObject *found = PyList_New(0);
     if (!found || nearest.empty()) {
         return found;
     }
-    const Moved mine = moved(row);
+    const Moved mine = moved(previous, present, row);
     const Rectangle own = outline(present, row), own_before = outline(previous, row);
     for (const Near &near : nearest) {
         const size_t other = near.second;
@@ -459,7 +665,7 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
         if (near.first >= (reach + further) * (reach + further)) {
             continue;
         }
-        const Moved theirs = moved(other);
+        const Moved theirs = moved(previous, present, other);
         const double rx = mine.x - theirs.x, ry = mine.y - theirs.y;
         const double margin = sqrt(rx * rx + ry * ry) + mine.aside + theirs.aside;
         if (!(near.first < (reach + margin) * (reach + margin))) {
@@ -481,18 +687,20 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
     return found;
 }
 
-// least_change(earlier, later) -> float | None: the least of the differences of two lists of numbers; 0 for empty ones
+// least_change(earlier, later) -> float | None: the least of the changes of speed; 0 where nobody is
 PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 2) {
-        PyErr_SetString(PyExc_TypeError, "least_change takes two arguments");
+    Columns *was = count == 2 ? columns_of(given[0]) : nullptr, *is = was ? columns_of(given[1]) : nullptr;
+    if (!is) {
+        PyErr_SetString(PyExc_TypeError, "least_change takes columns twice");
         return nullptr;
     }
-    if (!numbers(given[0], lengths) || !numbers(given[1], widths) || lengths.size() != widths.size()) {
+    const Scene earlier(was), later(is);
+    if (earlier.size != later.size) {
         Py_RETURN_NONE;
     }
-    double least = lengths.empty() ? 0.0 : HUGE_VAL;
-    for (size_t row = 0; row < lengths.size(); row++) {
-        const double change = widths[row] - lengths[row];
+    double least = later.size ? HUGE_VAL : 0.0;
+    for (size_t row = 0; row < later.size; row++) {
+        const double change = later.speeds[row] - earlier.speeds[row];
         if (std::isnan(change)) {
             Py_RETURN_NONE;
         }
@@ -505,110 +713,317 @@ PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
 
 const double SLACK = 1e-6; // m, and relative: what NumPy rounds otherwise is far less
 
-// may_be_near(columns, actors, row, lengths, widths, gap, horizon) -> bytes | None
+// Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors).
+struct Part {
+    Py_buffer buffer = {};
+    bool held = false;
+    size_t scenes = 0, actors = 0;
+    Py_ssize_t own = -1;
+    std::vector<double> lengths, widths;
+    std::vector<int64_t> numbers;
+
+    Part() = default;
+    Part(const Part &) = delete;
+    Part(Part &&other) noexcept
+        : buffer(other.buffer), held(other.held), scenes(other.scenes), actors(other.actors), own(other.own),
+          lengths(std::move(other.lengths)), widths(std::move(other.widths)), numbers(std::move(other.numbers)) {
+        other.held = false;
+    }
+    ~Part() {
+        if (held) {
+            PyBuffer_Release(&buffer);
+        }
+    }
+
+    // False where it is not what the core knows; with an exception set where it is nothing of the kind.
+    bool read(PyObject *given) {
+        if (!PyTuple_CheckExact(given) || PyTuple_GET_SIZE(given) != 5) {
+            PyErr_SetString(PyExc_TypeError, "a part of an episode has five parts itself");
+            return false;
+        }
+        own = PyLong_AsSsize_t(PyTuple_GET_ITEM(given, 1));
+        PyObject *whose = PyTuple_GET_ITEM(given, 4);
+        if (PyErr_Occurred() || !numbers_of(PyTuple_GET_ITEM(given, 2), lengths) ||
+            !numbers_of(PyTuple_GET_ITEM(given, 3), widths) || !PyList_CheckExact(whose)) {
+            return false;
+        }
+        actors = lengths.size();
+        for (Py_ssize_t row = 0; row < PyList_GET_SIZE(whose); row++) {
+            numbers.push_back(PyLong_AsLongLong(PyList_GET_ITEM(whose, row)));
+        }
+        if (PyErr_Occurred() || !actors || widths.size() != actors || numbers.size() != actors || own < -1 ||
+            (own >= 0 && static_cast<size_t>(own) >= actors)) {
+            return false;
+        }
+        if (PyObject_GetBuffer(PyTuple_GET_ITEM(given, 0), &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+            return false;
+        }
+        held = true;
+        const size_t length = static_cast<size_t>(buffer.len);
+        scenes = length / (32 * actors);
+        return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors;
+    }
+    const double *scene(size_t number) const { return static_cast<const double *>(buffer.buf) + number * 4 * actors; }
+};
+
+// All parts of an episode; empty where one is not what the core knows.
+bool read_parts(PyObject *list, std::vector<Part> &parts) {
+    if (!PyList_CheckExact(list)) {
+        PyErr_SetString(PyExc_TypeError, "the parts of an episode are a list");
+        return false;
+    }
+    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(list); number++) {
+        Part part;
+        if (!part.read(PyList_GET_ITEM(list, number))) {
+            return false;
+        }
+        parts.push_back(std::move(part));
+    }
+    return true;
+}
+
+// Columns of numbers, one after another, as bytes.
+template <typename Number> PyObject *bytes_of(const std::vector<std::vector<Number>> &columns) {
+    const size_t size = columns[0].size() * sizeof(Number);
+    PyObject *bytes = PyBytes_FromStringAndSize(nullptr, static_cast<Py_ssize_t>(columns.size() * size));
+    char *place = bytes ? PyBytes_AS_STRING(bytes) : nullptr;
+    for (const std::vector<Number> &column : columns) {
+        if (place && size) {
+            memcpy(place, column.data(), size);
+            place += size;
+        }
+    }
+    return bytes;
+}
+
+PyObject *both(PyObject *one, PyObject *two) {
+    PyObject *pair = one && two ? PyTuple_Pack(2, one, two) : nullptr;
+    Py_XDECREF(one);
+    Py_XDECREF(two);
+    return pair;
+}
+
+// may_be_near(parts, gap, horizon, gap so far, time so far, braking so far) -> (numbers, places) | None
 // The conditions of `approaches` in crashhunt/world/_approach.py with some slack: who fulfils them there does so here.
 PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 7) {
-        PyErr_SetString(PyExc_TypeError, "may_be_near takes seven arguments");
+    if (count != 6) {
+        PyErr_SetString(PyExc_TypeError, "may_be_near takes parts and five numbers");
         return nullptr;
     }
-    const Py_ssize_t all = PyLong_AsSsize_t(given[1]), asked = PyLong_AsSsize_t(given[2]);
-    const double gap = PyFloat_AsDouble(given[5]), horizon = PyFloat_AsDouble(given[6]);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    if (!numbers(given[3], lengths) || !numbers(given[4], widths) || all < 1 || asked < 0 || asked >= all ||
-        lengths.size() != static_cast<size_t>(all) || widths.size() != static_cast<size_t>(all)) {
-        Py_RETURN_NONE;
-    }
-    Py_buffer buffer;
-    if (PyObject_GetBuffer(given[0], &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
-        return nullptr;
-    }
-    const size_t actors = static_cast<size_t>(all), own = static_cast<size_t>(asked), width = 4 * actors;
-    const size_t scenes = static_cast<size_t>(buffer.len) / (8 * width);
-    if (buffer.itemsize != 8 || !buffer.format || !strchr(buffer.format, 'd') ||
-        static_cast<size_t>(buffer.len) != scenes * 8 * width) {
-        PyBuffer_Release(&buffer);
-        Py_RETURN_NONE;
+    const double gap = PyFloat_AsDouble(given[1]), horizon = PyFloat_AsDouble(given[2]);
+    const double gap_so_far = PyFloat_AsDouble(given[3]), time_so_far = PyFloat_AsDouble(given[4]);
+    const double braking_so_far = PyFloat_AsDouble(given[5]);
+    std::vector<Part> parts;
+    if (PyErr_Occurred() || !read_parts(given[0], parts)) {
+        return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
     }
     struct Body {
         double x, y, vx, vy, reach, apart;
     };
-    static std::vector<Body> bodies;
-    static std::vector<int64_t> kept;
-    bodies.resize(actors);
-    kept.clear();
-    for (size_t scene = 0; scene < scenes; scene++) {
-        const double *line = static_cast<const double *>(buffer.buf) + scene * width;
-        for (size_t actor = 0; actor < actors; actor++) {
-            const double heading = line[2 * actors + actor], speed = line[3 * actors + actor];
-            const double c = cos(heading), s = sin(heading), half = lengths[actor] / 2;
-            bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s,
-                             std::hypot(half, widths[actor] / 2), 0.0};
-        }
-        const Body me = bodies[own];
-        double best = HUGE_VAL;
-        for (size_t actor = 0; actor < actors; actor++) {
-            Body &body = bodies[actor];
-            body.apart = std::hypot(body.x - me.x, body.y - me.y);
-            if (actor != own && body.apart - me.reach - body.reach < gap) {
-                best = std::min(best, body.apart - widths[actor] / 2 - widths[own] / 2);
-            }
-        }
-        const size_t before = kept.size();
-        for (size_t actor = 0; actor < actors; actor++) {
-            if (actor == own) {
+    std::vector<Body> bodies;
+    std::vector<std::vector<double>> found(6); // x, y, heading, speed, half length, half width
+    std::vector<std::vector<int64_t>> places(2); // the scene, and where the agent is among those found
+    int64_t step = -1;
+    for (const Part &part : parts) {
+        const size_t actors = part.actors, own = static_cast<size_t>(part.own);
+        bodies.resize(actors);
+        for (size_t scene = 0; scene < part.scenes; scene++) {
+            step++;
+            if (part.own < 0) {
                 continue;
             }
-            const Body &body = bodies[actor];
-            const double dx = body.x - me.x, dy = body.y - me.y, vx = body.vx - me.vx, vy = body.vy - me.vy;
-            const double reach = me.reach + body.reach, bound = body.apart - reach, slack = SLACK * (1 + body.apart);
-            const double speed = sqrt(vx * vx + vy * vy), scale = SLACK * (1 + body.apart) * (1 + speed);
-            // Said in the negative: what is not a number is kept, and left to Python.
-            const bool far = bound > gap + slack || bound > best + slack;
-            const bool harmless = (-(dx * vx + dy * vy) < -scale && body.apart > reach + slack) ||
-                                  fabs(dx * vy - dy * vx) > reach * speed + scale || bound > horizon * speed + scale;
-            if (!(far && harmless)) {
-                if (kept.size() == before) {
-                    kept.push_back(static_cast<int64_t>(scene * actors + own));
+            const double *line = part.scene(scene);
+            for (size_t actor = 0; actor < actors; actor++) {
+                const double heading = line[2 * actors + actor], speed = line[3 * actors + actor];
+                const double c = cos(heading), s = sin(heading), half = part.lengths[actor] / 2;
+                bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s,
+                                 std::hypot(half, part.widths[actor] / 2), 0.0};
+            }
+            const Body me = bodies[own];
+            double best = gap_so_far;
+            for (size_t actor = 0; actor < actors; actor++) {
+                Body &body = bodies[actor];
+                body.apart = std::hypot(body.x - me.x, body.y - me.y);
+                if (actor != own && body.apart - me.reach - body.reach < gap) {
+                    best = std::min(best, body.apart - part.widths[actor] / 2 - part.widths[own] / 2);
                 }
-                kept.push_back(static_cast<int64_t>(scene * actors + actor));
+            }
+            const size_t before = found[0].size();
+            const auto keep = [&](size_t actor) {
+                const double values[] = {line[2 * actor], line[2 * actor + 1], line[2 * actors + actor],
+                                         line[3 * actors + actor], part.lengths[actor] / 2, part.widths[actor] / 2};
+                for (size_t column = 0; column < 6; column++) {
+                    found[column].push_back(values[column]);
+                }
+                places[0].push_back(step);
+                places[1].push_back(static_cast<int64_t>(before));
+            };
+            for (size_t actor = 0; actor < actors; actor++) {
+                if (actor == own) {
+                    continue;
+                }
+                const Body &body = bodies[actor];
+                const double dx = body.x - me.x, dy = body.y - me.y, vx = body.vx - me.vx, vy = body.vy - me.vy;
+                const double reach = me.reach + body.reach, bound = body.apart - reach;
+                const double slack = SLACK * (1 + body.apart), speed = sqrt(vx * vx + vy * vy);
+                const double scale = SLACK * (1 + body.apart) * (1 + speed);
+                // Said in the negative: what is not a number is kept, and left to Python.
+                const bool far = bound > gap + slack || bound > best + slack;
+                const bool harmless = (-(dx * vx + dy * vy) < -scale && body.apart > reach + slack) ||
+                                      fabs(dx * vy - dy * vx) > reach * speed + scale ||
+                                      bound > horizon * speed + scale ||
+                                      // As near as they come, it is no sooner and no harder than once before.
+                                      (bound > slack && bound - slack > time_so_far * (speed + scale) &&
+                                       (speed + scale) * (speed + scale) < 2 * (bound - slack) * braking_so_far);
+                if (!(far && harmless)) {
+                    if (found[0].size() == before) {
+                        keep(own);
+                    }
+                    keep(actor);
+                }
             }
         }
     }
-    PyBuffer_Release(&buffer);
-    return PyBytes_FromStringAndSize(reinterpret_cast<const char *>(kept.data()),
-                                     static_cast<Py_ssize_t>(kept.size() * sizeof(int64_t)));
+    return both(bytes_of(found), bytes_of(places));
+}
+
+// tracks(parts, every, within) -> (numbers, places) | None, each a pair for the agent and for the others
+// As `_straight` of crashhunt/world/_tracks.py, of every so many scenes.
+PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "tracks takes parts and two numbers");
+        return nullptr;
+    }
+    const long long every = PyLong_AsLongLong(given[1]);
+    const double within = PyFloat_AsDouble(given[2]);
+    std::vector<Part> parts;
+    if (PyErr_Occurred() || every < 1 || !read_parts(given[0], parts)) {
+        return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
+    }
+    std::vector<std::vector<double>> own(5), others(5); // x, y, heading, half length, half width
+    std::vector<std::vector<int64_t>> steps(1), pairs(2); // the scene; the sample and whose
+    int64_t step = -1, sample = -1;
+    for (const Part &part : parts) {
+        const size_t actors = part.actors, row = static_cast<size_t>(part.own);
+        for (size_t scene = 0; scene < part.scenes; scene++) {
+            step++;
+            if (part.own < 0 || step % every) {
+                continue;
+            }
+            sample++;
+            const double *line = part.scene(scene);
+            const auto put = [&](std::vector<std::vector<double>> &columns, size_t actor) {
+                columns[0].push_back(line[2 * actor]);
+                columns[1].push_back(line[2 * actor + 1]);
+                columns[2].push_back(line[2 * actors + actor]);
+                columns[3].push_back(part.lengths[actor] / 2);
+                columns[4].push_back(part.widths[actor] / 2);
+            };
+            put(own, row);
+            steps[0].push_back(step);
+            for (size_t actor = 0; actor < actors; actor++) {
+                const double dx = line[2 * actor] - line[2 * row], dy = line[2 * actor + 1] - line[2 * row + 1];
+                const double reach = within + 2 * (part.lengths[actor] / 2) + 2 * (part.lengths[row] / 2);
+                if (actor != row && dx * dx + dy * dy < reach * reach) {
+                    put(others, actor);
+                    pairs[0].push_back(sample);
+                    pairs[1].push_back(part.numbers[actor]);
+                }
+            }
+        }
+    }
+    return both(both(bytes_of(own), bytes_of(steps)), both(bytes_of(others), bytes_of(pairs)));
 }
 
 // ---------------------------------------------------------------------------------------------------- the black box
 
-// write_step(buffer, offset, tag, step, time_s, rewards, points, headings, speeds) -> end | None
+// Where a process is, as the end of the header says: the last four of BlackBox's.
+void say_where(char *start, size_t committed, long long step, int phase, uint32_t agent) {
+    const uint64_t until = committed;
+    const int64_t number = step;
+    const int32_t what = phase;
+    memcpy(start + 32, &until, 8);
+    memcpy(start + 40, &number, 8);
+    memcpy(start + 48, &what, 4);
+    memcpy(start + 52, &agent, 4);
+}
+
+// write_array(buffer, offset, tag, agent, array, step, phase) -> end | None
+// A record of an array as BlackBox._raw packs it.
+PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    if (count != 7) {
+        PyErr_SetString(PyExc_TypeError, "write_array takes a buffer, an array and five numbers");
+        return nullptr;
+    }
+    const Py_ssize_t offset = PyLong_AsSsize_t(given[1]);
+    const long tag = PyLong_AsLong(given[2]), agent = PyLong_AsLong(given[3]), phase = PyLong_AsLong(given[6]);
+    const long long step = PyLong_AsLongLong(given[5]);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    Py_buffer array, buffer;
+    if (PyObject_GetBuffer(given[4], &array, PyBUF_C_CONTIGUOUS) < 0) {
+        PyErr_Clear(); // such as one that is not in order
+        Py_RETURN_NONE;
+    }
+    if (PyObject_GetBuffer(given[0], &buffer, PyBUF_WRITABLE) < 0) {
+        PyBuffer_Release(&array);
+        return nullptr;
+    }
+    const size_t length = static_cast<size_t>(array.len), padding = -length & 7;
+    const bool fits = offset >= 64 && buffer.len >= offset &&
+                      length + padding + 8 <= static_cast<size_t>(buffer.len - offset) && length <= UINT32_MAX &&
+                      tag >= 0 && tag <= 255 && agent >= 0 && agent <= 65535;
+    if (fits) {
+        char *start = static_cast<char *>(buffer.buf), *place = start + offset;
+        const unsigned char head[2] = {static_cast<unsigned char>(tag), 0};
+        const uint16_t whose = static_cast<uint16_t>(agent);
+        const uint32_t size = static_cast<uint32_t>(length);
+        memcpy(place, head, 2);
+        memcpy(place + 2, &whose, 2);
+        memcpy(place + 4, &size, 4);
+        memcpy(place + 8, array.buf, length);
+        memset(place + 8 + length, 0, padding);
+        say_where(start, static_cast<size_t>(offset) + 8 + length + padding, step, static_cast<int>(phase),
+                  static_cast<uint32_t>(agent));
+    }
+    PyBuffer_Release(&array);
+    PyBuffer_Release(&buffer);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "an array is written beyond the end");
+        return nullptr;
+    }
+    return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + length + padding);
+}
+
+// write_step(buffer, offset, tag, step, time_s, rewards, columns, phase) -> end | None
 // A record of a step as BlackBox.step packs it, little-endian as every machine is for which this is built.
 PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 9) {
-        PyErr_SetString(PyExc_TypeError, "write_step takes nine arguments");
+    Columns *columns = count == 8 ? columns_of(given[6]) : nullptr;
+    if (!columns) {
+        PyErr_SetString(PyExc_TypeError, "write_step takes a buffer, six more and columns");
         return nullptr;
     }
     const Py_ssize_t offset = PyLong_AsSsize_t(given[1]);
     const long tag = PyLong_AsLong(given[2]);
     const long long step = PyLong_AsLongLong(given[3]);
     const double time_s = PyFloat_AsDouble(given[4]);
+    const long phase = PyLong_AsLong(given[7]);
     if (PyErr_Occurred()) {
         return nullptr;
     }
     PyObject *rewards = given[5];
-    if (!present.read(given[6], given[7], given[8]) || !PyTuple_CheckExact(rewards) || tag < 0 || tag > 255) {
+    const std::vector<double> &values = *columns->values;
+    if (!PyTuple_CheckExact(rewards) || tag < 0 || tag > 255) {
         Py_RETURN_NONE;
     }
     const size_t agents = static_cast<size_t>(PyTuple_GET_SIZE(rewards));
-    const size_t payload = 8 * (2 + agents + 4 * present.size());
+    const size_t payload = 8 * (2 + agents + values.size());
     Py_buffer buffer;
     if (PyObject_GetBuffer(given[0], &buffer, PyBUF_WRITABLE) < 0) {
         return nullptr;
     }
-    if (offset < 0 || static_cast<size_t>(offset) + 8 + payload > static_cast<size_t>(buffer.len)) {
+    if (offset < 64 || static_cast<size_t>(offset) + 8 + payload > static_cast<size_t>(buffer.len)) {
         PyBuffer_Release(&buffer);
         PyErr_SetString(PyExc_ValueError, "a step is written beyond the end");
         return nullptr;
@@ -633,17 +1048,20 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
         }
         put(&reward, 8);
     }
-    put(present.points.data(), 8 * present.points.size());
-    put(present.headings.data(), 8 * present.headings.size());
-    put(present.speeds.data(), 8 * present.speeds.size());
+    put(values.data(), 8 * values.size());
+    say_where(static_cast<char *>(buffer.buf), static_cast<size_t>(offset) + 8 + payload, step,
+              static_cast<int>(phase), 0);
     PyBuffer_Release(&buffer);
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + payload);
 }
 
 // ---------------------------------------------------------------------------------------------------------- the module
 
+#define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
+
 PyMethodDef vehicles_methods[] = {
-    {"read", vehicles_read, METH_NOARGS, "Return points, headings (rad) and speeds; None where libsumo refuses."},
+    {"read", vehicles_read, METH_NOARGS, "Return where everybody is; None where libsumo refuses."},
+    {"look", FAST(vehicles_look), "Return where everybody is; None where anything else has happened."},
     {nullptr, nullptr, 0, nullptr},
 };
 PyType_Slot vehicles_slots[] = {
@@ -653,27 +1071,51 @@ PyType_Slot vehicles_slots[] = {
     {Py_tp_doc, const_cast<char *>("Vehicles of the running simulation, by their ids.")},
     {0, nullptr},
 };
+PyMethodDef columns_methods[] = {
+    {"speed", columns_speed, METH_O, "Return the speed of a row."},
+    {nullptr, nullptr, 0, nullptr},
+};
+PyGetSetDef columns_getters[] = {
+    {"points", columns_points, nullptr, "A new list of x and y.", nullptr},
+    {"headings", columns_headings, nullptr, "A new list.", nullptr},
+    {"speeds", columns_speeds, nullptr, "A new list.", nullptr},
+    {nullptr, nullptr, nullptr, nullptr, nullptr},
+};
+PyType_Slot columns_slots[] = {
+    {Py_tp_dealloc, reinterpret_cast<void *>(columns_free)},
+    {Py_tp_methods, columns_methods},
+    {Py_tp_getset, columns_getters},
+    {Py_tp_doc, const_cast<char *>("Where everybody in a scene is.")},
+    {0, nullptr},
+};
+PyType_Spec columns_spec = {"_crashhunt_core.Columns", sizeof(Columns), 0,
+                            Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, columns_slots};
 PyType_Spec vehicles_spec = {"_crashhunt_core.Vehicles", sizeof(Vehicles), 0, Py_TPFLAGS_DEFAULT, vehicles_slots};
-
-#define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
 
 PyMethodDef functions[] = {
     {"bind", bind, METH_O, "Find libsumo's functions in its library, given by its path."},
     {"is_coming_or_going", is_coming_or_going, METH_NOARGS, "Whether a vehicle has entered or left in the last step."},
     {"in_sight", FAST(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
+    {"columns", FAST(columns), "Return lists as columns; None where they are none of numbers."},
     {"observe", FAST(observe), "Return an observation as bytes."},
     {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
-    {"least_change", FAST(least_change), "Return the least difference between two lists of numbers."},
-    {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach, as int64."},
+    {"least_change", FAST(least_change), "Return the least change of speed between two scenes."},
+    {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach."},
+    {"tracks", FAST(tracks), "Return the way of an agent, and who was near it."},
+    {"write_array", FAST(write_array), "Write the record of an array; return where it ends."},
     {"write_step", FAST(write_step), "Write the record of a step; return where it ends."},
     {nullptr, nullptr, 0, nullptr},
 };
 
 int fill(PyObject *module) {
-    PyObject *type = PyType_FromSpec(&vehicles_spec);
-    if (!type || PyModule_AddObject(module, "Vehicles", type) < 0) {
-        Py_XDECREF(type);
-        return -1;
+    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec}) {
+        PyObject *type = PyType_FromSpec(spec);
+        if (!type || PyModule_AddObjectRef(module, strrchr(spec->name, '.') + 1, type) < 0) {
+            Py_XDECREF(type);
+            return -1;
+        }
+        // Never given back: columns may outlive the module.
+        (spec == &vehicles_spec ? vehicles_type : columns_type) = reinterpret_cast<PyTypeObject *>(type);
     }
     return PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE);
 }

@@ -116,22 +116,18 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
     Who is further away than the two have got relative to each other has not been there. This looks at every vehicle
     nearby in every step, and so spares what it can.
     """
-    roster, reaches = scene.roster, scene.roster.reaches
-    further = 0.0
+    roster, further = scene.roster, 0.0
     if previous is not None:
         step_s = scene.time_s - previous.time_s
+        same = previous.roster is roster and not (scene.spines or previous.spines)
+        if same and scene.core is not None and scene.columns is not None and previous.columns is not None:
+            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, _HARDEST)
+            if rows is not None:
+                return rows
         further = 2 * reachable_m(max(scene.speeds) + _HARDEST * step_s, step_s)
     limit = (roster.touch_distance + further) ** 2
-    same = previous is not None and previous.roster is roster and not (scene.spines or previous.spines)
-    if scene.core is not None and previous is not None and same:
-        rows = scene.core.within_reach(
-            scene.points, scene.headings, scene.speeds, previous.points, previous.headings, previous.speeds,
-            roster.lengths, roster.widths, reaches, row, further, limit,
-        )  # fmt: skip
-        if rows is not None:
-            return rows
-    moved = None
-    found = []
+    moved, found = None, []
+    reaches = roster.reaches
     for squared, other in scene.neighbors(row):
         if squared >= limit:
             break

@@ -167,6 +167,11 @@ class BlackBox:
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
         mapped = self._map
+        if self._core is not None:
+            written = self._core.write_array(mapped, offset, tag, agent, array, self._step, phase)
+            if written is not None:
+                self._offset = written
+                return
         _HEAD.pack_into(mapped, offset, tag, agent, length)
         start = offset + 8
         end = start + length
@@ -179,14 +184,17 @@ class BlackBox:
 
     def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record that a step is complete; the scene's roster must have been recorded."""
-        offset, count = self._offset, len(scene.points)
+        offset, count = self._offset, len(scene.roster)
         packer = self._steps.get(count)
         if packer is None:
             packer = self._steps[count] = struct.Struct(f"<BxHIqd{self._agents + 4 * count}d")
         if offset + packer.size > self._reserved:
             self._reserve(offset + packer.size)
-        core, columns = scene.core, (scene.points, scene.headings, scene.speeds)
-        if core is None or core.write_step(self._map, offset, _STEP, step, scene.time_s, rewards, *columns) is None:
+        core, columns, end = scene.core, scene.columns, None
+        if core is not None and columns is not None:
+            where = (self._map, offset, _STEP, step)
+            end = core.write_step(*where, scene.time_s, rewards, columns, _SIMULATE)
+        if end is None:
             packer.pack_into(
                 self._map,
                 offset,
@@ -200,12 +208,12 @@ class BlackBox:
                 *scene.headings,
                 *scene.speeds,
             )
+            end = offset + packer.size
+            _WHERE.pack_into(self._map, _WHERE_OFFSET, end, step, _SIMULATE, 0)
         self._roster, self._core = scene.roster, core
         rest = scene if scene.heights or scene.spines else None
-        self._trail.append((scene.roster, offset + packer.size - 32 * count, rest))
-        self._offset = offset + packer.size
-        self._step = step
-        _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, step, _SIMULATE, 0)
+        self._trail.append((scene.roster, end - 32 * count, rest))
+        self._offset, self._step = end, step
 
     def mark(self, phase: int, agent: int = 0) -> None:
         """Say where the process is, and commit."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Kinematics"]
 
+_SINGLE = np.dtype("<f4")
 _ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
 _USUAL = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
 # highway-env's: five and two times its top speed of 40 m/s, and its lane width of 4 m.
@@ -103,13 +104,12 @@ class Kinematics:
             lateral_speed: to the right, in m/s.
             lanes: of its edge; the range of y when normalising.
         """
-        points, headings, speeds, actors = scene.points, scene.headings, scene.speeds, scene.roster.actors
-        if scene.core is not None and self._usual and not scene.heights and not self.hidden:
-            lengths = scene.roster.lengths
-            place = row, self._others, distance, from_left, lateral_speed
-            found = scene.core.observe(points, headings, speeds, lengths, *place)
+        columns = scene.columns
+        if scene.core is not None and columns is not None and self._usual and not scene.heights and not self.hidden:
+            found = scene.core.observe(columns, row, self._others, distance, from_left, lateral_speed)
             if found is not None:
-                return np.frombuffer(found, "<f4").reshape(self.shape)
+                return np.ndarray(self.shape, _SINGLE, found)
+        points, headings, speeds, actors = scene.points, scene.headings, scene.speeds, scene.roster.actors
         heading, speed = headings[row], speeds[row]
         own_cos, own_sin, half = cos(heading), sin(heading), actors[row].length / 2
         x, y = points[row]

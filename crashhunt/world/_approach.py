@@ -10,6 +10,7 @@ import numpy as np
 from crashhunt.world._closest import ClosestApproach
 from crashhunt.world._geometry import rectangle_gap, time_to_contact
 from crashhunt.world._outlines import LEVEL_M, levels, outlines
+from crashhunt.world._scene import core_of, part_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +24,7 @@ __all__ = ["ApproachMeter", "approaches", "closest_approach"]
 _CHUNK = 256  # scenes at a time, which costs a tenth of one at a time
 _GAP_M = 50.0  # what is further away is not near
 _HORIZON_S = 10.0  # a collision course further ahead than this says nothing
+_NOTHING = ClosestApproach()
 
 
 class ApproachMeter:
@@ -43,8 +45,8 @@ class ApproachMeter:
     def measure(self, frames: Sequence[Frame]) -> None:
         """Take scenes in."""
         for agent in self._agents:
-            times, gaps, brakes = approaches(frames, agent)
             so_far = self.closest
+            times, gaps, brakes = approaches(frames, agent, so_far)
             self.closest = ClosestApproach(
                 min(so_far.time_to_collision_s, float(times.min(initial=math.inf))),
                 min(so_far.gap_m, float(gaps.min(initial=math.inf))),
@@ -61,13 +63,14 @@ def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestA
 
 
 def approaches(
-    frames: Sequence[Frame], agent: str
+    frames: Sequence[Frame], agent: str, so_far: ClosestApproach = _NOTHING
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return, for each scene, how near the agent is to the nearest danger.
 
     Args:
         frames: in order.
         agent: the controlled vehicle; scenes without it are as safe as can be.
+        so_far: what does not come nearer than this in any way may be left out.
 
     Returns:
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
@@ -75,18 +78,9 @@ def approaches(
     """
     count = sum(len(frame.columns) for frame in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-    blocks = []
-    step = first = 0
-    for frame in frames:
-        row = frame.roster.index.get(agent)
-        if row is not None:
-            for block in _blocks(frame, row):
-                blocks.append(block.moved(step, first))
-                first += len(block.x)
-        step += len(frame.columns)
-    if not blocks:
+    whole = _near_block(frames, agent, so_far) or _whole_block(frames, agent, so_far)
+    if whole is None or not len(whole.x):
         return times, gaps, brakes
-    whole = _Block(*(np.concatenate(columns) for columns in zip(*blocks, strict=True)))
     heading, speed, half, number, own = whole.heading, whole.speed, whole.half, whole.step, whole.own
     forward = np.stack((np.cos(heading), np.sin(heading)), axis=1)
     center = np.stack((whole.x, whole.y), axis=1) - half[:, :1] * forward
@@ -154,34 +148,38 @@ class _Block(NamedTuple):
         return self._replace(step=self.step + step, own=self.own + first)
 
 
+def _whole_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -> _Block | None:
+    blocks = []
+    step = first = 0
+    for frame in frames:
+        row = frame.roster.index.get(agent)
+        if row is not None:
+            near = _near_block([frame], agent, so_far)
+            for block in [near] if near is not None else _blocks(frame, row):
+                blocks.append(block.moved(step, first))
+                first += len(block.x)
+        step += len(frame.columns)
+    return _Block(*(np.concatenate(columns) for columns in zip(*blocks, strict=True))) if blocks else None
+
+
+def _near_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -> _Block | None:
+    """Those only who may be near, as the core finds them; None where it does not."""
+    core = core_of(frames)
+    if core is None:
+        return None
+    parts = [part_of(frame, agent, frame.roster.rows) for frame in frames]
+    least = so_far.gap_m, so_far.time_to_collision_s, so_far.required_deceleration
+    found = core.may_be_near(parts, _GAP_M, _HORIZON_S, *least)
+    if found is None:
+        return None
+    x, y, heading, speed, *half = np.frombuffer(found[0]).reshape(6, -1)
+    step, own = np.frombuffer(found[1], np.int64).reshape(2, -1)
+    flat = np.zeros(len(x))
+    return _Block(x, y, heading, speed, np.stack(half, axis=1), step, own, flat, flat, flat)
+
+
 def _blocks(frame: Frame, row: int) -> list[_Block]:
-    if frame.spines is not None:
-        return _bent_blocks(frame, row)
-    if frame.core is not None and frame.heights is None:
-        roster = frame.roster
-        found = frame.core.may_be_near(
-            frame.columns, len(roster), row, roster.lengths, roster.widths, _GAP_M, _HORIZON_S
-        )  # fmt: skip
-        if found is not None:
-            return [_sparse_block(frame, row, np.frombuffer(found, np.int64))] if found else []
-    return [_block(frame, row)]
-
-
-def _sparse_block(frame: Frame, row: int, places: NDArray[np.int64]) -> _Block:
-    """A block of those only who may be near, in which the agent comes first in each scene."""
-    columns, actors = frame.columns, len(frame.roster)
-    step, actor = np.divmod(places, actors)
-    number, flat = np.arange(len(places)), np.zeros(len(places))
-    return _Block(
-        columns[step, 2 * actor],
-        columns[step, 2 * actor + 1],
-        columns[step, 2 * actors + actor],
-        columns[step, 3 * actors + actor],
-        frame.roster.half_sizes[actor],
-        step,
-        np.maximum.accumulate(np.where(actor == row, number, 0)),
-        flat, flat, flat,
-    )  # fmt: skip
+    return [_block(frame, row)] if frame.spines is None else _bent_blocks(frame, row)
 
 
 def _block(frame: Frame, row: int) -> _Block:

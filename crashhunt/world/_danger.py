@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.world._outlines import LEVEL_M
-from crashhunt.world._tracks import sampled, spacing_s, tracks
+from crashhunt.world._tracks import spacing_s, ways
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,7 +150,7 @@ def _measured(
     frames: Sequence[Frame], agent: str, step_length_s: float
 ) -> tuple[Array, Array, NDArray[np.intp], list[str]] | None:
     """Times, dangers and who else, of each sample; and the names of these."""
-    seen = tracks(list(sampled(frames, step_length_s)), agent, _AHEAD_M)
+    seen = ways(frames, agent, _AHEAD_M, step_length_s)
     if seen is None:
         return None
     track, others, names = seen

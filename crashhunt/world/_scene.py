@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Core
+    from crashhunt.native import Columns, Core, Part
     from crashhunt.world._events import Event
 
 __all__ = [
@@ -26,8 +26,10 @@ __all__ = [
     "Roster",
     "Scene",
     "Spine",
+    "core_of",
     "is_person",
     "joined_frame",
+    "part_of",
 ]
 
 PERSON = "person "
@@ -108,6 +110,11 @@ class Roster:
         return {actor.id: row for row, actor in enumerate(self.actors)}
 
     @cached_property
+    def rows(self) -> list[int]:
+        """The row of each actor."""
+        return list(range(len(self.actors)))
+
+    @cached_property
     def half_sizes(self) -> NDArray[np.float64]:
         """Half the length and half the width of each actor, shape (n, 2), in m."""
         return np.array([(actor.length / 2, actor.width / 2) for actor in self.actors]).reshape(-1, 2)
@@ -137,6 +144,7 @@ class Roster:
 
 
 _NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
+_LATER: Any = None  # in place of what is made of the core's columns when it is asked for
 
 
 class Frame(NamedTuple):
@@ -172,6 +180,20 @@ class Frame(NamedTuple):
             grades=heights[count:],
             spines=spines,
         )
+
+
+def core_of(frames: Sequence[Frame]) -> Core | None:
+    """Return what computes faster with all of some frames; None where there is no such thing."""
+    core = frames[0].core if frames else None
+    if any(frame.core is None or frame.heights is not None or frame.spines is not None for frame in frames):
+        return None
+    return core
+
+
+def part_of(frame: Frame, agent: str, numbers: list[int]) -> Part:
+    """Return a frame as the core takes it, around an agent, with a number for each actor."""
+    roster = frame.roster
+    return frame.columns, roster.index.get(agent, -1), roster.lengths, roster.widths, numbers
 
 
 def joined_frame(
@@ -213,6 +235,7 @@ class Scene:
         swept: whether everybody has driven here from the previous scene along the way that the headings say, so that
             contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
         core: what computes with it faster, where there is such a thing; the results are the same.
+        columns: points, headings and speeds as the core has them, which may be left out then.
 
     Attributes:
         events: what else happened in this step.
@@ -221,20 +244,21 @@ class Scene:
     """
 
     __slots__ = (
+        "_headings",
         "_neighbors",
+        "_points",
+        "_speeds",
         "agent_lanes",
+        "columns",
         "contacts",
         "core",
         "events",
         "grades",
-        "headings",
         "heights",
         "lanes",
         "off_road",
-        "points",
         "previous",
         "roster",
-        "speeds",
         "spines",
         "swept",
         "time_s",
@@ -244,9 +268,9 @@ class Scene:
         self,
         time_s: float,
         roster: Roster,
-        points: Sequence[tuple[float, float]],
-        headings: Sequence[float],
-        speeds: Sequence[float],
+        points: Sequence[tuple[float, float]] = _LATER,
+        headings: Sequence[float] = _LATER,
+        speeds: Sequence[float] = _LATER,
         contacts: tuple[Contact, ...] = (),
         off_road: tuple[str, ...] = (),
         lanes: tuple[str, ...] = (),
@@ -256,12 +280,14 @@ class Scene:
         *,
         swept: bool = False,
         core: Core | None = None,
+        columns: Columns | None = None,
     ) -> None:
         self.time_s = time_s
         self.roster = roster
-        self.points = points
-        self.headings = headings
-        self.speeds = speeds
+        self.columns = columns
+        self._points = points
+        self._headings = headings
+        self._speeds = speeds
         self.contacts = contacts
         self.off_road = off_road
         self.lanes = lanes
@@ -274,6 +300,32 @@ class Scene:
         self.agent_lanes: dict[str, str] = {}
         self.previous: Scene | None = None
         self._neighbors: dict[int, list[tuple[float, int]]] = {}
+
+    # Most steps do without these lists. No `__getattr__`: with one, every attribute of a scene takes longer.
+    @property
+    def points(self) -> Sequence[tuple[float, float]]:
+        """The centre of each front bumper: x and y, in m."""
+        if self._points is _LATER and self.columns is not None:
+            self._points = self.columns.points
+        return self._points
+
+    @property
+    def headings(self) -> Sequence[float]:
+        """In rad, counter-clockwise from the x axis."""
+        if self._headings is _LATER and self.columns is not None:
+            self._headings = self.columns.headings
+        return self._headings
+
+    @property
+    def speeds(self) -> Sequence[float]:
+        """In m/s."""
+        if self._speeds is _LATER and self.columns is not None:
+            self._speeds = self.columns.speeds
+        return self._speeds
+
+    def speed(self, row: int) -> float:
+        """Return the speed of an actor, in m/s."""
+        return self.speeds[row] if self.columns is None else self.columns.speed(row)
 
     def follow(self, previous: Scene | None) -> None:
         """Say which scene was one step before."""

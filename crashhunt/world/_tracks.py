@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from crashhunt.world._outlines import levels, outlines
+from crashhunt.world._scene import core_of, part_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Others", "Track", "sampled", "spacing_s", "tracks"]
+__all__ = ["Others", "Track", "sampled", "spacing_s", "tracks", "ways"]
 
 _APART_S = 0.3  # of the samples, at least: nobody gets far in it, and every step costs time
 _AT_MOST_S = 0.3  # where a step is longer, there are samples between two scenes
@@ -128,6 +129,40 @@ def _between(columns: Array, share: Array) -> Array:
     return found
 
 
+def ways(
+    frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float
+) -> tuple[Track, Others, list[str]] | None:
+    """Return what `tracks` returns of scenes at regular instants, from the core where it can."""
+    core = core_of(frames)
+    if core is None or _between_steps(step_length_s) > 1:
+        return tracks(list(sampled(frames, step_length_s)), agent, within_m)
+    numbers: dict[str, int] = {}
+    every, step = _every(step_length_s), 0
+    parts = []
+    for frame in frames:
+        whose = frame.roster.rows
+        after = step + len(frame.columns)
+        if agent in frame.roster.index and -(-step // every) * every < after:  # it has a sample
+            whose = [numbers.setdefault(actor.id, len(numbers)) for actor in frame.roster.actors]
+        parts.append(part_of(frame, agent, whose))
+        step = after
+    found = core.tracks(parts, every, within_m)
+    if found is None:
+        return tracks(list(sampled(frames, step_length_s)), agent, within_m)
+    (own, steps), (theirs, pairs) = found
+    if not steps:
+        return None
+    x, y, heading, *half = np.frombuffer(own).reshape(5, -1)
+    flat = np.zeros(len(x))
+    tall = np.full(len(x), next(one.height for frame in frames for one in frame.roster.actors if one.id == agent))
+    time = np.frombuffer(steps, np.int64).astype(float) * step_length_s
+    mine = np.array([x, y, heading, flat, *half, tall])
+    sample, who = np.frombuffer(pairs, np.int64).reshape(2, -1)
+    other_x, other_y, other_heading, *other_half = np.frombuffer(theirs).reshape(5, -1)
+    z = np.zeros(len(sample))
+    return _track(time, mine), _others([sample, who, other_x, other_y, other_heading, z, *other_half, z]), list(numbers)
+
+
 def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> tuple[Track, Others, list[str]] | None:
     """Return the way of an agent, those who came within a distance of it, and the names of these.
 
@@ -156,13 +191,20 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
         first += len(instants)
     if not times:
         return None
-    x, y, heading, z, *sizes = np.concatenate(own, axis=1)
+    track = _track(np.concatenate(times), np.concatenate(own, axis=1))
+    return track, _others([np.concatenate(column) for column in zip(*theirs, strict=True)]), list(numbers)
+
+
+def _track(time: Array, fronts: Array) -> Track:
+    x, y, heading, z, *sizes = fronts
     forward = np.cos(heading), np.sin(heading)
-    track = Track(np.concatenate(times), x - sizes[0] * forward[0], y - sizes[0] * forward[1],
-                  np.unwrap(heading), z, *sizes)  # fmt: skip
-    sample, who, x, y, heading, z, *sizes = (np.concatenate(column) for column in zip(*theirs, strict=True))
+    return Track(time, x - sizes[0] * forward[0], y - sizes[0] * forward[1], np.unwrap(heading), z, *sizes)
+
+
+def _others(fronts: Sequence[NDArray[Any]]) -> Others:
+    sample, who, x, y, heading, z, *sizes = fronts
     x, y = x - sizes[0] * np.cos(heading), y - sizes[0] * np.sin(heading)
-    return track, Others(sample.astype(np.intp), who.astype(np.intp), x, y, heading, z, *sizes), list(numbers)
+    return Others(sample.astype(np.intp), who.astype(np.intp), x, y, heading, z, *sizes)
 
 
 def _straight(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> tuple[Array, tuple[Any, ...]]:

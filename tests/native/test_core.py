@@ -21,7 +21,8 @@ from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators import Kinematics
 from crashhunt.trial import CRASHES, TrialSpec
-from crashhunt.world import Actor, Roster, Scene, approaches, joined_frame
+from crashhunt.world import Actor, ApproachMeter, Roster, Scene, approaches, joined_frame
+from crashhunt.world._tracks import ways
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
@@ -45,10 +46,19 @@ def two_scenes(draw):
     return found
 
 
+def columns_of(scene):
+    """The numbers of a scene as the core has them."""
+    roster = scene.roster
+    sizes = core.Vehicles((), roster.lengths, roster.widths, roster.reaches)
+    return core.columns(sizes, scene.points, scene.headings, scene.speeds)
+
+
 def both_ways(scene, call):
     """What comes of a call with the core, and without."""
     scene._neighbors.clear()
     scene.core = core
+    for one in filter(None, (scene, scene.previous)):
+        one.columns = columns_of(one)
     with_it = call()
     scene._neighbors.clear()
     scene.core = None
@@ -70,6 +80,7 @@ def test_an_observation_is_the_same_to_the_bit(scenes, rows, place):
 @given(two_scenes())
 def test_the_same_are_within_reach(scenes):
     previous, scene = scenes
+    scene.follow(previous)
     for row in range(len(scene.points)):
         ours, theirs = both_ways(scene, lambda row=row: _within_reach(scene, previous, row))
         assert ours == theirs
@@ -79,6 +90,8 @@ def test_somebody_is_within_reach():
     roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "abc"))
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
     now = Scene(0.1, roster, [(3.1, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0], core=core)
+    was.columns, now.columns = columns_of(was), columns_of(now)
+    assert core.within_reach(now.columns, was.columns, 0, 0.1, 10.0) == [1]
     assert _within_reach(now, was, 0) == [1]
 
 
@@ -97,11 +110,49 @@ def test_the_closest_approach_is_the_same_to_the_bit(episodes):
 
 def test_of_many_far_away_nobody_is_looked_at():
     near = [(0.0, 0.0), (30.0, 0.0), (400.0, 3.0), (90.0, 60.0)]
-    frame = np.array([[*itertools.chain(*near), 0.0, 0.0, 0.0, 0.0, 20.0, 5.0, 20.0, 20.0]])
-    found = core.may_be_near(frame, 4, 0, [5.0] * 4, [2.0] * 4, 50.0, 10.0)
-    assert np.frombuffer(found, np.int64).tolist() == [0, 1]
-    assert core.may_be_near(frame, 4, 2, [5.0] * 4, [2.0] * 4, 50.0, 10.0) == b""
-    assert core.may_be_near(frame.astype(np.float32), 4, 0, [5.0] * 4, [2.0] * 4, 50.0, 10.0) is None
+    frame = np.array([[*itertools.chain(*near), 0.0, 0.0, 0.0, 0.0, 20.0, 5.0, 20.0, 20.0]] * 2)
+
+    def found(row, *so_far, columns=frame):
+        part = (columns, row, [5.0] * 4, [2.0] * 4, [0, 1, 2, 3])
+        return core.may_be_near([part], 50.0, 10.0, *(so_far or (math.inf, math.inf, 0.0)))
+
+    numbers, places = found(0)
+    ahead = [0.0, 0.0, 0.0, 20.0, 2.5, 1.0], [30.0, 0.0, 0.0, 5.0, 2.5, 1.0]
+    assert np.frombuffer(numbers).reshape(6, -1).T.tolist() == [*ahead, *ahead]
+    assert np.frombuffer(places, np.int64).reshape(2, -1).tolist() == [[0, 0, 1, 1], [0, 0, 2, 2]]
+    assert found(0, 1.0, 1.0, 9.0) == (b"", b"")  # it was nearer before
+    for nearer in ((27.0, 1.0, 9.0), (1.0, 9.0, 9.0), (1.0, 1.0, 4.0)):
+        assert found(0, *nearer) == (numbers, places)
+    assert found(2) == found(-1) == (b"", b"")
+    assert found(0, columns=frame.astype(np.float32)) is None
+    for odd in (4, -2, 2**40):
+        assert found(odd) is None
+
+
+@settings(deadline=None, max_examples=60)
+@given(some.lists(two_scenes(), min_size=1, max_size=4), some.sampled_from([0.1, 0.3, 0.9]))
+def test_the_ways_that_were_driven_are_the_same(episodes, step_length_s):
+    frames = [joined_frame(one.roster, np.concatenate([one.frame.columns, two.frame.columns]), [None] * 2)
+              for one, two in episodes]  # fmt: skip
+    for agent in ("0", "3", "nobody"):
+        ours = ways([frame._replace(core=core) for frame in frames], agent, 100.0, step_length_s)
+        theirs = ways(frames, agent, 100.0, step_length_s)
+        assert repr_of(ours) == repr_of(theirs)
+
+
+def repr_of(seen):
+    return seen and [[column.tolist() for column in part] for part in seen[:2]] + [seen[2]]
+
+
+@settings(deadline=None, max_examples=60)
+@given(some.lists(two_scenes(), min_size=2, max_size=4))
+def test_the_closest_so_far_leaves_out_nothing(episodes):
+    ours, theirs = ApproachMeter("0"), ApproachMeter("0")
+    for one, two in episodes:
+        both = np.concatenate([one.frame.columns, two.frame.columns])
+        theirs.measure([joined_frame(one.roster, both, [None] * 2)])
+        ours.measure([joined_frame(one.roster, both, [None] * 2, core)])
+    assert repr(ours.closest) == repr(theirs.closest)
 
 
 @settings(deadline=None, max_examples=60)
@@ -122,37 +173,91 @@ def test_the_record_of_a_step_is_the_same(tmp_path_factory, scenes, rewards, ste
     assert ours == theirs
 
 
+def lists_of(speeds):
+    """Columns in which only speeds differ."""
+    sizes = core.Vehicles((), *[[1.0] * len(speeds)] * 3)
+    return core.columns(sizes, [(0.0, 0.0)] * len(speeds), [0.0] * len(speeds), speeds)
+
+
 @given(some.lists(some.tuples(some.floats(-50, 50), some.floats(-50, 50)), max_size=20))
 def test_the_least_change(pairs):
     earlier, later = [one for one, _ in pairs], [two for _, two in pairs]
     expected = min((two - one for one, two in pairs), default=0.0)
-    assert core.least_change(earlier, later) == expected
+    assert core.least_change(lists_of(earlier), lists_of(later)) == expected
+
+
+@given(two_scenes())
+def test_what_goes_in_comes_out(scenes):
+    found = columns_of(scenes[0])
+    assert (found.points, found.headings, found.speeds) == (scenes[0].points, scenes[0].headings, scenes[0].speeds)
+    assert [found.speed(row) for row in range(len(found.speeds))] == found.speeds
+    for row in (-1, len(found.speeds)):
+        with pytest.raises(IndexError):
+            found.speed(row)
 
 
 @pytest.mark.parametrize("odd", [math.nan, 1, None, "1", 10**400])
 def test_what_the_core_does_not_know_is_left_to_python(odd):
     points, numbers = [(0.0, 0.0), (9.0, 0.0)], [1.0, 2.0]
-    assert core.least_change(numbers, [1.0, odd]) is None
-    assert core.observe([(0.0, 0.0), (odd, 0.0)], numbers, numbers, numbers, 0, 4, 1.0, 1.0, 0.0) is None
-    lists = (points, numbers, numbers)
-    reached = core.within_reach(*lists, [(0.0, odd), (0.0, 0.0)], *lists[1:], *[numbers] * 3, 0, 9.0, 1e9)
-    assert reached == ([] if odd is math.nan else None)
+    sizes = core.Vehicles((), numbers, numbers, numbers)
+    plain = core.columns(sizes, points, numbers, numbers)
+    if odd is math.nan:
+        strange = core.columns(sizes, [(0.0, 0.0), (odd, 0.0)], numbers, numbers)
+        assert core.observe(strange, 0, 4, 1.0, 1.0, 0.0) is None
+        assert core.within_reach(strange, plain, 0, 0.1, 10.0) is None
+        assert core.within_reach(plain, strange, 0, 0.1, 10.0) == []
+        assert core.least_change(lists_of(numbers), lists_of([1.0, odd])) is None
+    else:
+        assert core.columns(sizes, [(0.0, 0.0), (odd, 0.0)], numbers, numbers) is None
+        assert core.columns(sizes, points, [1.0, odd], numbers) is None
+        with pytest.raises(TypeError, match="lists of floats"):
+            core.Vehicles((), numbers, numbers, [1.0, odd])
     for rows in ([], numbers[:1], tuple(numbers)):
-        assert core.observe(points, rows, numbers, numbers, 0, 4, 1.0, 1.0, 0.0) is None
+        assert core.columns(sizes, points, rows, numbers) is None
+    alone = core.columns(sizes, points[:1], [1.0], [1.0])  # of two, whose sizes are known
+    assert core.observe(alone, 0, 4, 1.0, 1.0, 0.0) is None
+    assert core.within_reach(alone, alone, 0, 0.1, 10.0) is None
+    assert core.least_change(alone, plain) is None
     for row in (-1, 2):
-        assert core.observe(points, numbers, numbers, numbers, row, 4, 1.0, 1.0, 0.0) is None
+        assert core.observe(plain, row, 4, 1.0, 1.0, 0.0) is None
+        assert core.within_reach(plain, plain, row, 0.1, 10.0) is None
+    for wrong in (None, sizes, [plain]):
+        with pytest.raises(TypeError, match="columns"):
+            core.least_change(plain, wrong)
 
 
 def test_what_is_too_large_for_single_precision_is_an_error_as_in_python():
-    assert core.observe([(0.0, 0.0)], [0.0], [0.0], [5.0], 0, 2, 1e39, 0.0, 0.0) is None
+    assert core.observe(lists_of([0.0]), 0, 2, 1e39, 0.0, 0.0) is None
     with pytest.raises(OverflowError):
         struct.pack("<f", 1e39)
 
 
 def test_nothing_is_written_beyond_the_end():
-    for offset in (-1, 60, 2**62):
+    buffer = bytearray(128)
+    for offset in (-1, 0, 63, 81, 2**62):
         with pytest.raises(ValueError, match="beyond the end"):
-            core.write_step(bytearray(64), offset, 5, 0, 0.0, (), [(1.0, 1.0)], [0.0], [0.0])
+            core.write_step(buffer, offset, 5, 0, 0.0, (), lists_of([0.0]), 2)
+        with pytest.raises(ValueError, match="beyond the end"):
+            core.write_array(buffer, offset, 5, 0, np.zeros(5), 0, 1)
+    assert buffer == bytes(128)
+    assert core.write_step(buffer, 72, 5, 0, 0.0, (), lists_of([0.0]), 2) == 128
+    assert core.write_array(buffer, 80, 5, 0, np.zeros(5), 0, 1) == 128
+
+
+@pytest.mark.parametrize("array", [np.arange(35, dtype="<f4"), np.float64(3.5), np.zeros((2, 0)), np.arange(6)[::2],
+                                   np.array([7], "<i8"), np.arange(12.0).reshape(3, 4).T])  # fmt: skip
+def test_the_record_of_an_array_is_the_same(tmp_path, array):
+    found = []
+    for used in (core, None):
+        box = BlackBox(tmp_path / "box.bin")
+        box.begin(pid=1, trial=0, started=0.0)
+        box.prologue(b"", 1)
+        box._core, box._step = used, 7
+        box.observation(3, array)
+        box.action(65535, array)
+        found.append((bytes(box.committed()), bytes(box._map[:64]), box._offset))
+        box.close()
+    assert found[0] == found[1]
 
 
 def test_it_is_used_only_where_it_is_known(monkeypatch):
@@ -185,12 +290,32 @@ def _nearly(observation):
 
 
 class _Moved:
-    def __init__(self, ids):
-        self._vehicles = core.Vehicles(ids)
+    def __init__(self, ids, *sizes):
+        self._vehicles = core.Vehicles(ids, *sizes)
 
     def read(self):
-        points, angles, speeds = self._vehicles.read()
-        return points, [*angles[:-1], math.nextafter(angles[-1], 10.0)], speeds
+        found = self._vehicles.read()
+        angles = [*found.headings[:-1], math.nextafter(found.headings[-1], 10.0)]
+        return core.columns(self._vehicles, found.points, angles, found.speeds)
+
+    def look(self, *_):
+        return None
+
+
+class _Hasty:
+    """Sees that all is as before where somebody has just come."""
+
+    def __init__(self, *given):
+        self._vehicles = core.Vehicles(*given)
+        self.read = self._vehicles.read
+
+    def look(self, *_):
+        return self._vehicles.read()
+
+
+class _Crowded(_Hasty):
+    def look(self, *_):
+        return ("ego", "nobody")
 
 
 def _blind(eyes, squared):
@@ -203,6 +328,8 @@ LIES = {
     "nothing": None,
     "observe": lambda *given: _nearly(core.observe(*given)),
     "Vehicles": _Moved,
+    "Vehicles, seen at once": _Hasty,
+    "Vehicles, others than before": _Crowded,
     "is_coming_or_going": lambda: not core.is_coming_or_going(),
 }
 
@@ -219,7 +346,7 @@ def run(tmp_path):
         simulator = SumoSimulator(chosen, stage)
         assert (simulator._sight.core is core) == (native is None)
         if lie is not None and LIES[lie] is not None:
-            simulator._sight.core = _Lies(lie, LIES[lie])
+            simulator._sight.core = _Lies(lie.partition(",")[0], LIES[lie])
         box = BlackBox(stage / "box.bin")
         box.begin(pid=1, trial=0, started=0.0)
         agents = {"make_agent": lambda *_: KeepLaneWithSpeed(speed), "crash_on": CRASHES}
@@ -257,9 +384,19 @@ def test_a_vehicle_that_has_left_is_refused_as_by_libsumo(run):
     _, simulator = run("loop", native=None, steps=3)
     simulator.reset(seed=1, options={"arguments": argument_values(load_scenario("loop"))})
     try:
-        assert core.Vehicles(("nobody",)).read() is None
-        assert core.Vehicles(()).read() == ([], [], [])
-        eyes = core.Vehicles(("nobody", "ego"))
+        nothing = [], [], []
+        assert core.Vehicles(("nobody",), *nothing).read() is None
+        assert core.Vehicles(("nobody",), *nothing).look(core.Vehicles((), *nothing), 0.0) is None
+        assert core.Vehicles((), *nothing).read().points == []
+        eyes = core.Vehicles(("nobody", "ego"), *nothing)
+        assert core.is_coming_or_going()
+        assert core.Vehicles((), *nothing).look(eyes, 0.0) is None
+        while core.is_coming_or_going():
+            libsumo.simulationStep()
+        everybody = core.Vehicles((), *nothing).look(eyes, math.inf)
+        assert everybody == libsumo.vehicle.getIDList()
+        assert core.Vehicles((), *nothing).look(eyes, 0.0).points == []
+        assert len(core.Vehicles(everybody, *nothing).look(eyes, math.inf).points) == len(everybody)
         ids, (point,) = core.in_sight(eyes, 1e-9)
         assert (ids, point) == (("ego",), libsumo.vehicle.getPosition("ego"))
         assert set(core.in_sight(eyes, math.inf)[0]) == set(libsumo.vehicle.getIDList())

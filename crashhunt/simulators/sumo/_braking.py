@@ -100,7 +100,9 @@ class HardBraking:
         """Who braked harder than its limit in the last step, and how hard in m/s²."""
         rows: Iterable[tuple[Actor, float, float]]
         if scene.roster is last.roster:
-            least = scene.core.least_change(last.speeds, scene.speeds) if scene.core is not None else None
+            least = None
+            if scene.core is not None and scene.columns is not None and last.columns is not None:
+                least = scene.core.least_change(last.columns, scene.columns)
             if least is None:
                 least = min(map(sub, scene.speeds, last.speeds), default=0.0)
             if least > -_LOOKED_INTO * self._dt:

@@ -178,7 +178,7 @@ class SumoSimulator:
             for agent in actions:
                 row = present.get(agent)
                 observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
-                rewards[agent] = 0.0 if row is None else scene.speeds[row] * self.step_length_s
+                rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
                 terminations[agent] = row is None
             scene.events = self._events.look(scene, tuple(actions))
         except _TRACI_ERRORS as error:

@@ -81,9 +81,10 @@ class SumoEvents:
             if lane != before or self._steps % _DIRECTION_EVERY == 0:
                 self._ask_direction(agent, lane, last, scene, found)
             row = scene.roster.index[agent]
-            if scene.speeds[row] < Standstill.SPEED and sumo.vehicle_getStopState(agent) & 1:
+            speed = scene.speed(row)
+            if speed < Standstill.SPEED and sumo.vehicle_getStopState(agent) & 1:
                 self._standstill.move(agent)  # at a stop of its schedule
-            elif stood := self._standstill.look(agent, scene.speeds[row]):
+            elif stood := self._standstill.look(agent, speed):
                 found.append(self._of(scene, agent, "not_moving", f"{agent} had stood still for {stood:g} s"))
         if sumo.simulation_getEmergencyStoppingVehiclesNumber():
             self._at_dead_ends(scene, agents, found)
