@@ -13,6 +13,7 @@ from crashhunt.cli._progress import shown_progress
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from crashhunt.cli._common import Commands
     from crashhunt.shrinking import Shrunk
@@ -28,7 +29,9 @@ def add_shrink(commands: Commands) -> None:
         "shrink",
         help="make a crash smaller while it stays the same kind of crash",
         description="Make a crash smaller while it stays the same kind of crash: leave others out, drop disturbances, "
-        "bring arguments to their defaults and to round numbers. Each step is really run, by the code of the snapshot. "
+        "bring arguments to their defaults and to round numbers; where it takes many others, move these along their "
+        "recorded ways, leave out those whom it does not take, and cut the beginning off. Each step is really run, by "
+        "the code of the snapshot. "
         "What is left is a crash of its own beside the first, ID.small. Interrupted, it leaves the best that it has, "
         "and the same command goes on from there. Exits with 1 where the crash does not come again.",
     )
@@ -36,6 +39,15 @@ def add_shrink(commands: Commands) -> None:
     shrink.add_argument(
         "--budget", metavar="TRIALS", type=integer, default=_BUDGET,
         help=f"how many trials may be run; default: {_BUDGET}",
+    )  # fmt: skip
+    shrink.add_argument(
+        "--for", metavar="TIME", dest="time", default="",
+        help="how long that may take, such as 1m or 90s; two runs that confirm what is left come on top",
+    )  # fmt: skip
+    shrink.add_argument(
+        "--form", choices=("either", "traffic", "scripted"), default="either",
+        help="whether the others go on driving (traffic), or are moved along their recorded ways (scripted); default: "
+        "either, traffic where that leaves few of them",
     )  # fmt: skip
     shrink.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
     add_json(shrink)
@@ -45,11 +57,16 @@ def add_shrink(commands: Commands) -> None:
 def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.crashes import find_bundle
+    from crashhunt.plans import seconds_of
     from crashhunt.shrinking import shrink
 
     for name, value in (("--budget", options.budget - 1), ("--parallel", options.parallel)):
         if value < 0:
             raise UsageError(f"{name} is {vars(options)[name[2:]]}", fix="give at least 1")
+    try:
+        time_s = seconds_of(options.time)
+    except ValueError:
+        raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     if options.directory.is_file():
         raise UsageError(
             f"{str(options.directory)!r} is a file, and what is left would be written beside the crash",
@@ -58,8 +75,9 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     bundle = find_bundle(options.directory, options.crash)
     with stop_requests() as asked, shown_progress(f"making {bundle.id} smaller", as_json=options.json) as watch:
         found = shrink(
-            bundle, budget=options.budget, parallel=options.parallel, watch=watch, stopped=lambda: bool(asked)
-        )
+            bundle, budget=options.budget, time_s=time_s, form=options.form, parallel=options.parallel,
+            watch=watch, stopped=lambda: bool(asked),
+        )  # fmt: skip
     say(_told(found), as_json=options.json)
     if options.json:
         print(json.dumps(found.to_json()))
@@ -74,11 +92,15 @@ def _told(found: Shrunk) -> str:
     if small is None:
         what = "it cannot be made smaller" if found.verdict == "not_reproduced" else "nothing could be taken away"
         lines.append(f"  {what}: {found.why}" if found.why else f"  {what}")
+        lines += [f"  note: {note}" for note in found.notes]
         return in_lines(lines)
     (before, after), result = found.actors, small.result
+    moved = "" if found.scripted is None else _moved(found.scripted)
     lines += [
         f"{small.id}: {result.summary}",
         f"  {before} were seen, and {after} are left; {was.steps} steps, and now {result.steps}",
+        *([f"  {moved}"] if moved else []),
+        *([f"  the first {found.steps_cut} steps are cut off"] if found.steps_cut else []),
         *(f"  {name} was {left} and is {right}" for name, (left, right) in found.changed.items()),
         f"  {found.trials} trials"
         + (f"; ended before it was done: {found.why or found.ended}" if _early(found) else ""),
@@ -86,8 +108,15 @@ def _told(found: Shrunk) -> str:
         "  confirmed: a fresh process did the same to the bit"
         if small.confirmed
         else "  flaky: a fresh process did not do the same",
+        *(f"  note: {note}" for note in found.notes),
     ]
     return in_lines(lines)
+
+
+def _moved(names: Sequence[str]) -> str:
+    if not names:
+        return "the traffic takes no part"
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} moved as recorded, whatever the agent does"
 
 
 def _early(found: Shrunk) -> bool:

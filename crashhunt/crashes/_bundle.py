@@ -28,7 +28,7 @@ from crashhunt.trial import (
     check_parts,
     outcome_of,
 )
-from crashhunt.world import ClosestApproach, Event
+from crashhunt.world import ClosestApproach, Event, Paths
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,7 +48,8 @@ __all__ = [
     "write_trial",
 ]
 
-SCHEMA = 4
+SCHEMA = 5
+_ALL_DRIVE = 4  # what is written where nobody is scripted
 _ALL_TAKE_PART = 3  # what is written where nobody is left out
 _UNDISTURBED = 2  # what is written where there are no disturbances: without them, it would be another trial
 _PROTECTED = 2  # the first version with a digest of itself and of the files beside it
@@ -67,6 +68,7 @@ _TYPES: Plain = {
     "disturbed": bool,
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
     "only": list[str] | None,
+    "script": dict | None,
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
@@ -214,6 +216,8 @@ class Bundle:
             data["planned_disturbances"] = spec.get("disturbances", [])
         if "only" in spec:
             data["only"] = spec["only"]
+        if "script" in spec:
+            data["script"] = spec["script"]
         whole = merged(data, self.added)
         whole["integrity"] = digest_of_data(whole)
         with whole_file(folder / layout.CRASH) as temporary:
@@ -223,8 +227,10 @@ class Bundle:
 
 def _schema_of(spec: TrialSpec) -> int:
     """The first version that knows everything that determines the trial."""
-    if spec.only is not None:
+    if spec.script is not None:
         return SCHEMA
+    if spec.only is not None:
+        return _ALL_DRIVE
     return _ALL_TAKE_PART if spec.disturbances else _UNDISTURBED
 
 
@@ -277,6 +283,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         max_steps=data["max_steps"],
         disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
         only=tuple(only) if (only := data.get("only")) is not None else None,
+        script=Paths.from_json(script) if (script := data.get("script")) else None,
     )
     result = TrialResult(
         spec,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
     from crashhunt.recording import DivergenceData
     from crashhunt.trial import CollisionData, DisturbanceData, EscapeData, FailureData, Value
-    from crashhunt.world import ClosestData, EventData
+    from crashhunt.world import ClosestData, EventData, PathsData
 
 __all__ = ["ArchiveIndex", "CrashData", "CrashSummary", "Protected"]
 
@@ -58,6 +58,7 @@ class CrashData(Protected):
     disturbances: NotRequired[list[DisturbanceData]]
     planned_disturbances: NotRequired[list[DisturbanceData]]
     only: NotRequired[list[str] | None]
+    script: NotRequired[PathsData | None]
 
 
 class CrashSummary(TypedDict):

@@ -9,14 +9,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from crashhunt.base.asleep import Asleep
-from crashhunt.base.errors import InvalidEpisodeError, RecorderError
+from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import Copy, Held, held, shared_memory
 from crashhunt.episode._disturbed import Disturbed
 from crashhunt.episode._failures import close_agent, failure_of, is_emptied
-from crashhunt.episode._wiring import agent_seed, told, unflattener
+from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import FlattensObservations, HasMap, LeavesOut
+from crashhunt.simulators import FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.base.plain import Plain
     from crashhunt.episode._observer import Observer
-    from crashhunt.simulators import Info, Observations, Options, Simulator, StepResult
+    from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
@@ -299,12 +299,7 @@ class Episode:
         spec, simulator = self.spec, self.simulator
         agent = ""
         try:
-            options: Options = {"arguments": spec.scenario_arguments}
-            if spec.only is not None:
-                if not offers(simulator, LeavesOut):
-                    raise InvalidEpisodeError("the simulator cannot leave anybody out")
-                options["only"] = spec.only
-            self.observations, _ = self._reset(seed=spec.seed, options=options)
+            self.observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.base.faculties import offers
 from crashhunt.episode._observer import Observer
+from crashhunt.simulators import LeavesOut, PlaysPaths
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -15,7 +18,28 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-__all__ = ["agent_seed", "told", "unflattener"]
+    from crashhunt.simulators import Options, Simulator
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["agent_seed", "options_of", "told", "unflattener"]
+
+
+def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
+    """Return what a simulator is asked for with its reset.
+
+    Raises:
+        InvalidEpisodeError: it cannot do it.
+    """
+    options: Options = {"arguments": spec.scenario_arguments}
+    if spec.only is not None:
+        if not offers(simulator, LeavesOut):
+            raise InvalidEpisodeError("the simulator cannot leave anybody out")
+        options["only"] = spec.only
+    if spec.script is not None:
+        if not offers(simulator, PlaysPaths):
+            raise InvalidEpisodeError("the simulator cannot move anybody along recorded paths")
+        options["script"] = spec.script
+    return options
 
 
 def agent_seed(seed: int, number: int) -> int:

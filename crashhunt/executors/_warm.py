@@ -255,4 +255,5 @@ def _say(says: int, said: _Said) -> None:
 
 def _key(spec: TrialSpec) -> str:
     """What the traffic of a trial follows from."""
-    return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only], sort_keys=True)
+    script = None if spec.script is None else spec.script.to_json()
+    return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)

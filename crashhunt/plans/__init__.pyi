@@ -1,4 +1,5 @@
 from ._declaration import Given as Given, HuntOption as HuntOption
+from ._duration import seconds_of as seconds_of
 from ._executor import SizesItself as SizesItself, executor_of as executor_of
 from ._options import (
     Driver as Driver,

@@ -190,6 +190,7 @@ def _elsewhere(name: str, settings: HuntSettings, spec: TrialSpec, step_length_s
         scenario_arguments=argument_values(other) | shared,
         max_steps=max(1, round(spec.max_steps * step_length_s / there)),
         only=None,
+        script=None,
         disturbances=tuple(
             replace(one, step=max(1, round(one.step * step_length_s / there)), agent=ids.get(one.agent, one.agent))
             for one in spec.disturbances

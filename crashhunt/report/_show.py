@@ -354,7 +354,14 @@ def _shrunk(bundle: Bundle) -> list[str]:
     if not isinstance(told, dict):
         return []
     gone, changed = (told.get(name) or {} for name in ("removed", "changed"))
-    return [f"  {told.get('of')} made smaller: {len(gone)} left out, {len(changed)} arguments plainer"]
+    lines = [f"  {told.get('of')} made smaller: {len(gone)} left out, {len(changed)} arguments plainer"]
+    script = bundle.result.spec.script
+    if script is not None:
+        cut = told.get("steps_cut")
+        who = ", ".join(script.names)
+        moved = f"{who} moved along recorded ways, whatever the agent does" if who else "without any traffic"
+        lines.append(f"  scripted: {moved}" + (f"; it begins {cut} steps later" if cut else ""))
+    return lines
 
 
 def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[StepRecord]:

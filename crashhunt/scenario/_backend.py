@@ -125,6 +125,7 @@ class Backend:
             crash is a stranger's, and"; empty where it does nothing else. It is given the values of the trial's
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
         right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
+        plays_paths: whether it can move others along recorded ways.
         watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
             is not used again.
     """
@@ -154,6 +155,7 @@ class Backend:
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
+    plays_paths: bool = False
     watched: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

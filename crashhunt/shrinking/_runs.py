@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from crashhunt.triage import Signature
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Ran", "Runs", "StoppedError"]
+__all__ = ["OutOfTimeError", "Ran", "Runs", "StoppedError", "is_same"]
 
 _LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 _FIRST = 10**6  # the numbers of candidates; no hunt has a trial of such
@@ -34,6 +35,10 @@ _FIRST = 10**6  # the numbers of candidates; no hunt has a trial of such
 
 class StoppedError(Exception):
     """It was given up: the budget is used up, or somebody has asked for it."""
+
+
+class OutOfTimeError(StoppedError):
+    """It was given up: the time is over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,7 @@ class Runs:
         memory: a file with what came of candidates when it was interrupted; written as it goes on.
         parallel: trials at a time.
         budget: how many may be run.
+        time_s: how long they may take altogether, in s of wall-clock time; None for as long as it takes.
         stopped: asked now and then whether to give up.
         watch: called with how many have been run, and how many may be.
 
@@ -78,6 +84,7 @@ class Runs:
         *,
         parallel: int,
         budget: int,
+        time_s: float | None,
         stopped: Callable[[], bool],
         watch: Watch | None,
     ) -> None:
@@ -86,16 +93,21 @@ class Runs:
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
         self._budget, self._stopped, self._watch = budget, stopped, watch
         self._scratch = scratch
+        self._until = None if time_s is None else time.monotonic() + time_s
         self._memory = _remembered(memory)
         worker = replace(rerun.worker, scratch=scratch, keep_trials=False)
         kind = PoolExecutor if is_todays(rerun) else FreshProcessExecutor
         self._executor = kind(worker, parallel=parallel)
         self._next = _FIRST
 
-    def first(self, candidates: Sequence[TrialSpec]) -> int | None:
+    def first(self, candidates: Sequence[TrialSpec], *, again: bool = False) -> int | None:
         """Return the place of the first candidate that crashes in the same manner; None where none does.
 
         Which it is does not depend on how many run at a time.
+
+        Args:
+            candidates: to be tried.
+            again: run even what is known not to do it.
 
         Raises:
             StoppedError: it was given up before that was known.
@@ -106,7 +118,8 @@ class Runs:
         for place, spec in enumerate(candidates):
             if self.count + len(found) + len(numbers) >= self._budget:
                 break
-            if (known := self._memory.get(self._key(spec))) is not None:
+            known = self._memory.get(self._key(spec))
+            if known is not None and (known.same or not again):
                 found[place] = known
                 if known.same:
                     break
@@ -126,8 +139,7 @@ class Runs:
                     if ran.same and place < best:
                         best = place
                         self._give_up(numbers, best)
-                if self._stopped():
-                    raise StoppedError
+                self._stop_if_asked()
         finally:
             self._give_up(numbers, -1)
         self.count += sum(1 for place in found if place <= best)
@@ -152,8 +164,7 @@ class Runs:
         results: list[TrialResult] = []
         while not results:
             results = [one for one in self._executor.completed(_LOOK_EVERY_S) if one.spec.number == number]
-            if self._stopped():
-                raise StoppedError
+            self._stop_if_asked()
         folder = scratch_of(self._scratch, number)
         names: list[str] = []
         same = self._judged(results[0], keep=True).digest == self._rerun.bundle.result.digest
@@ -165,6 +176,12 @@ class Runs:
     def close(self) -> None:
         """End every process."""
         self._executor.close()
+
+    def _stop_if_asked(self) -> None:
+        if self._stopped():
+            raise StoppedError
+        if self._until is not None and time.monotonic() >= self._until:
+            raise OutOfTimeError
 
     def _numbered(self, spec: TrialSpec) -> TrialSpec:
         return replace(spec, number=self._next, max_steps=min(spec.max_steps, self.most_steps))
@@ -185,7 +202,7 @@ class Runs:
                 result.collision.agent, result.collision.role,
             )  # fmt: skip
         if same:
-            same = self._signature_of(result, folder) == self._signature
+            same = is_same(self._signature_of(result, folder), self._signature, result.spec)
         if result.kept and not keep:  # else it is the worker's, which goes on in it
             shutil.rmtree(folder, ignore_errors=True)
         return Ran(same, result.steps, result.digest)
@@ -214,6 +231,13 @@ class Runs:
         line = json.dumps({"key": key, "same": ran.same, "steps": ran.steps, "digest": ran.digest})
         with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # a full disk is told in the end
             file.write(f"{line}\n")
+
+
+def is_same(found: Signature | None, wanted: Signature, spec: TrialSpec) -> bool:
+    """Whether a trial crashed in the same manner; what disturbed scripted others is in their ways."""
+    if found is not None and spec.script is not None:
+        found = replace(found, disturbed=wanted.disturbed)
+    return found == wanted
 
 
 def _remembered(file: Path) -> dict[str, Ran]:

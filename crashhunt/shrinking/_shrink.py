@@ -10,34 +10,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.errors import UsageError
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.replays import ReplayOptions, confirm, prepare
-from crashhunt.shrinking._runs import Runs, StoppedError
-from crashhunt.shrinking._search import fewest, plainest
+from crashhunt.shrinking._runs import Runs, is_same
+from crashhunt.shrinking._stages import Ended, Form, Search
 from crashhunt.triage import signature_of
-from crashhunt.trial import EVERYBODY, Outcome
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle
-    from crashhunt.recording import Recording
     from crashhunt.replays import Rerun
     from crashhunt.triage import Signature
-    from crashhunt.trial import Disturbance, TrialResult, TrialSpec, Value
+    from crashhunt.trial import TrialResult, TrialSpec, Value
 
 __all__ = ["Shrunk", "ShrunkData", "shrink", "shrunk_name"]
 
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
-Ended = Literal["done", "budget", "interrupted", "error"]
-_TRIES = 3  # of a crash that does not come again at once
-_NEAR = 6  # of the others, so many that are nearest in the end are tried together
-_SINGLE = 40  # and so many one by one
-_LONGER_S = 5.0  # simulation time by which it may become longer, besides twice as long, where fewer take part
+_TRIES = 3  # of what is left of a flaky crash
 
 
 class ShrunkData(TypedDict):
@@ -57,6 +52,9 @@ class ShrunkData(TypedDict):
     trials_run: int
     removed: list[str]
     changed: dict[str, list[Value | None]]
+    scripted: list[str] | None
+    steps_cut: int
+    notes: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +71,8 @@ class Shrunk:
         trials: how many were run.
         removed: who and what was taken away.
         changed: arguments that have another value: name to what it was and what it is.
+        steps_cut: how many steps of the beginning were cut off.
+        notes: what may make a difference, in words.
     """
 
     bundle: Bundle
@@ -84,6 +84,14 @@ class Shrunk:
     trials: int = 0
     removed: tuple[str, ...] = ()
     changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
+    steps_cut: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scripted(self) -> tuple[str, ...] | None:
+        """Who is moved along a recorded way; None where the others drive."""
+        script = self.small.result.spec.script if self.small is not None else None
+        return None if script is None else script.names
 
     def to_json(self) -> ShrunkData:
         """Return the shape that ``shrink --json`` prints."""
@@ -103,6 +111,9 @@ class Shrunk:
             "trials_run": self.trials,
             "removed": list(self.removed),
             "changed": {name: list(values) for name, values in self.changed.items()},
+            "scripted": None if self.scripted is None else list(self.scripted),
+            "steps_cut": self.steps_cut,
+            "notes": list(self.notes),
         }
 
 
@@ -115,19 +126,25 @@ def shrink(
     bundle: Bundle,
     *,
     budget: int = 500,
+    time_s: float | None = None,
+    form: Form = "either",
     parallel: int = 0,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Shrunk:
     """Make a crash smaller while it stays the same kind of crash, and write what is left as a bundle beside it.
 
-    Others are left out, disturbances dropped, and arguments made plainer: towards their defaults, and rounder. The
-    result depends on the crash and the budget only. Interrupted, it leaves the best that it has, and the same call goes
-    on from there.
+    Others are left out, disturbances dropped, and arguments made plainer: towards their defaults, and rounder. Where it
+    takes more than a few others, these are moved along their recorded ways, of which any can be left out, and the
+    beginning is cut off. The result depends on the crash and the budget only, unless time runs out. Interrupted, it
+    leaves the best that it has, and the same call goes on from there.
 
     Args:
         bundle: the crash.
         budget: how many trials may be run.
+        time_s: how long that may take, in s of wall-clock time; two runs that confirm what is left come on top.
+        form: ``traffic`` where the others are to go on driving, ``scripted`` where they are not; ``either`` where that
+            depends on how few are left.
         parallel: how many at a time; 0 for one per core.
         watch: called with how many have been run, and how many may be.
         stopped: asked now and then whether to give up.
@@ -143,16 +160,19 @@ def shrink(
         raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
     if budget < 1:
         raise UsageError(f"the budget is {budget}", fix="give at least 1 trial")
+    if time_s is not None and not time_s > 0:
+        raise UsageError(f"the time is {time_s} s", fix="give more than 0")
     rerun = prepare(bundle, ReplayOptions())
     signature = signature_of(bundle)
     memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")
     with tempfile.TemporaryDirectory(prefix="crashhunt-shrink-") as folder:
         runs = Runs(
             rerun, signature, Path(folder), memory,
-            parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, stopped=stopped, watch=watch,
+            parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, time_s=time_s,
+            stopped=stopped, watch=watch,
         )  # fmt: skip
         try:
-            search = _Search(rerun, runs)
+            search = Search(rerun, runs, form)
             ended, why = search.run(stopped)
         finally:
             runs.close()
@@ -162,154 +182,32 @@ def shrink(
         if small is None:
             why = "what was left did not do the same in a fresh process"
     if not search.reproduced:
-        verdict: Verdict = "unchanged" if ended in ("interrupted", "budget") else "not_reproduced"
-        return Shrunk(bundle, verdict, ended, why=why, actors=search.actors(None), trials=runs.count)
+        verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
+        return Shrunk(bundle, verdict, ended, None, why, search.actors(None), runs.count, notes=rerun.warnings)
     if small is None:
-        return Shrunk(bundle, "unchanged", ended, why=why, actors=search.actors(None), trials=runs.count)
+        return Shrunk(bundle, "unchanged", ended, None, why, search.actors(None), runs.count, notes=rerun.warnings)
     if ended == "done":
         memory.unlink(missing_ok=True)
     return Shrunk(
         bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count,
-        search.removed(), search.changed(),
+        search.removed(), search.changed(), search.steps_cut, rerun.warnings,
     )  # fmt: skip
 
 
-class _Search:
-    """What is tried, and the smallest that still did it."""
-
-    def __init__(self, rerun: Rerun, runs: Runs) -> None:
-        self.best = rerun.spec
-        self.smaller: list[TrialSpec] = []
-        self.reproduced = False
-        self._rerun, self._runs = rerun, runs
-        self._everybody: tuple[str, ...] = ()
-
-    def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
-        """Make it smaller until nothing helps any more; returns why it ended."""
-        try:
-            for _ in range(_TRIES):
-                self.reproduced = self.reproduced or self._runs.first([self.best]) is not None
-            if not self.reproduced:
-                return "done", f"it did not come again in {_TRIES} runs"
-            before = None
-            while before != self.best:
-                before = self.best
-                self._fewer_others()
-                self._fewer_disturbances()
-                self._plainer_arguments()
-        except StoppedError:
-            asked = stopped()
-            return ("interrupted", "") if asked else ("budget", "give a larger --budget to go on from here")
-        except CrashhuntError as error:
-            if not self.reproduced:
-                raise
-            return "error", str(error)
-        return "done", ""
-
-    def _try(self, specs: Sequence[TrialSpec]) -> int | None:
-        good = self._runs.first(specs)
-        if good is not None:
-            self.best = specs[good]
-            self.smaller.append(self.best)
-        return good
-
-    def _fewer_others(self) -> None:
-        best = self.best
-
-        def tried(some: Sequence[tuple[str, ...]]) -> int | None:
-            return self._try([replace(best, only=one) for one in some])
-
-        if best.only is not None:
-            fewest(best.only, tried)
-            return
-        self._everybody = self._runs.entered(replace(best, only=(EVERYBODY,)))
-        if not self._everybody:
-            return  # the simulator cannot leave anybody out
-        shortest, likely = self._runs.most_steps, self._likely()
-        middle = min(best.max_steps, round(2 * shortest + _LONGER_S / self._rerun.recorded.prologue.step_length_s))
-        for most in dict.fromkeys((shortest, middle, best.max_steps)):
-            self._runs.most_steps = most
-            if (good := tried(likely)) is not None:
-                fewest(likely[good], tried)
-                return
-        self._runs.most_steps = middle
-        fewest(self._everybody, tried)
-
-    def _likely(self) -> list[tuple[str, ...]]:
-        """Who may be all that it takes: nobody, the other one, the nearest in the end, any single one of them."""
-        recording, known = self._rerun.recorded, set(self._everybody)
-        hit = self._rerun.bundle.result.collision
-        other = (hit.other,) if hit is not None and hit.other in known else ()
-        near = _nearest(recording, self._rerun.bundle.driver)
-        near = [name for name in near if name in known]
-        groups = [(), other, tuple(near[:2]), *((name,) for name in near[:_SINGLE]), tuple(near[:_NEAR])]
-        return list(dict.fromkeys(groups))
-
-    def _fewer_disturbances(self) -> None:
-        best = self.best
-
-        def tried(some: Sequence[tuple[Disturbance, ...]]) -> int | None:
-            return self._try([replace(best, disturbances=one) for one in some])
-
-        fewest(best.disturbances, tried)
-
-    def _plainer_arguments(self) -> None:
-        defaults = self._defaults()
-        names = [("", name) for name in self.best.scenario_arguments]
-        names += [(agent, name) for agent, given in self.best.arguments.items() for name in given]
-        at_default = self.best
-        for key in names:
-            if defaults.get(key) is not None:
-                at_default = _with(at_default, key, defaults[key])
-        if at_default != self.best:
-            self._try([at_default])
-        for key in names:
-            best = self.best
-            values = plainest(_value(best, key), defaults.get(key))
-            if values:
-                self._try([_with(best, key, value) for value in values])
-
-    def _defaults(self) -> dict[tuple[str, str], Value | None]:
-        scenario = self._rerun.worker.scenario
-        found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
-        for agent in scenario.agents:
-            found |= {(agent, name): known.default for name, known in scenario.agent_arguments(agent).items()}
-        return found
-
-    def actors(self, after: Recording | None) -> tuple[int, int]:
-        """How many were seen before and after."""
-        before = _actors(self._rerun.recorded)
-        return before, before if after is None else _actors(after)
-
-    def removed(self) -> tuple[str, ...]:
-        """Who and what was taken away."""
-        was, only = self._rerun.spec, self.best.only
-        stay = {*(only or ()), *was.arguments, *self._rerun.worker.scenario.agents}
-        others = [name for name in self._everybody if name not in stay] if only is not None else []
-        gone = [one.words for one in was.disturbances if one not in self.best.disturbances]
-        return (*others, *gone)
-
-    def changed(self) -> dict[str, tuple[Value | None, Value | None]]:
-        """Arguments that have another value."""
-        was, now = self._rerun.spec, self.best
-        keys = [("", name) for name in was.scenario_arguments]
-        keys += [(agent, name) for agent, given in was.arguments.items() for name in given]
-        pairs = {f"{agent}.{name}" if agent else name: (_value(was, (agent, name)), _value(now, (agent, name)))
-                 for agent, name in keys}  # fmt: skip
-        return {name: (left, right) for name, (left, right) in pairs.items() if left != right}
-
-
-def _written(rerun: Rerun, search: _Search, signature: Signature) -> Bundle | None:
+def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:
     """Run the smallest in a fresh process, and write its bundle; another process confirms it, as of every crash.
 
     Of what does not do the same there, the next larger one is taken; None where none does.
     """
     bundle = rerun.bundle
-    for spec in reversed(search.smaller):
+    tries = _TRIES if bundle.confirmed is False else 1
+    for spec in (spec for spec in reversed(search.smaller) for _ in range(tries)):
         search.best = spec
         small = _run_fresh(rerun, search.best)
-        if signature_of(small) == signature:
-            told = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
+        if is_same(signature_of(small), signature, spec):
+            told: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
+            if search.steps_cut:
+                told["steps_cut"] = search.steps_cut
             small = replace(small, added={**small.added, "shrunk": told})
             small = confirm(small) or small
             small.write()
@@ -337,38 +235,5 @@ def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
         )  # fmt: skip
 
 
-def _plain(search: _Search) -> dict[str, list[Value | None]]:
+def _plain(search: Search) -> dict[str, list[Value | None]]:
     return {name: list(values) for name, values in search.changed().items()}
-
-
-def _actors(recording: Recording) -> int:
-    return len({actor.id for scene in recording.scenes() for actor in scene.roster.actors})
-
-
-def _nearest(recording: Recording, agent: str) -> list[str]:
-    """The others in the last scene, the nearest first."""
-    scenes = recording.scenes()
-    if not scenes or agent not in scenes[-1].roster.index:
-        return []
-    scene = scenes[-1]
-    x, y = scene.points[scene.roster.index[agent]]
-    away = {
-        actor.id: (point[0] - x) ** 2 + (point[1] - y) ** 2
-        for actor, point in zip(scene.roster.actors, scene.points, strict=True)
-        if actor.id != agent
-    }
-    return sorted(away, key=lambda name: (away[name], name))
-
-
-def _value(spec: TrialSpec, key: tuple[str, str]) -> Value:
-    agent, name = key
-    return spec.arguments[agent][name] if agent else spec.scenario_arguments[name]
-
-
-def _with(spec: TrialSpec, key: tuple[str, str], value: Value | None) -> TrialSpec:
-    agent, name = key
-    if value is None:
-        return spec
-    if not agent:
-        return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
-    return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})

@@ -24,6 +24,7 @@ from ._protocol import (
     NamesObservations as NamesObservations,
     Observations as Observations,
     Options as Options,
+    PlaysPaths as PlaysPaths,
     Simulator as Simulator,
     StepResult as StepResult,
     TellsEvents as TellsEvents,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Scene
+    from crashhunt.world import Lane, Paths, Scene
 
 __all__ = [
     "FACULTIES",
@@ -35,6 +35,7 @@ __all__ = [
     "NamesObservations",
     "Observations",
     "Options",
+    "PlaysPaths",
     "Simulator",
     "StepResult",
     "TellsEvents",
@@ -50,10 +51,12 @@ class Options(TypedDict, total=False):
         arguments: the arguments of the scenario, by name.
         only: those besides the agents that take part, by the names that scenes have for them; everybody where it is
             missing. Only given to one that is `LeavesOut`.
+        script: recorded ways along which the others are moved. Only given to one that is `PlaysPaths`.
     """
 
     arguments: Mapping[str, Value]
     only: Sequence[str]
+    script: Paths
 
 
 Observations = dict[str, NDArray[Any]]
@@ -102,8 +105,8 @@ class Simulator(Protocol):
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
     `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
-    `HoldsBack`, `LeavesOut` and `Tidies`. Nothing is registered: whoever has the methods and attributes of one offers
-    it.
+    `HoldsBack`, `LeavesOut`, `PlaysPaths` and `Tidies`. Nothing is registered: whoever has the methods and attributes
+    of one offers it.
     """
 
     @property
@@ -298,6 +301,14 @@ class LeavesOut(Protocol):
         """Who has entered since `Simulator.reset` was given ``only``, whether it took part or not; else nobody."""
 
 
+class PlaysPaths(Protocol):
+    """A simulator that can move others along recorded ways, so that nothing that anybody does changes them."""
+
+    @property
+    def scripted(self) -> bool:
+        """Whether the others of this episode are moved along recorded ways."""
+
+
 class Tidies(Protocol):
     """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
 
@@ -325,6 +336,7 @@ FACULTIES: tuple[type, ...] = (
     Disturbs,
     HoldsBack,
     LeavesOut,
+    PlaysPaths,
     Tidies,
 )
 """Everything that a simulator may offer."""

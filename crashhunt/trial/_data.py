@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.trial._space import Value
-    from crashhunt.world import ClosestData, EventData
+    from crashhunt.world import ClosestData, EventData, PathsData
 
 __all__ = [
     "BranchData",
@@ -57,6 +57,7 @@ class SpecExtras(TypedDict, total=False):
     origin: str
     disturbances: list[DisturbanceData]
     only: list[str]
+    script: PathsData
     requires: list[str]
 
 

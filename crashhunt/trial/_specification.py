@@ -9,6 +9,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.tolerance import ESSENTIAL, known_values, not_understood, required_of
 from crashhunt.base.version import __version__
 from crashhunt.trial._disturbance import Disturbance
+from crashhunt.world import Paths
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,6 +65,8 @@ class TrialSpec:
         origin: the sampler's word on where it came from, such as the name of a strategy. It determines nothing.
         disturbances: who around the agents errs, and when; in the order of their steps.
         only: which of the others take part; None for all. A crash that was made smaller has it.
+        script: recorded ways along which the others are moved, whatever anybody does; the agents begin where theirs
+            do, and the traffic takes no part. None where the others drive.
     """
 
     number: int
@@ -76,6 +79,7 @@ class TrialSpec:
     origin: str = ""
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=ESSENTIAL)
     only: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
+    script: Paths | None = field(default=None, metadata=ESSENTIAL)
 
     def to_json(self) -> SpecData:
         """Return plain dicts and numbers."""
@@ -90,6 +94,8 @@ class TrialSpec:
             more["disturbances"] = [one.to_json() for one in self.disturbances]
         if self.only is not None:
             more["only"] = list(self.only)
+        if self.script is not None:
+            more["script"] = self.script.to_json()
         if requires := [*required_of(self), *(required_of(self.overruled) if self.overruled else ())]:
             more["requires"] = requires
         return {
@@ -126,4 +132,5 @@ class TrialSpec:
             origin=data.get("origin", ""),
             disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
             only=tuple(only) if (only := data.get("only")) is not None else None,
+            script=Paths.from_json(script) if (script := data.get("script")) else None,
         )

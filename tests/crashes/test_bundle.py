@@ -160,7 +160,7 @@ def test_what_has_changed_is_refused(bundle):
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"schema": 5}, "schema 5 is above 4"),
+        ({"schema": 6}, "schema 6 is above 5"),
         ({"schema": 0}, "schema 0"),
         ({"seed": 2**31}, "out of its range"),
         ({"seed": -1}, "out of its range"),

@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 from crashhunt.base import errors
 from crashhunt.errors import CrashhuntError
 from crashhunt.trial import CRASHES, Collision, Failure, Outcome, TrialResult, TrialSpec
-from crashhunt.world import ClosestApproach
+from crashhunt.world import Actor, ClosestApproach, Path, Paths, State
 
 ALL_ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, CrashhuntError)]
 
@@ -32,6 +32,12 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 values = st.one_of(st.booleans(), st.integers(-(2**53), 2**53), finite, st.text())
 names = st.lists(st.text()).map(tuple)
 hits = st.builds(Collision, st.text(), st.text(), st.text(), st.text(), names, x=finite)
+ways = st.builds(
+    Path,
+    st.builds(Actor, st.text(), st.text(), finite, finite),
+    st.integers(0, 99),
+    st.tuples(st.builds(State, *[finite] * 4)),
+)
 results = st.builds(
     TrialResult,
     spec=st.builds(
@@ -42,6 +48,7 @@ results = st.builds(
         scenario_arguments=st.dictionaries(st.text(), values),
         max_steps=st.integers(1, 10**9),
         only=st.none() | names,
+        script=st.none() | st.builds(Paths, finite, st.integers(0, 99), st.just(()), st.tuples(ways)),
     ),
     outcome=st.sampled_from(Outcome),
     steps=st.integers(0, 10**9),

@@ -24,18 +24,20 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
     return {str(arguments.get(setup.replaces, "")): agent for agent, setup in agents.items() if setup.replaces}
 
 
-def enter(scenario: Scenario, replaced: Mapping[str, str], left_out: LeftOut | None) -> None:
+def enter(
+    scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], left_out: LeftOut | None
+) -> None:
     """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road.
 
     Args:
-        scenario: whose agents.
+        scenario: how long it warms up, and how long is waited.
+        setups: of the agents that drive.
         replaced: vehicles of the traffic to the agents that take their places.
         left_out: who of the traffic takes no part; None where all do.
 
     Raises:
         InvalidEpisodeError: one of them did not enter in time, or had left again.
     """
-    setups = scenario.agents
     begin = libsumo.simulation.getTime()
     if scenario.warmup_s > 0:
         if left_out is not None:

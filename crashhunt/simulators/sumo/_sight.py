@@ -49,6 +49,9 @@ class Sight:
         lateral: whether vehicles may be elsewhere than in the middle of a lane.
         speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
         core: what reads faster, where it is there.
+
+    Attributes:
+        leaving: the ids of persons who are there and have no part any more.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class Sight:
         self._eyes: Vehicles | None = core.Vehicles(self._controlled, [], [], []) if core is not None else None
         self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
         self._speeds = speeds
+        self.leaving: set[str] = set()
         self._high: bool | None = None
         self._bends = Bends(lateral=lateral)
         self._known: dict[str, Actor] = {}
@@ -200,7 +204,7 @@ class Sight:
         if self._persons_count and (sumo.person_getIDCount() or self._all_persons):
             self._all_persons = sumo.person_getIDList()
             near = _near(self._all_persons, list(map(sumo.person_getPosition, self._all_persons)), eyes)
-            persons = tuple([person for person in near if not sumo.person_getVehicle(person)])
+            persons = tuple([one for one in near if one not in self.leaving and not sumo.person_getVehicle(one)])
         if ids != self._ids or persons != self._persons:
             self._see(ids, persons)
 

@@ -24,13 +24,14 @@ from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._entering import enter, replaced_by
 from crashhunt.simulators.sumo._holding import held_back
 from crashhunt.simulators.sumo._left_out import LeftOut
+from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
 
     from crashhunt.scenario import AgentSetup, Scenario
     from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
-    from crashhunt.trial import Disturbance
-    from crashhunt.world import Scene
+    from crashhunt.trial import Disturbance, Value
+    from crashhunt.world import Paths, Scene
 
 __all__ = ["SumoSimulator"]
 
@@ -93,6 +94,9 @@ class SumoSimulator:
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
         self._left_out: LeftOut | None = None
+        self.scripted = False
+        self._setups = scenario.agents
+        self._look_with: Sight | ScriptedSight = self._sight
 
     told_events = BACKEND.told_events
     disturbing_kinds = BACKEND.disturbances or ()
@@ -124,9 +128,8 @@ class SumoSimulator:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
         global _current
         options = options or {}
-        arguments, only = options.get("arguments", {}), options.get("only")
-        replaced = replaced_by(self._scenario.agents, arguments)
-        self._left_out = None if only is None else LeftOut((*only, *self._scenario.agents, *replaced))
+        arguments = options.get("arguments", {})
+        self._begin(options.get("only"), options.get("script"), arguments)
         command = self._files.arguments(seed, arguments)
         try:
             if libsumo.isLoaded():
@@ -135,14 +138,15 @@ class SumoSimulator:
                 libsumo.start([*self._program, *command])
                 _keep_xml_ready()
             _current = weakref.ref(self)
-            enter(self._scenario, replaced, self._left_out)
+            enter(self._scenario, self._setups, self._replaced, self._left_out)
+            if script := options.get("script"):
+                place_agents(script)
         except _TRACI_ERRORS as error:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
-        self.agents = list(self._scenario.agents)
+        self.agents = list(self._setups)
         self._targets = dict.fromkeys(self.agents, -1)
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._steps = 0
-        self._sight.reset()
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         self._look()
@@ -152,7 +156,7 @@ class SumoSimulator:
             self.notices.append(_DISTRUSTED)
             self._look()
             observations = self._observe_all()
-        self._events.begin(self._scene, self.agents, self._scenario.agents)
+        self._events.begin(self._scene, self.agents, self._moved)
         return observations, {}
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
@@ -244,6 +248,21 @@ class SumoSimulator:
         (left, _), (right, _) = libsumo.simulation.getNetBoundary()
         return float(right - left)
 
+    def _begin(self, only: Sequence[str] | None, script: Paths | None, arguments: Mapping[str, Value]) -> None:
+        """Forget the last episode, and note who takes part in this one."""
+        self._sight.reset()
+        self._sight.leaving.clear()
+        self._look_with, setups = self._sight, self._scenario.agents
+        self.scripted = script is not None
+        if script is not None:
+            self._look_with = ScriptedSight(self._sight, script)
+            driven = {path.actor.id for path in script.agents}
+            setups, only = {agent: setup for agent, setup in setups.items() if agent in driven}, ()
+        self._setups, self._replaced = setups, replaced_by(setups, arguments)
+        self._moved = {**self._scenario.agents, **dict.fromkeys(script.names if script is not None else ())}
+        stay = (*(only or ()), *setups, *self._replaced)
+        self._left_out = None if only is None else LeftOut(stay, self._sight.leaving)
+
     def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
         setup = self._scenario.agents[agent]
         if setup.action == "meta":
@@ -307,7 +326,7 @@ class SumoSimulator:
 
     def _look(self) -> None:
         """Read the state of everybody in sight."""
-        self._scene = self._sight.look(self._steps, self._off_road)
+        self._scene = self._look_with.look(self._steps, self._off_road)
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
         edge = sumo.vehicle_getRoadID(agent)

@@ -132,6 +132,7 @@ BACKEND = Backend(
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),
+    plays_paths=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     explained=_explained,
     side_effect=_side_effect,

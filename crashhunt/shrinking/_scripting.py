@@ -1,0 +1,102 @@
+"""The second form of a crash: the others moved along recorded ways, so that who is left out changes nobody else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.trial import OF_AGENT
+from crashhunt.world import paths_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.replays import Rerun
+    from crashhunt.trial import TrialSpec
+
+__all__ = ["Part", "Scripting", "can_be_scripted"]
+
+_BEFORE_S = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0)
+"""How long before the crash it may begin, in s: tried in this order. A lane change is looked for 3 s back."""
+
+_LONGER_S = 1.0  # by which the crash may come later than it did: the others are seen no longer than that
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What of a crash takes part.
+
+    Args:
+        agents: who drives themselves.
+        others: who is moved; agents may be among them.
+        begin: the step of the recording with which it begins.
+    """
+
+    agents: tuple[str, ...]
+    others: tuple[str, ...]
+    begin: int = 0
+
+
+class Scripting:
+    """Makes trials of parts of a recorded crash.
+
+    Args:
+        rerun: the crash.
+    """
+
+    def __init__(self, rerun: Rerun) -> None:
+        recorded = rerun.recorded
+        self._spec = rerun.spec
+        self._step_s = recorded.prologue.step_length_s
+        self._paths = paths_of(recorded.scenes(), recorded.agents)
+        self.whole = Part(recorded.agents, self._paths.names)
+
+    @property
+    def steps(self) -> int:
+        """How many were recorded."""
+        return self._paths.steps
+
+    def spec(self, part: Part, like: TrialSpec | None = None) -> TrialSpec:
+        """Return the trial.
+
+        Args:
+            part: who takes part, and from when on.
+            like: whose arguments and disturbances it has; without, those that were recorded.
+        """
+        paths = self._paths.driven_by(part.agents).only(part.others)
+        paths = paths.cut(part.begin, paths.steps, self._step_s).placing()
+        base = like or self._spec
+        disturbances = base.disturbances
+        if base.script is None:  # else they have been shifted; what befell the others is in their ways
+            kept = (one for one in disturbances if one.what in OF_AGENT and one.step > part.begin)
+            disturbances = tuple(replace(one, step=one.step - part.begin) for one in kept)
+        return replace(
+            base,
+            arguments={agent: given for agent, given in base.arguments.items() if agent in part.agents},
+            disturbances=disturbances,
+            only=None,
+            script=paths,
+            max_steps=paths.steps + max(1, round(_LONGER_S / self._step_s)),
+        )
+
+    def begins(self, agents: Sequence[str]) -> list[int]:
+        """Return with which later steps it could begin, the last one first."""
+        known = [{step for step, _ in path.lanes} for path in self._paths.agents if path.actor.id in agents]
+        steps = sorted(set.intersection(*known)) if known else []
+        found = []
+        for before_s in _BEFORE_S:
+            latest = self.steps - round(before_s / self._step_s)
+            found += [step for step in steps if 0 < step <= latest][-1:]
+        return list(dict.fromkeys(found))
+
+
+def can_be_scripted(rerun: Rerun) -> bool:
+    """Whether simulator and the crashhunt that runs it can move others along recorded ways."""
+    if not rerun.worker.scenario.backend.plays_paths:
+        return False
+    return not rerun.worker.code or any(
+        name.endswith(f"/{layout.PACKAGE.name}/scenario/_backend.py")
+        and "plays_paths" in (rerun.snapshot.path / name).read_text(encoding="utf-8", errors="replace")
+        for name in rerun.snapshot.manifest["files"]
+    )

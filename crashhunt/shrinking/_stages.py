@@ -1,0 +1,330 @@
+"""What is tried to make a crash smaller, in which order, and the smallest that still did it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.shrinking._runs import OutOfTimeError, StoppedError
+from crashhunt.shrinking._scripting import Part, Scripting, can_be_scripted
+from crashhunt.shrinking._search import fewest, plainest
+from crashhunt.trial import EVERYBODY, OF_AGENT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.recording import Recording
+    from crashhunt.replays import Rerun
+    from crashhunt.shrinking._runs import Runs
+    from crashhunt.trial import Disturbance, TrialSpec, Value
+
+__all__ = ["Ended", "Form", "Search"]
+
+Ended = Literal["done", "budget", "time", "interrupted", "error"]
+Form = Literal["either", "traffic", "scripted"]
+_TRIES = 3  # of a crash that does not come again at once
+_FLAKY_TRIES = 10  # of one of which that is known
+_NEAR = 6  # of the others, so many that are nearest in the end are tried together
+_SINGLE = 40  # and so many one by one
+_SINGLE_OR_SCRIPTED = 6  # where there is another way
+_LONGER_S = 5.0  # simulation time by which it may become longer, besides twice as long, where fewer take part
+_FEW = 3  # actors; with no more of them, the traffic goes on driving by itself
+
+
+class Search:
+    """Makes a crash smaller.
+
+    Args:
+        rerun: the crash.
+        runs: what runs candidates.
+        form: whether the others go on driving; ``either`` where that leaves few of them.
+
+    Attributes:
+        best: the smallest that did it.
+        smaller: all that did it and are smaller, one after another.
+        reproduced: whether the crash itself came again.
+    """
+
+    def __init__(self, rerun: Rerun, runs: Runs, form: Form) -> None:
+        self.best = rerun.spec
+        self.smaller: list[TrialSpec] = []
+        self.reproduced = False
+        self._rerun, self._runs, self._form = rerun, runs, form
+        self._everybody: tuple[str, ...] = ()
+        self._left_out = True
+        self._scripting = Scripting(rerun) if form != "traffic" and can_be_scripted(rerun) else None
+
+    def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
+        """Make it smaller until nothing helps any more; returns why it ended."""
+        tries = _FLAKY_TRIES if self._rerun.bundle.confirmed is False else _TRIES
+        try:
+            for _ in range(tries):
+                self.reproduced = self.reproduced or self._runs.first([self.best], again=True) is not None
+            if not self.reproduced:
+                return "done", f"it did not come again in {tries} runs"
+            if self._form == "scripted" and self._scripting is None:
+                title = self._rerun.worker.scenario.backend.title or "its simulator"
+                return "done", f"{title} cannot move others along recorded ways, or not in the version of the snapshot"
+            if self._scripting is None:
+                self._until_nothing_helps(self._fewer_others)
+            else:
+                self._smaller_in_either_form(self._scripting)
+        except StoppedError as error:
+            if stopped():
+                return "interrupted", ""
+            if isinstance(error, OutOfTimeError):
+                return "time", "give --for more time to go on from here"
+            return "budget", "give a larger --budget to go on from here"
+        except CrashhuntError as error:
+            if not self.reproduced:
+                raise
+            return "error", str(error)
+        return "done", ""
+
+    def _smaller_in_either_form(self, scripting: Scripting) -> None:
+        if self._form == "either":
+            self._fewer_others()
+            if self.best.only is not None:
+                self._until_nothing_helps(self._fewer_others)
+        if self._wants_script():
+            self._script(scripting)
+        if self.best.only is None and self.best.script is None and self._form == "either":
+            self._scripting = None
+            self._until_nothing_helps(self._fewer_others)
+
+    def _until_nothing_helps(self, fewer_others: Callable[[], None]) -> None:
+        before = None
+        while before != self.best:
+            before = self.best
+            fewer_others()
+            self._fewer_disturbances()
+            self._plainer_arguments()
+
+    def _try(self, specs: Sequence[TrialSpec]) -> int | None:
+        good = self._runs.first(specs)
+        if good is not None:
+            self.best = specs[good]
+            self.smaller.append(self.best)
+        return good
+
+    # With the traffic driving
+
+    def _fewer_others(self) -> None:
+        best = self.best
+
+        def tried(some: Sequence[tuple[str, ...]]) -> int | None:
+            return self._try([replace(best, only=one) for one in some])
+
+        if best.only is not None:
+            fewest(best.only, tried)
+            return
+        if not self._left_out:
+            return
+        self._everybody = self._runs.entered(replace(best, only=(EVERYBODY,)))
+        if not self._everybody:
+            self._left_out = False  # the simulator cannot do it
+            return
+        shortest, likely = self._runs.most_steps, self._likely()
+        middle = min(best.max_steps, round(2 * shortest + _LONGER_S / self._rerun.recorded.prologue.step_length_s))
+        lengths = dict.fromkeys((shortest, middle, best.max_steps))
+        for most in lengths if self._scripting is None else (shortest, middle):
+            self._runs.most_steps = most
+            if (good := tried(likely)) is not None:
+                fewest(likely[good], tried)
+                return
+        self._runs.most_steps = middle
+        if self._scripting is None:
+            fewest(self._everybody, tried)
+
+    def _likely(self) -> list[tuple[str, ...]]:
+        """Who may be all that it takes: nobody, the other one, the nearest in the end, any single one of them."""
+        recording, known = self._rerun.recorded, set(self._everybody)
+        near = [name for name in _nearest(recording, self._rerun.bundle.driver) if name in known]
+        other = [name for name in self._others_of_the_crash() if name in known]
+        single = near[: _SINGLE if self._scripting is None else _SINGLE_OR_SCRIPTED]
+        groups = [(), tuple(other), tuple(near[:2]), *((name,) for name in single), tuple(near[:_NEAR])]
+        return list(dict.fromkeys(groups))
+
+    def _others_of_the_crash(self) -> list[str]:
+        result = self._rerun.bundle.result
+        named = (result.collision.other,) if result.collision else result.event.others if result.event else ()
+        return [name for name in named if name]
+
+    # With the others scripted
+
+    def _wants_script(self) -> bool:
+        best, agents = self.best, self._rerun.recorded.agents
+        if self._form == "scripted" or best.only is None or len(agents) > 1:
+            return True
+        # Where nobody else is there, the traffic is nothing, and the beginning can be cut off.
+        return not best.only or len(best.only) + len(agents) > _FEW
+
+    def _script(self, scripting: Scripting) -> None:
+        self._runs.most_steps = max(self._runs.most_steps, 2 * scripting.steps + 100)
+        best = self.best
+        before = len(self.smaller)
+        part = self._fewest_moved(scripting)
+        if part is None:
+            return
+        good = self._try([scripting.spec(one) for one in self._later(scripting, part)])
+        if good is not None:
+            part = self._later(scripting, part)[good]
+        if best.only is not None and not self._is_smaller(part, best):
+            self.best = best
+            del self.smaller[before:]
+            return
+        self._until_nothing_helps(lambda: None)
+
+    def _is_smaller(self, part: Part, than: TrialSpec) -> bool:
+        """Whether it has fewer actors, agents or steps than one in which the others drive."""
+        only = than.only or ()
+        if self._form == "scripted":
+            return True
+        if len(part.agents) < len(than.arguments):
+            return True
+        if len(part.agents) + len(part.others) < len(than.arguments) + len(only):
+            return True
+        return not only and part.begin > 0
+
+    def _fewest_moved(self, scripting: Scripting) -> Part | None:
+        """Leave out all of the others that it does not take; None where it does not come again in this form."""
+        whole, about = scripting.whole, self._rerun.bundle.driver
+        near = [name for name in _nearest(self._rerun.recorded, about) if name not in whole.agents]
+        other = tuple(self._others_of_the_crash())
+        alone = (about,) if len(whole.agents) > 1 and about in whole.agents else ()
+        likely: list[Part] = []
+        for agents in dict.fromkeys((alone, whole.agents) if alone else (whole.agents,)):
+            moved = [name for name in whole.agents if name not in agents]
+            groups = [(), other, tuple(near[:1]), tuple(near[:2]), tuple(moved), tuple(near[:_NEAR]), (*moved, *near)]
+            groups = [tuple(name for name in group if name not in agents) for group in groups]
+            likely += [Part(agents, group) for group in dict.fromkeys(groups)]
+        likely.append(whole)
+        good = self._try([scripting.spec(part) for part in likely])
+        if good is None:
+            return None
+        found = likely[good]
+
+        def tried(some: Sequence[tuple[str, ...]]) -> int | None:
+            return self._try([scripting.spec(replace(found, others=one)) for one in some])
+
+        return replace(found, others=fewest(found.others, tried))
+
+    def _later(self, scripting: Scripting, part: Part) -> list[Part]:
+        return [replace(part, begin=begin) for begin in scripting.begins(part.agents)]
+
+    # What both have
+
+    def _fewer_disturbances(self) -> None:
+        best = self.best
+
+        def tried(some: Sequence[tuple[Disturbance, ...]]) -> int | None:
+            return self._try([replace(best, disturbances=one) for one in some])
+
+        fewest(best.disturbances, tried)
+
+    def _plainer_arguments(self) -> None:
+        defaults = self._defaults()
+        at_default = self.best
+        for key in _keys(self.best):
+            if defaults.get(key) is not None:
+                at_default = _with(at_default, key, defaults[key])
+        if at_default != self.best:
+            self._try([at_default])
+        for key in _keys(self.best):
+            best = self.best
+            values = plainest(_value(best, key), defaults.get(key))
+            if values:
+                self._try([_with(best, key, value) for value in values])
+
+    def _defaults(self) -> dict[tuple[str, str], Value | None]:
+        scenario = self._rerun.worker.scenario
+        found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
+        for agent in scenario.agents:
+            found |= {(agent, name): known.default for name, known in scenario.agent_arguments(agent).items()}
+        return found
+
+    # What came of it
+
+    def actors(self, after: Recording | None) -> tuple[int, int]:
+        """How many were seen before and after."""
+        before = _actors(self._rerun.recorded)
+        return before, before if after is None else _actors(after)
+
+    @property
+    def steps_cut(self) -> int:
+        """How many steps of the beginning were cut off."""
+        script = self.best.script
+        if script is None:
+            return 0
+        recorded = self._rerun.recorded
+        return round((script.time_s - recorded.scene(0).time_s) / recorded.prologue.step_length_s)
+
+    def removed(self) -> tuple[str, ...]:
+        """Who and what was taken away."""
+        was, best = self._rerun.spec, self.best
+        everybody = self._everybody
+        if best.script is not None:
+            stay = {*best.script.names, *(path.actor.id for path in best.script.agents)}
+            everybody = tuple(actor.id for actor in self._rerun.recorded.actors)
+        elif best.only is not None:
+            stay = {*best.only, *was.arguments, *self._rerun.worker.scenario.agents}
+        else:
+            stay = set(everybody)
+        others = [name for name in dict.fromkeys(everybody) if name not in stay]
+        gone = [one for one in was.disturbances if not self._has(one)]
+        if best.script is not None:  # what befell the others is in their ways
+            gone = [one for one in gone if one.what in OF_AGENT]
+        return (*others, *(one.words for one in gone))
+
+    def _has(self, disturbance: Disturbance) -> bool:
+        """Whether what is left has a disturbance; where the beginning was cut off, it comes earlier in it."""
+        shifted = replace(disturbance, step=disturbance.step - self.steps_cut)
+        return shifted in self.best.disturbances
+
+    def changed(self) -> dict[str, tuple[Value | None, Value | None]]:
+        """Arguments that have another value."""
+        was, now = self._rerun.spec, self.best
+        pairs = {
+            f"{agent}.{name}" if agent else name: (_value(was, (agent, name)), _value(now, (agent, name)))
+            for agent, name in _keys(now)
+        }
+        return {name: (left, right) for name, (left, right) in pairs.items() if left != right}
+
+
+def _actors(recording: Recording) -> int:
+    return len({actor.id for scene in recording.scenes() for actor in scene.roster.actors})
+
+
+def _nearest(recording: Recording, agent: str) -> list[str]:
+    """The others in the last scene, the nearest first."""
+    scenes = recording.scenes()
+    if not scenes or agent not in scenes[-1].roster.index:
+        return []
+    scene = scenes[-1]
+    x, y = scene.points[scene.roster.index[agent]]
+    away = {
+        actor.id: (point[0] - x) ** 2 + (point[1] - y) ** 2
+        for actor, point in zip(scene.roster.actors, scene.points, strict=True)
+        if actor.id != agent
+    }
+    return sorted(away, key=lambda name: (away[name], name))
+
+
+def _keys(spec: TrialSpec) -> list[tuple[str, str]]:
+    names = [("", name) for name in spec.scenario_arguments]
+    return names + [(agent, name) for agent, given in spec.arguments.items() for name in given]
+
+
+def _value(spec: TrialSpec, key: tuple[str, str]) -> Value:
+    agent, name = key
+    return spec.arguments[agent][name] if agent else spec.scenario_arguments[name]
+
+
+def _with(spec: TrialSpec, key: tuple[str, str], value: Value | None) -> TrialSpec:
+    agent, name = key
+    if value is None:
+        return spec
+    if not agent:
+        return replace(spec, scenario_arguments={**spec.scenario_arguments, name: value})
+    return replace(spec, arguments={**spec.arguments, agent: {**spec.arguments[agent], name: value}})

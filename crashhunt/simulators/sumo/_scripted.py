@@ -1,0 +1,134 @@
+"""Others who are moved along recorded ways: SUMO has the controlled vehicles only, and scenes have both.
+
+A vehicle that SUMO is told to move to a place is somewhere on a lane near it, and drives as fast as that comes to. So
+the others are not in SUMO: where they were is put into the scenes as it was recorded, to the bit. What agents see and
+whom they touch is made of scenes. A controlled vehicle whose speed mode has it heed others does not heed these.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.world import Actor, Path, Roster, Scene, State
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.simulators.sumo._sight import Sight
+    from crashhunt.world import Paths, Spine
+
+    Row = tuple[Actor, State, str, Spine | None]
+
+__all__ = ["ScriptedSight", "place_agents"]
+
+
+class ScriptedSight:
+    """Looks at the controlled vehicles, and adds the others.
+
+    Args:
+        sight: looks at SUMO.
+        script: who was where; the steps are those of the episode. Who was in sight to the end goes straight on.
+    """
+
+    def __init__(self, sight: Sight, script: Paths) -> None:
+        self._sight, self._script = sight, script
+        self._agents = {path.actor.id: path for path in script.agents}
+        self._roster = Roster(())
+
+    def look(self, steps: int, off_road: Sequence[str]) -> Scene:
+        """Return the scene after so many steps."""
+        scene = self._sight.look(steps, off_road)
+        rows = [
+            self._agent(scene, row, steps) for row, actor in enumerate(scene.roster.actors) if actor.id in self._agents
+        ]
+        rows += [self._row(path, steps) for path in self._script.others if self._is_there(path, steps)]
+        actors = tuple(actor for actor, *_ in rows)
+        if actors != self._roster.actors:
+            self._roster = Roster(actors)
+        states = [state for _, state, *_ in rows]
+        return Scene(
+            scene.time_s,
+            self._roster,
+            [(state.x, state.y) for state in states],
+            [state.heading for state in states],
+            [state.speed for state in states],
+            tuple(hit for hit in scene.contacts if {hit.collider, hit.victim} <= self._agents.keys()),
+            tuple(off_road),
+            tuple(lane for _, _, lane, _ in rows) if scene.lanes else (),
+            [state.z for state in states] if scene.heights else (),
+            [state.grade for state in states] if scene.heights else (),
+            {row: spine for row, (*_, spine) in enumerate(rows) if spine is not None},
+            swept=True,
+            core=scene.core,
+        )
+
+    def _agent(self, scene: Scene, row: int, steps: int) -> Row:
+        actor = scene.roster.actors[row]
+        lane = scene.lanes[row] if scene.lanes else ""
+        if steps == 0:  # SUMO says only after the next step where somebody is whom it has moved
+            return actor, self._agents[actor.id].states[0], lane, None
+        high = (scene.heights[row], scene.grades[row]) if scene.heights else ()
+        state = State(*scene.points[row], scene.headings[row], scene.speeds[row], *high)
+        return actor, state, lane, scene.spines.get(row)
+
+    def _is_there(self, path: Path, steps: int) -> bool:
+        return path.first <= steps and (steps <= path.last or path.last >= self._script.steps)
+
+    def _row(self, path: Path, steps: int) -> Row:
+        state = path.states[min(steps, path.last) - path.first]
+        lane = next((lane for step, lane in reversed(path.lanes) if step <= steps), "")
+        spine = next((spine for step, spine in path.spines if step == min(steps, path.last)), None)
+        if steps > path.last:
+            state, spine = self._gone_on(path, state, steps), None
+        return path.actor, state, lane, spine
+
+    def _gone_on(self, path: Path, state: State, steps: int) -> State:
+        """Where somebody is after the end of what was recorded, at an unchanged speed."""
+        away = state.speed * (steps - path.last) * sumo.simulation_getDeltaT()
+        return state._replace(x=state.x + away * math.cos(state.heading), y=state.y + away * math.sin(state.heading))
+
+
+def place_agents(script: Paths) -> None:
+    """Wait until the script begins, and move the controlled vehicles to where it says.
+
+    Raises:
+        InvalidEpisodeError: they cannot get there.
+    """
+    step_s = sumo.simulation_getDeltaT()
+    while sumo.simulation_getTime() < script.time_s - step_s / 2:
+        for path in script.agents:
+            sumo.vehicle_setSpeed(path.actor.id, 0.0)  # nobody is in the way of anybody, and nobody is to get far
+        libsumo.simulationStep()
+    for path in script.agents:
+        agent, state = path.actor.id, path.states[0]
+        if path.first > 0 or not path.lanes or path.lanes[0][0] > 0 or agent not in sumo.vehicle_getIDList():
+            raise InvalidEpisodeError(f"where {agent!r} is to begin is not known")
+        lane = path.lanes[0][1]
+        libsumo.vehicle.moveTo(agent, lane, _along(lane, (state.x, state.y)))
+        libsumo.vehicle.setPreviousSpeed(agent, state.speed)
+        sumo.vehicle_setSpeed(agent, -1.0)
+
+
+def _along(lane: str, point: tuple[float, float]) -> float:
+    """How far along a lane the nearest point of it is, in m."""
+    shape = [(x, y) for x, y, *_ in sumo.lane_getShape(lane)]
+    best = done = 0.0
+    least = math.inf
+    for (x0, y0), (x1, y1) in pairwise(shape):
+        dx, dy = x1 - x0, y1 - y0
+        length = math.hypot(dx, dy)
+        if length == 0.0:
+            continue
+        along = min(length, max(0.0, ((point[0] - x0) * dx + (point[1] - y0) * dy) / length))
+        away = math.hypot(point[0] - x0 - along * dx / length, point[1] - y0 - along * dy / length)
+        if away < least:
+            least, best = away, done + along
+        done += length
+    length = float(sumo.lane_getLength(lane))
+    return min(length, best * length / done) if done else 0.0
