@@ -31,12 +31,13 @@ def add_crashes(commands: Commands) -> None:
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.crashes import list_bundles
-    from crashhunt.hunts import find_hunts
+    from crashhunt.hunts import dropped_crashes, find_hunts
     from crashhunt.report import describe_groups
     from crashhunt.triage import group_crashes
 
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
-    found = group_crashes(bundle for hunt in hunts for bundle in list_bundles(hunt))
+    bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
+    found = group_crashes(bundles, dropped_crashes(hunts))
     say(describe_groups(found.groups), as_json=options.json)
     for why in found.left_out:
         say(f"left out: {why}", as_json=True)

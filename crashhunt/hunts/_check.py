@@ -93,6 +93,7 @@ class Checked:
         crashes: the names of the bundles that are as they were written.
         damaged_crashes: of those that are not.
         findings: what is wrong.
+        dropped: the trials of which the bundles were given up, as shorter crashes of their kind were kept.
     """
 
     dir: Path
@@ -103,6 +104,7 @@ class Checked:
     crashes: list[str] = field(default_factory=list)
     damaged_crashes: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    dropped: set[int] = field(default_factory=set)
 
     @property
     def fine(self) -> bool:
@@ -215,6 +217,8 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
             try:
                 _read_everything(ledger)
                 found.trials = ledger.finished()
+                dropped = ledger.facts().get("dropped") or {}
+                found.dropped = {number for numbers in dropped.values() for number in numbers}
             except HuntDirectoryError as error:
                 _count_rows(found, ledger, settings, error)
             crashes = {}
@@ -357,7 +361,7 @@ def _compare(
                 found.findings.append(Finding(where, what, "", "run the same command again: the hunt goes on with it"))
         elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
             found.findings.append(Finding(where, "the ledger says something else about its trial", "", _AGAIN))
-    for number in sorted(rows.keys() - by_trial.keys() - damaged):
+    for number in sorted(rows.keys() - by_trial.keys() - damaged - found.dropped):
         if hunt_state(found.dir).state != "running":
             what = f"trial {number} crashed, and its bundle is missing"
             found.findings.append(Finding(str(found.dir / layout.CRASHES), what, "its log and evidence", _AGAIN))

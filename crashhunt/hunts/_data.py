@@ -42,6 +42,7 @@ class Noted(TypedDict, total=False):
         disturb: how often what disturbs its trials; None where nothing does.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
         kinds: of crashes, the most frequent first, where it collects them all.
+        dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
         newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
     """
 
@@ -61,6 +62,7 @@ class Noted(TypedDict, total=False):
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
     newest_kind: float | None
+    dropped: dict[str, list[int]]
 
 
 class Facts(Noted, total=False):

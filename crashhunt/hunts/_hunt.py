@@ -29,6 +29,7 @@ from crashhunt.hunts._probed import look_at_probes
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
+from crashhunt.hunts._surplus import give_up_surplus
 from crashhunt.hunts._workers import settings_of_workers
 from crashhunt.plans import core_of, disturber, sampler_of
 from crashhunt.replays import confirm
@@ -169,6 +170,7 @@ class Hunt:
             stopped = "distinct" if settings.run.keep_going else "crash"
         else:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
+        give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
         near = keep_near_misses(self._place, ledger, settings, progress.notes, self._parallel_here, self._stops)
@@ -248,6 +250,7 @@ class Hunt:
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
+                    give_up_surplus(ledger, progress, run)
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()

@@ -9,7 +9,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.triage import Group, fault_of, groups_of, signature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.crashes import Bundle
     from crashhunt.triage import Signature
@@ -30,7 +30,7 @@ def kind_data(group: Group) -> KindData:
     """Return a group in few words, with the ids of its crashes."""
     return {
         "words": str(group.signature),
-        "count": len(group.bundles),
+        "count": group.count,
         "first": group.first.id,
         "shortest": group.shortest.id,
     }
@@ -44,6 +44,7 @@ class Kinds:
         crashes: that were saved before.
         newest: when the last new kind came, in s since the epoch; None where nobody knows.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
+        dropped: of each kind, in words, the trials whose bundles were given up before.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Kinds:
         newest: float | None = None,
         *,
         only_at_fault: bool = False,
+        dropped: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         self._only_at_fault = only_at_fault
         self._at_fault: set[int] = set()
@@ -63,6 +65,7 @@ class Kinds:
         self._groups: tuple[Group, ...] | None = None
         self.newest = newest
         self.newest_trial: int | None = None
+        self.dropped = {words: list(numbers) for words, numbers in (dropped or {}).items()}
         for bundle in crashes:
             self._sign(bundle)
 
@@ -79,8 +82,26 @@ class Kinds:
     def groups(self) -> tuple[Group, ...]:
         """Return what there is, the most frequent kind first, each with its crashes in the order of their trials."""
         if self._groups is None:  # a screen asks ten times a second
-            self._groups = groups_of(self._signed[number] for number in sorted(self._signed))
+            dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
+            self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
         return self._groups
+
+    def surplus(self, keep: int) -> list[Bundle]:
+        """Return the crashes of which there are so many of the same kind that are shorter, and give them up.
+
+        They count on, and are no members any more.
+        """
+        found = []
+        for group in groups_of(self._signed.values()):
+            lengths = sorted(group.bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+            for bundle in lengths[keep:]:
+                number = bundle.result.spec.number
+                del self._signed[number]
+                self.dropped.setdefault(str(group.signature), []).append(number)
+                found.append(bundle)
+        if found:
+            self._groups = None
+        return found
 
     @property
     def until(self) -> int | None:

@@ -108,7 +108,8 @@ class Progress:
         if run.keep_going or run.only_at_fault:
             wanted = run.distinct if run.keep_going else 1
             newest = before.get("newest_kind")
-            self.kinds = Kinds(wanted, crashes, newest, only_at_fault=run.only_at_fault)
+            dropped = before.get("dropped")
+            self.kinds = Kinds(wanted, crashes, newest, only_at_fault=run.only_at_fault, dropped=dropped)
 
     def take(self, result: TrialResult) -> None:
         """Take note of a trial without a crash."""

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Self
 
+from crashhunt.base.errors import UsageError
 from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
 from crashhunt.plans._duration import check_duration, check_probe
 from crashhunt.trial import CRASHES
@@ -164,6 +165,12 @@ class RunOptions(_Options):
         "apart; 0: never stop for that",
         flag="--distinct", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
+    keep: int = option(
+        0, "of each kind of crash, how many bundles are kept, those of the shortest crashes; 0: all",
+        help="of each kind of crash, keep the bundles of the N shortest only; of the others the ledger tells. Goes "
+        "with --keep-going or --distinct; 0: keep all",
+        flag="--keep", metavar="N", check=at_least(0, zero="keep all"),
+    )  # fmt: skip
     only_at_fault: bool = option(
         False, "stop for crashes only that are the agent's own fault; the others are kept, and the hunt goes on",
         help="hunt for crashes that are the agent's own fault, as rules with names tell it; others, and those of which "
@@ -227,6 +234,9 @@ class RunOptions(_Options):
             UsageError: one is none.
         """
         found = super().checked()
+        if found.keep and not (found.keep_going or found.distinct or found.only_at_fault):
+            message = f"--keep {found.keep} is for hunts that go on after a crash"
+            raise UsageError(message, fix="give --keep-going or --distinct as well")
         return replace(found, keep_going=True) if found.distinct else found
 
 

@@ -24,14 +24,14 @@ def describe_groups(groups: Sequence[Group]) -> str:
         name = shortest.id if len(hunts) == 1 else str(shortest.path)
         rows.append(
             [
-                str(len(group.bundles)),
+                str(group.count),
                 str(group.signature),
                 *([group.fault] if faults else []),
                 name,
                 str(shortest.result.steps),
             ]
         )
-    count = sum(len(group.bundles) for group in groups)
+    count = sum(group.count for group in groups)
     words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'kind' if len(groups) == 1 else 'kinds'}"
     return "\n".join([f"{words}:", "", *_lines(rows)])
 

@@ -92,7 +92,7 @@ class Watcher:
         rows.append(outcomes or Text("no trial has ended yet", style="dim"))
         if status.kinds:
             kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
-            each = "; ".join(f"{len(kind.bundles)} {kind.signature}" for kind in status.kinds)
+            each = "; ".join(f"{kind.count} {kind.signature}" for kind in status.kinds)
             rows.append(kinds + Text(one_line(each), "dim"))
         # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))

@@ -11,7 +11,7 @@ from crashhunt.triage._fault import fault_of
 from crashhunt.triage._signature import Signature, signature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
@@ -44,11 +44,18 @@ class Group:
         signature: of all of them.
         bundles: in the order in which they were given; at least one.
         faults: whose fault each was; empty where that was not asked.
+        dropped: how many more there were, whose bundles were given up.
     """
 
     signature: Signature
     bundles: tuple[Bundle, ...]
     faults: tuple[Verdict, ...] = ()
+    dropped: int = 0
+
+    @property
+    def count(self) -> int:
+        """How many crashes there were."""
+        return len(self.bundles) + self.dropped
 
     @property
     def fault(self) -> str:
@@ -77,7 +84,7 @@ class Group:
         return {
             "words": str(self.signature),
             "signature": self.signature.to_json(),
-            "count": len(self.bundles),
+            "count": self.count,
             "outcome": self.signature.outcome,
             "manner": self.signature.manner,
             "fault": self.fault,
@@ -101,11 +108,12 @@ class Groups:
     left_out: tuple[str, ...] = ()
 
 
-def group_crashes(bundles: Iterable[Bundle]) -> Groups:
+def group_crashes(bundles: Iterable[Bundle], dropped: Mapping[str, int] | None = None) -> Groups:
     """Group crashes by their signatures.
 
     Args:
         bundles: of one hunt or several; the log of each is read.
+        dropped: of each kind, in words, how many more there were.
     """
     signed, left_out = [], []
     faults: dict[Path, Verdict] = {}
@@ -117,7 +125,8 @@ def group_crashes(bundles: Iterable[Bundle]) -> Groups:
         except BundleError as error:
             left_out.append(str(error))
     groups = (
-        replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles)) for group in groups_of(signed)
+        replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles))
+        for group in groups_of(signed, dropped)
     )
     return Groups(tuple(groups), tuple(left_out))
 
@@ -130,10 +139,20 @@ def _avoidable(bundle: Bundle) -> bool | None:
     return True if escape is not None and escape.step is not None else None
 
 
-def groups_of(signed: Iterable[tuple[Signature, Bundle]]) -> tuple[Group, ...]:
-    """Return the groups of crashes whose signatures are known, the largest first."""
+def groups_of(
+    signed: Iterable[tuple[Signature, Bundle]], dropped: Mapping[str, int] | None = None
+) -> tuple[Group, ...]:
+    """Return the groups of crashes whose signatures are known, the largest first.
+
+    Args:
+        signed: the crashes.
+        dropped: of each kind, in words, how many more there were.
+    """
     found: dict[Signature, list[Bundle]] = {}
     for signature, bundle in signed:
         found.setdefault(signature, []).append(bundle)
-    groups = [Group(signature, tuple(members)) for signature, members in found.items()]
-    return tuple(sorted(groups, key=lambda group: (-len(group.bundles), group.signature)))
+    more = dropped or {}
+    groups = [
+        Group(signature, tuple(members), dropped=more.get(str(signature), 0)) for signature, members in found.items()
+    ]
+    return tuple(sorted(groups, key=lambda group: (-group.count, group.signature)))

@@ -224,6 +224,26 @@ def test_tables_of_trials(toy, made_once):
     assert not list(toy.folder.glob(".*.part"))
 
 
+def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
+    made_once(keeps_going, toy)
+    before, folder = rows(toy, "h"), toy.folder / "h" / "crashes"
+    crashes = sorted((row for row in before if row["outcome"] == "collision"), key=lambda row: row["steps"])
+    assert len(crashes) == len(list(folder.iterdir())) > 2
+    shutil.copytree(toy.folder / "h", toy.folder / "k")
+    folder = toy.folder / "k" / "crashes"
+    told = toy.crashhunt("run", "k", "2", "25", "99", "--scenario", "toy", "--seed", "4", *KEEP[-1:], "--keep", "2")
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        f"{row['number']:06d}-collision" for row in crashes[:2]
+    )
+    assert f"{len(crashes)} crashes of 1 kind" in told.out
+    assert rows(toy, "k") == before
+    (group,) = toy.crashhunt("crashes", "k", "--json").json["groups"]
+    assert (group["count"], len(group["members"])) == (len(crashes), 2)
+    assert "2 crashes are as written" in toy.crashhunt("check", "k").out
+    shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up
+    assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out
+
+
 def test_which_of_two_agents_crashes_less(toy):
     for name, speed in (("fast", "14"), ("slow", "4")):
         toy.crashhunt("run", name, "2", "6", "99", *KEEP, "--arg", f"speed={speed}", "--set", "gap_m=20:30")

@@ -50,6 +50,25 @@ def test_the_last_new_kind_is_not_the_last_crash(monkeypatch):
     ]
 
 
+def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
+    kinds = Kinds(2)
+    for number, (kind, steps) in enumerate([("KeyError", 9), ("KeyError", 4), ("IndexError", 7), ("KeyError", 4)]):
+        kinds.add(crash(number, kind, steps), number)
+    assert [bundle.id for bundle in kinds.surplus(1)] == ["c3", "c0"]
+    assert kinds.surplus(1) == []
+    kinds.add(crash(5, "KeyError", 2), 5)
+    assert [bundle.id for bundle in kinds.surplus(1)] == ["c1"]
+    assert [(group.count, group.first.id, group.shortest.id) for group in kinds.groups()] == [
+        (4, "c5", "c5"), (1, "c2", "c2"),
+    ]  # fmt: skip
+    assert kinds.until == 2  # it was found, though its bundle is gone
+    again = Kinds(2, [crash(5, "KeyError", 2)], dropped=kinds.dropped)
+    assert again.groups()[0].count == 4
+    with pytest.raises(UsageError, match="--keep 2 is for hunts that go on after a crash"):
+        RunSettings(keep=2).checked()
+    assert RunSettings(keep=2, distinct=2).checked().keep == 2
+
+
 def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
     assert RunSettings(distinct=3).checked().keep_going
     assert not RunSettings().checked().keep_going
