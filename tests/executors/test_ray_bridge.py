@@ -33,6 +33,7 @@ class Made:
         self.address = address
         self.cpus = {}  # machine to CPUs
         self.others = {}  # machine to CPUs that somebody else has
+        self.hunts = {}  # machine to CPUs that other hunts have
         self.actors = []
         self.late = False  # whether actors wait
         self.nowhere = set()  # those that do
@@ -56,6 +57,10 @@ class Made:
 
     def waits(self, actor):
         return actor in self.nowhere
+
+    def held(self, machine):
+        ours = [one for one in self.actors if one.alive and one.machine == machine and one not in self.nowhere]
+        return sum(one.slots for one in ours) + self.hunts.get(machine, 0)
 
     def ask(self, actor, what, *arguments):
         actor.asked = answer = object()
@@ -228,6 +233,28 @@ def test_an_actor_whose_cpus_somebody_else_got_is_taken_back(begin):
     with pytest.raises(UsageError, match="can run nothing: none of its 2 CPUs is free; wait until others are done"):
         after(40)
     assert not any(actor.alive for actor in cluster.actors)
+
+
+def test_whoever_loses_a_race_of_two_hunts_is_told_soon(begin):
+    """In ten seconds on an idle machine, of which some go by until the other hunt has begun."""
+    _, cluster, after = begin(a=2)
+    cluster.late = True
+    after(3)
+    cluster.others["a"] = cluster.hunts["a"] = 2
+    with pytest.raises(UsageError, match="can run nothing: none of its 2 CPUs is free; wait until others are done"):
+        after(5)
+    assert not any(actor.alive for actor in cluster.actors)
+
+
+def test_what_another_hunt_has_left_is_taken(begin):
+    _, cluster, after = begin(a=4)
+    cluster.late = True
+    after(2)
+    cluster.others["a"] = cluster.hunts["a"] = 1
+    cluster.late = False
+    told = after(4)
+    assert [(actor.slots, actor.alive) for actor in cluster.actors] == [(4, False), (3, True)]
+    assert {"capacity": 3} in told
 
 
 def test_an_actor_that_takes_long_to_start_is_given_more_time_again(begin):

@@ -42,7 +42,7 @@ _REFILL_S = 0.005  # for the hunt to submit more, which then goes along with the
 _RECEIVED = 1 << 18  # bytes at a time
 _TAKE_S = 2.0  # how long a node waits for a trial to end, before it says that there is nothing new
 _FREE_S = 3.0  # for CPUs to become free that somebody else has just left
-_START_S = 30.0  # for an actor to be where it should stand; then whoever came before it has the CPUs
+_START_S = 30.0  # for an actor to be where it should stand; then whoever came before it, and is no hunt, has the CPUs
 _LOOKS = 3  # that show free CPUs, before a node that takes part runs more: Ray is late to say what has been taken
 _CLOSE_S = 1.5  # for nodes to end everything; then they are killed
 _LOSSES = 3  # of a node without a trial between
@@ -178,7 +178,7 @@ class Bridge:
         for node in list(self._roster.nodes.values()):
             if node.machine not in alive:
                 self._lose(node)
-            elif self._is_too_late(node):
+            elif self._is_too_late(node, alive[node.machine]):
                 self._give_up(node)
         able = {found.id: found for found in alive.values() if found.cpus > 0}
         taken = sum(node.slots for node in self._roster.nodes.values())
@@ -216,11 +216,13 @@ class Bridge:
         self._free[found.id] = self._free.get(found.id, 0) + 1 if settled else 0
         return found.free if self._free[found.id] >= _LOOKS else 0
 
-    def _is_too_late(self, node: Node) -> bool:
-        """Whether an actor still waits for CPUs that were free."""
-        patience = self._patience.get(node.machine, _START_S)
-        first = node.doing == "differs" and time.monotonic() - node.stood > patience
-        return first and self._cluster.waits(node.actor)
+    def _is_too_late(self, node: Node, found: Found) -> bool:
+        """Whether an actor still waits for CPUs that were free: at once where another hunt has them."""
+        waited_s = time.monotonic() - node.stood
+        if node.doing != "differs" or waited_s < _LOOK_EVERY_S or not self._cluster.waits(node.actor):
+            return False
+        taken = self._cluster.held(node.machine) + node.slots > found.cpus
+        return taken or waited_s > self._patience.get(node.machine, _START_S)
 
     def _give_up(self, node: Node) -> None:
         """Take back an actor that stands nowhere; the next one has more patience, as it may have been about to."""

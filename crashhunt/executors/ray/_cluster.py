@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import secrets
 import threading
 import time
 from collections import Counter
@@ -26,6 +27,7 @@ __all__ = ["Cluster", "Found", "Lost", "TokenError", "UnreachableError"]
 _ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
 _ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, beside those of the other
+_NAME = "crashhunt-"  # of actors; what follows is how many CPUs one has
 _GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
 _GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
@@ -127,7 +129,20 @@ class Cluster:
     def stand(self, node: str, slots: int) -> Any:
         """Have an actor stand on a node, which takes so many of its CPUs."""
         strategy = self._affinity(node_id=node, soft=False)
-        return self._kind.options(num_cpus=slots, scheduling_strategy=strategy).remote()
+        name = f"{_NAME}{slots}-{secrets.token_hex(8)}"
+        return self._kind.options(num_cpus=slots, scheduling_strategy=strategy, name=name).remote()
+
+    def held(self, node: str) -> int:
+        """Return how many CPUs of a node hunts have, this one or others, whose actors stand there."""
+        from ray._private.state import actors
+
+        found = 0
+        with suppress(Exception):
+            for actor in actors(actor_state_name="ALIVE").values():
+                name = actor.get("Name") or ""
+                if name.startswith(_NAME) and actor["Address"]["NodeID"] == node:
+                    found += int(name.removeprefix(_NAME).partition("-")[0])
+        return found
 
     def waits(self, actor: Any) -> bool:
         """Whether an actor stands nowhere yet: somebody else has the CPUs, or its process takes long to start."""
