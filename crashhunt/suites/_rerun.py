@@ -185,12 +185,14 @@ class _Names:
 
 def _replace_invalid(hunt: Path, state: HuntState) -> int:
     """Have the trials that could not be set up run again, unless the hunt has found what it was after."""
-    settings = read_settings(hunt / layout.HUNT)
-    done = state.crashes and not settings.run.keep_going
-    done = done or 0 < settings.run.distinct <= len(state.kinds or ())
-    if not state.outcomes.get(Outcome.INVALID) or done:
+    run = read_settings(hunt / layout.HUNT).run
+    done = (state.crashes and not run.keep_going) or 0 < run.distinct <= len(state.kinds or ())
+    if not state.outcomes.get(Outcome.INVALID):
         return 0
     with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
+        # With --only-at-fault, crashes of others' and their kinds are not what it was after.
+        if ledger.facts().get("state") in ("crash", "distinct") or (done and not run.only_at_fault):
+            return 0
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
 
 
