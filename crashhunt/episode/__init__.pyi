@@ -1,6 +1,7 @@
 from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
 from ._failures import failure_of as failure_of, words_of as words_of
+from ._first_copy import FirstCopy as FirstCopy
 from ._nearness import Nearness as Nearness
 from ._observer import Observer as Observer
 from ._overruled import Braking as Braking, Keeping as Keeping, overruled_agent as overruled_agent

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from crashhunt.episode._branches import Brancher
     from crashhunt.episode._episode import MakeAgent, Reset
+    from crashhunt.episode._first_copy import FirstCopy
     from crashhunt.episode._observer import Observer
     from crashhunt.episode._probes import Prober
     from crashhunt.oracles import Oracle
@@ -42,6 +43,7 @@ def run_episode(
     reset: Reset | None = None,
     prober: Prober | None = None,
     brancher: Brancher | None = None,
+    first_copy: FirstCopy | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -55,6 +57,7 @@ def run_episode(
         observers: who else is told; after the recorder.
         reset: what resets the simulator, where it is not the simulator itself.
         prober: asks copies of it how little it would take for a crash.
+        first_copy: sees at once whether there can be copies.
         brancher: has copies of it go on with other disturbances where it comes near to one.
 
     Returns:
@@ -65,7 +68,7 @@ def run_episode(
     """
     began = time.monotonic()
     seed_everything(spec.seed)
-    asking = [one for one in (prober, brancher) if one is not None]
+    asking = [one for one in (first_copy, prober, brancher) if one is not None]
     watching = [] if brancher is None else [brancher]
     try:
         with Episode(

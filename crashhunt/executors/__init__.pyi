@@ -10,6 +10,7 @@ from ._protocol import (
     SizesItself as SizesItself,
 )
 from ._worker import (
+    LEFT_OUT as LEFT_OUT,
     Worker as Worker,
     read_map as read_map,
 )

@@ -26,6 +26,7 @@ from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import (
     Brancher,
+    FirstCopy,
     Parts,
     Prober,
     WorkerSettings,
@@ -50,13 +51,11 @@ if TYPE_CHECKING:
     from crashhunt.simulators import FullBraking, Info, Observations, Options, Simulator
     from crashhunt.trial import Overruled, TrialResult, TrialSpec, Value
 
-__all__ = [
-    "Worker",
-    "loaded",
-    "read_map",
-    "read_tail",
-]
+__all__ = ["LEFT_OUT", "Worker", "loaded", "read_map", "read_tail"]
 
+LEFT_OUT = " are left out: "
+"""Stands in a notice between what there has never been any of, probes or branches, and why."""
+_FROM_HERE_ON = " are left out from here on: "
 _TAIL = 4000  # bytes
 
 
@@ -77,11 +76,13 @@ class Worker:
     def __init__(self, settings: WorkerSettings, parts: Parts | None = None, *, warm_copies: int = 0) -> None:
         self.change = ""
         self._noticed: set[str] = set()
+        self._without: set[str] = set()  # probes or branches
         self.used = False
         self._pid = os.getpid()
         self._is_copy = False
         self._prober = Prober(settings.probe_s, settings.crash_on, self._delay) if settings.probe_s else None
         self._brancher = Brancher(settings.branch, settings.crash_on, self._delay) if settings.branch else None
+        self._first_copy = FirstCopy(self._no_copies) if settings.probe_s or settings.branch else None
         self._settings = settings
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
@@ -159,6 +160,7 @@ class Worker:
                 reset=reset,
                 prober=self._prober,
                 brancher=self._brancher,
+                first_copy=self._first_copy,
             )
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to the end
@@ -167,9 +169,7 @@ class Worker:
             watchdog.cancel()
             self.change = self._changed(simulator)
             self._tell(simulator)
-            for asks, what in ((self._prober, "probes"), (self._brancher, "branches")):
-                if asks is not None and asks.why_not:
-                    self._notice(f"{what} are left out: {asks.why_not}")
+            self._tell_why_not(_FROM_HERE_ON)
             result = self._kept(result, simulator, folder)
         wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
         return replace(result, worker=os.getpid(), wall_s=wall_s, setup_s=setup_s)
@@ -215,6 +215,20 @@ class Worker:
         """Write down what the simulator wants people to know, for the hunt to tell them once."""
         for notice in simulator.notices if offers(simulator, TellsNotices) else ():
             self._notice(notice)
+
+    def _no_copies(self, why_not: str) -> None:
+        """Do without copies from the first step on; the hunt is told at once."""
+        if self._prober is not None:
+            self._prober.why_not = why_not
+        if self._brancher is not None:
+            self._brancher.why_not = why_not
+        self._tell_why_not(LEFT_OUT)
+
+    def _tell_why_not(self, how: str) -> None:
+        for asks, what in ((self._prober, "probes"), (self._brancher, "branches")):
+            if asks is not None and asks.why_not and what not in self._without:
+                self._without.add(what)
+                self._notice(f"{what}{how}{asks.why_not}")
 
     def _notice(self, notice: str) -> None:
         if notice not in self._noticed:

@@ -24,7 +24,7 @@ from crashhunt.hunts._from_the_start import FromTheStart
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
-from crashhunt.hunts._preflight import Preflight, why_invalid
+from crashhunt.hunts._preflight import Heard, Preflight, why_invalid
 from crashhunt.hunts._probed import look_at_probes
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
@@ -215,10 +215,11 @@ class Hunt:
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
+        audit, self._heard = Audit(worker_settings), Heard(settings, progress.outcomes)
         preflight = Preflight(
-            settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code
-        )
-        audit = Audit(worker_settings)
+            settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code,
+            listen=lambda: self._heard.hear(executor),
+        )  # fmt: skip
         in_flight: set[int] = set()
         heartbeat = 0.0
         progress.until = time.monotonic() + run.duration_s
@@ -288,7 +289,7 @@ class Hunt:
         self, executor: Executor, audit: Audit, ledger: Ledger, progress: Progress, *, wait_s: float = 0.0
     ) -> None:
         """Write down what people should know about how the trials were run, and whether they are the same again."""
-        for note in executor.notes():
+        for note in self._heard.take(executor):
             ledger.remark(note)
             progress.notes.append(note)
         progress.look_at(executor)

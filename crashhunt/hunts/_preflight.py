@@ -6,17 +6,19 @@ import re
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import ArgumentError
+from crashhunt.base.errors import ArgumentError, UsageError
+from crashhunt.executors import LEFT_OUT
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.executors import Executor
     from crashhunt.plans import HuntSettings
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["Preflight", "why_invalid"]
+__all__ = ["Heard", "Preflight", "why_invalid"]
 
 _ENOUGH = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
@@ -33,17 +35,19 @@ class Preflight:
         planned: how many trials there are to be.
         files: of arguments that name files, to where the snapshot has them.
         code: folders of the snapshot from which agents are imported.
+        listen: called before the first result is accounted for, as it may be refused why there are none.
     """
 
     def __init__(
         self, settings: HuntSettings, planned: int, *, files: Mapping[str, str] = MappingProxyType({}),
-        code: Sequence[str] = (),
+        code: Sequence[str] = (), listen: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         self._settings = settings
         self._names = {there: here for here, there in files.items()} | {f"{folder}/": "" for folder in code}
         self._enough = min(_ENOUGH, planned)
         self._held: list[TrialResult] = []
         self._passed = False
+        self._listen = listen
 
     def sift(self, result: TrialResult) -> list[TrialResult]:
         """Return what is to be accounted for now: nothing yet, or this result with those that were held back.
@@ -52,6 +56,8 @@ class Preflight:
             ArgumentError: the agent does not start, whatever the trial.
         """
         if self._passed or not self._is_of_an_agent(result):
+            if not self._passed:
+                self._listen()
             self._passed = True
             found, self._held = [*self._held, result], []
             return found
@@ -95,6 +101,50 @@ class Preflight:
         for there, here in self._names.items():
             text = text.replace(there, here)
         return text
+
+
+class Heard:
+    """What workers have to say, until it is written down; it is heard before that, as it may refuse the hunt.
+
+    Args:
+        settings: of the hunt.
+        outcomes: of the trials that have ended, with how many.
+    """
+
+    def __init__(self, settings: HuntSettings, outcomes: Mapping[str, int]) -> None:
+        self._settings = settings
+        self._outcomes = outcomes
+        self._notes: list[str] = []
+
+    def hear(self, executor: Executor) -> None:
+        """Ask the workers of an executor.
+
+        Raises:
+            UsageError: trials cannot be copied, as the first ones have shown after their first step. Once any has
+                ended, the hunt goes on without copies.
+        """
+        for note in executor.notes():
+            what, left_out, why = note.partition(LEFT_OUT)
+            if left_out and what in ("probes", "branches") and not sum(self._outcomes.values()):
+                raise self._refusal(why)
+            self._notes.append(note)
+
+    def take(self, executor: Executor) -> list[str]:
+        """Return what has been said and was not taken before.
+
+        Raises:
+            UsageError: as of `hear`.
+        """
+        self.hear(executor)
+        notes, self._notes = self._notes, []
+        return notes
+
+    def _refusal(self, why: str) -> UsageError:
+        asked = (("--probe", self._settings.probe), ("--branch", self._settings.branch))
+        flags = " and ".join(flag for flag, value in asked if value)
+        agents = ", ".join(dict.fromkeys(chosen.agent for chosen in self._settings.agents.values()))
+        fix = f"mend {agents}, or leave {flags} out"
+        return UsageError(f"{flags}: trials with {agents} cannot be copied: {why}", fix=fix)
 
 
 def why_invalid(result: TrialResult, scenario: Scenario) -> str:

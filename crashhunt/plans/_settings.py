@@ -140,7 +140,7 @@ class HuntSettings(TrialOptions):
         """Say in words what makes the trials of two hunts different; how they are run does not."""
         mine, theirs = _flat(asdict(self)), _flat(asdict(other))
         return [
-            f"{key} was {mine.get(key, '(not there)')} and is now {theirs.get(key, '(not there)')}"
+            f"{key} was {_shown(mine.get(key, '(not there)'))} and is now {_shown(theirs.get(key, '(not there)'))}"
             for key in sorted(mine.keys() | theirs.keys(), key=lambda key: (key.count("."), key))
             if mine.get(key) != theirs.get(key)
             and not key.startswith("run.")
@@ -230,6 +230,10 @@ def _added_to(path: Path) -> Plain:
     except (OSError, ValueError, RecursionError):
         return {}
     return later
+
+
+def _shown(value: object) -> object:
+    return "none" if value == "" else value
 
 
 def _without_none(data: object) -> Any:

@@ -51,3 +51,35 @@ def test_how_often_has_to_be_a_time(shell):
     for text in ("0", "often"):
         done = shell.crashhunt("run", "h", "1", "3", "60", f"--probe={text}", expect=2)
         assert done.err == f"crashhunt: --probe is {text}; give a time above 0, such as 4s, or leave it out\n"
+
+
+THREADS = """
+import threading
+
+class Threads:
+    def __init__(self, after: int = 0):
+        self.left, self.stop = after, threading.Event()
+    def reset(self, seed):
+        pass
+    def act(self, observation):
+        if self.left == 0:
+            threading.Thread(target=self.stop.wait, daemon=True).start()
+        self.left -= 1
+        return 5.0, 0
+    def close(self):
+        self.stop.set()
+"""
+
+
+def test_an_agent_that_cannot_be_copied_is_refused_at_its_first_step(shell):
+    """One that can be at first is told of once, and the hunt goes on."""
+    (shell.folder / "toy.toml").write_text(TOY)
+    (shell.folder / "threads.py").write_text(THREADS)
+    words = ("--scenario", "toy.toml", "--agent", "threads:Threads", "--seed", "1", "--probe", "1s", "--overwrite")
+    done = shell.crashhunt("run", "h", "1", "2", "30", *words, expect=2)
+    why = "threads have no copy, and 1 runs besides the first"
+    said = f"--probe: trials with threads:Threads cannot be copied: {why}; mend threads:Threads, or leave --probe out"
+    assert said in done.err
+    done = shell.crashhunt("run", "h", "1", "2", "30", *words, "--arg", "after=15", "--json")
+    assert done.json["trials_run"] == 2
+    assert done.err.count(f"probes are left out from here on: {why}") == 1
