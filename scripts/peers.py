@@ -1,7 +1,12 @@
-"""Samplers of others, and a plain mutation, in the form of ours, to be measured beside them."""
+"""Samplers of others, and a plain mutation, in the form of ours, to be measured beside them.
+
+Optuna and VerifAI are installed by whoever measures: ``pip install optuna verifai``, best into an environment of its
+own, as VerifAI brings Scenic, and an attrs of 2022.
+"""
 
 from __future__ import annotations
 
+from bisect import insort
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -13,12 +18,14 @@ if TYPE_CHECKING:
     from crashhunt.samplers import Key, Space
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["PEERS", "OptunaCmaEs", "OptunaTpe", "PlainMutation"]
+__all__ = ["PEERS", "OptunaCmaEs", "OptunaTpe", "PlainMutation", "VerifaiBandit", "VerifaiCrossEntropy"]
 
 PEERS = {
     "optuna-tpe": "peers:OptunaTpe",
     "optuna-cma-es": "peers:OptunaCmaEs",
     "plain-mutation": "peers:PlainMutation",
+    "verifai-ce": "peers:VerifaiCrossEntropy",
+    "verifai-mab": "peers:VerifaiBandit",
 }
 """Name in tables to what stands for it."""
 
@@ -68,6 +75,62 @@ class OptunaCmaEs(_Optuna):
     """Its CMA-ES."""
 
     kind = "CmaEsSampler"
+
+
+class _Verifai:
+    """A sampler of VerifAI with its default parameters: five buckets for each number, a category for each choice.
+
+    It learns from samples that are below a fixed threshold of robustness, by default from crashes alone, of which
+    there are none before the first. So it is given more: robustness is how far the danger was below that of the most
+    dangerous tenth of all trials so far, so that each of those counts as a counterexample.
+    """
+
+    learns = True
+    make = ""
+
+    def __init__(self, space: Space, *, points: int = 10) -> None:
+        from verifai.features import Box, Categorical, Feature, FeatureSpace
+        from verifai.samplers import FeatureSampler
+
+        self._space = dict(sorted(space.items()))
+        self._names = {key: f"feature_{index}" for index, key in enumerate(self._space)}
+        domains = {
+            self._names[key]: Feature(Categorical(*known.options) if isinstance(known, Choice) else Box([0.0, 1.0]))
+            for key, known in self._space.items()
+        }
+        self._sampler = getattr(FeatureSampler, self.make)(FeatureSpace(domains))
+        self._asked: dict[int, Any] = {}
+        self._dangers: list[float] = []
+
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
+        """Return its sample; it draws from NumPy's own generator, which is seeded for it."""
+        np.random.seed(int(rng.integers(2**32)))  # noqa: NPY002 - theirs
+        sample, _ = self._asked[number] = self._sampler.getSample()
+        drawn = {key: getattr(sample, name) for key, name in self._names.items()}
+        return Proposal({
+            key: drawn[key] if isinstance(known, Choice) else known.quantile(min(max(float(drawn[key][0]), 0.0), 1.0))
+            for key, known in self._space.items()
+        }, origin="verifai")  # fmt: skip
+
+    def tell(self, result: TrialResult) -> None:
+        """Update it."""
+        danger = 1.0 if result.outcome.category != "no crash" else result.danger or 0.0
+        level = self._dangers[-1 - len(self._dangers) // 10] if self._dangers else 1.0
+        insort(self._dangers, danger)
+        sample, info = self._asked.pop(result.spec.number)
+        self._sampler.update(sample, info, level - danger)
+
+
+class VerifaiCrossEntropy(_Verifai):
+    """Its cross-entropy."""
+
+    make = "crossEntropySamplerFor"
+
+
+class VerifaiBandit(_Verifai):
+    """Its multi-armed bandit."""
+
+    make = "multiArmedBanditSamplerFor"
 
 
 class PlainMutation:

@@ -2,7 +2,9 @@
 
 Every sampler is given the same arguments with the same bounds, the same seeds, and the same lag: before trial n it is
 told what came of all trials up to n - 4, as in a hunt with two workers. A hunt without a crash is given up after three
-times what random draws need on the average. The problems without a simulator have crash regions whose size is known.
+times what random draws need on the average. The problems without a simulator have crash regions whose size is known; on
+real ones, every crash is run again, and what counts is steps of all trials, warm-ups and those second runs. A trial
+that two hunts have in common runs once, and counts in both.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import tempfile
 import time
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -53,7 +55,7 @@ class Run:
         seed: of the hunt.
         trials: to the first crash, or until it was given up.
         found: whether there was one.
-        steps: of all its trials.
+        steps: of all its trials, with their warm-ups, and of running its crash again; without a simulator, trials.
         cpu_s: of the sampler alone.
     """
 
@@ -69,6 +71,11 @@ class Run:
 class Place(Protocol):
     """Where trials end."""
 
+    warmup_steps: int
+
+    def confirmed(self, crash: TrialResult) -> bool:
+        """Whether it comes again."""
+
     def submit(self, spec: TrialSpec) -> None:
         """Begin one."""
 
@@ -81,7 +88,12 @@ class AtOnce:
     """Trials of a problem without a simulator."""
 
     problem: Problem
+    warmup_steps: int = 0
     done: deque[TrialResult] = field(default_factory=deque)
+
+    def confirmed(self, crash: TrialResult) -> bool:
+        """Yes: it is a function of its arguments and its seed."""
+        return True
 
     def submit(self, spec: TrialSpec) -> None:
         """Work it out."""
@@ -98,19 +110,47 @@ class AtOnce:
 
 @dataclass(slots=True)
 class Workers:
-    """Trials on a simulator."""
+    """Trials on a simulator, of which none runs twice, unless it is to be confirmed.
+
+    Args:
+        pool: where they run.
+        warmup_steps: of each.
+        known: what has run in other hunts.
+    """
 
     pool: PoolExecutor
+    warmup_steps: int = 0
+    known: dict[str, TrialResult] = field(default_factory=dict)
+    waiting: deque[TrialResult] = field(default_factory=deque)
 
     def submit(self, spec: TrialSpec) -> None:
-        """Hand it over."""
-        self.pool.submit(spec)
+        """Hand it over, or look it up."""
+        known = self.known.get(_what(spec))
+        if known is None:
+            self.pool.submit(spec)
+        else:
+            self.waiting.append(replace(known, spec=spec))
 
     def ended(self) -> list[TrialResult]:
         """Wait for one or more."""
+        found = [*self.waiting]
+        self.waiting.clear()
+        while not found:
+            found = list(self.pool.completed(1.0))
+            self.known |= {_what(result.spec): result for result in found}
+        return found
+
+    def confirmed(self, crash: TrialResult) -> bool:
+        """Run it again, and say whether it came out the same to the bit."""
+        self.pool.submit(crash.spec)
         while not (found := list(self.pool.completed(1.0))):
             pass
-        return found
+        return found[0].digest == crash.digest
+
+
+def _what(spec: TrialSpec) -> str:
+    """Return all that a trial follows from."""
+    return json.dumps([spec.seed, spec.arguments, spec.scenario_arguments, spec.max_steps], sort_keys=True)
 
 
 def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
@@ -129,7 +169,7 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
             continue
         for result in place.ended():
             results[result.spec.number] = result
-            steps += result.steps
+            steps += result.steps + place.warmup_steps
             if result.outcome in settings.crash_on:
                 first = min(first, result.spec.number)
         began = time.process_time()
@@ -138,7 +178,12 @@ def hunted(settings: HuntSettings, place: Place, most: int, name: str) -> Run:
                 sampler.tell(results[told])
             told += 1
         spent += time.process_time() - began
-    return Run(name, settings.sampler, settings.seed, min(first + 1, most), first < most, steps, spent)
+    found = first < most
+    if found:
+        steps += results[first].steps + place.warmup_steps
+        if not place.confirmed(results[first]):
+            print(f"{name}, {settings.sampler}, {settings.seed}: trial {first} does not come again", file=sys.stderr)
+    return Run(name, settings.sampler, settings.seed, min(first + 1, most), found, steps, spent)
 
 
 def synthetic_run(name: str, sampler: str, seed: int) -> Run:
@@ -157,36 +202,40 @@ def synthetic_run(name: str, sampler: str, seed: int) -> Run:
 def real_runs(name: str, samplers: Sequence[str], seeds: Sequence[int], parallel: int) -> Iterator[Run]:
     """All hunts on a problem with a simulator, on the same warm workers."""
     problem: Real = REAL[name]
+    most = math.ceil(GIVE_UP / problem.rate)
     with tempfile.TemporaryDirectory(prefix="crashhunt-search-") as folder:
         scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
+        warmup_steps = 0
+        if problem.warmup_s is not None:
+            scenario = replace(scenario, warmup_s=problem.warmup_s)
+            warmup_steps = round(problem.warmup_s / scenario.step_length_s)
         working = WorkerSettings(
             scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
             scratch=Path(folder),
         )  # fmt: skip
         pool = PoolExecutor(working, parallel=parallel)
+        place = Workers(pool, warmup_steps)
         try:
             for seed in seeds:
                 for sampler in samplers:
                     asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
-                    found = hunted(plan(asked)[1], Workers(pool), math.ceil(GIVE_UP / problem.rate), name)
-                    yield Run(name, sampler, seed, found.trials, found.found, found.steps, found.cpu_s)
+                    yield replace(hunted(plan(asked)[1], place, most, name), sampler=sampler)
         finally:
             pool.close()
 
 
 def cost(runs: Sequence[Run], of_random: Sequence[Run]) -> float:
-    """Mean number of trials, given up ones as they are, as a share of what random draws need.
+    """Mean cost, given up hunts as they are, as a share of what random draws need.
 
-    That is known by calculation where there is no simulator; else it is what those of the same seeds did need.
+    Without a simulator that is trials, and what random draws need is known by calculation; else it is steps, and what
+    random draws of the same seeds did need.
     """
     problem = PROBLEMS.get(runs[0].problem)
     if problem is not None:
-        needed = (1.0 - math.exp(-GIVE_UP)) / problem.rate
-    elif of_random:
-        needed = statistics.fmean(run.trials for run in of_random)
-    else:
-        needed = math.nan
-    return statistics.fmean(run.trials for run in runs) / needed
+        return statistics.fmean(run.trials for run in runs) * problem.rate / (1.0 - math.exp(-GIVE_UP))
+    steps = {run.seed: run.steps for run in of_random}
+    both = [run for run in runs if run.seed in steps]
+    return sum(run.steps for run in both) / sum(steps[run.seed] for run in both) if both else math.nan
 
 
 def all_runs(samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str], workers: int) -> Iterator[Run]:
@@ -225,22 +274,31 @@ def table(costs: dict[str, dict[str, float]]) -> str:
 
 
 def store(path: Path, runs: Sequence[Run]) -> None:
-    """Write hunts: problem to sampler to seed to the number of trials, below 0 where it was given up after so many."""
-    found: dict[str, dict[str, dict[str, int]]] = {}
+    """Write hunts: problem to sampler to seed to trials, below 0 where it was given up, and steps where they count."""
+    found: dict[str, dict[str, dict[str, int | list[int]]]] = {}
     for run in sorted(runs, key=lambda run: (run.problem, run.sampler, run.seed)):
         row = found.setdefault(run.problem, {}).setdefault(run.sampler, {})
-        row[str(run.seed)] = run.trials if run.found else -run.trials
-    lines = json.dumps(found, indent=1).replace("\n   ", " ").replace("\n  }", " }")
-    path.write_text(lines + "\n", encoding="utf-8")
+        trials = run.trials if run.found else -run.trials
+        row[str(run.seed)] = [trials, run.steps] if run.problem in REAL else trials
+    problems = (
+        f" {json.dumps(name)}: {{\n"
+        + ",\n".join(f"  {json.dumps(sampler)}: {json.dumps(of)}" for sampler, of in row.items())
+        + "\n }"
+        for name, row in found.items()
+    )
+    path.write_text("{\n" + ",\n".join(problems) + "\n}\n", encoding="utf-8")
 
 
 def stored(path: Path) -> dict[tuple[str, str, int], Run]:
     """Read what `store` wrote."""
-    found: dict[str, dict[str, dict[str, int]]] = json.loads(path.read_text(encoding="utf-8"))
-    return {
-        (name, sampler, int(seed)): Run(name, sampler, int(seed), abs(trials), trials > 0)
-        for name, row in found.items() for sampler, of in row.items() for seed, trials in of.items()
-    }  # fmt: skip
+    found: dict[str, dict[str, dict[str, int | list[int]]]] = json.loads(path.read_text(encoding="utf-8"))
+    runs = {}
+    for name, row in found.items():
+        for sampler, of in row.items():
+            for seed, what in of.items():
+                trials, steps = what if isinstance(what, list) else (what, abs(what))
+                runs[name, sampler, int(seed)] = Run(name, sampler, int(seed), abs(trials), trials > 0, steps)
+    return runs
 
 
 def main() -> int:

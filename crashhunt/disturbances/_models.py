@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
+from crashhunt.base.draws import one_of
 from crashhunt.disturbances._protocol import Drawn
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class Choices:
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """Draw the three, in this order."""
-        return Drawn(_one_of(self.who, rng), _one_of(self.how_strong, rng), _one_of(self.how_long, rng))
+        return Drawn(one_of(self.who, rng), one_of(self.how_strong, rng), one_of(self.how_long, rng))
 
     def log_likelihood(self, drawn: Drawn) -> float:
         """Return the sum of the three logarithms."""
@@ -124,15 +125,6 @@ def unseen() -> Choices:
 def late_action() -> Choices:
     """What the agent decides takes effect late."""
     return Choices("late_action", {"itself": 1.0}, {0.2: 2.0, 0.5: 1.0, 1.0: 1.0}, {1.0: 1.0, 3.0: 1.0})
-
-
-def _one_of(weights: Mapping[T, float], rng: np.random.Generator) -> T:
-    place = rng.random() * sum(weights.values())
-    for value, weight in weights.items():
-        place -= weight
-        if place < 0:
-            return value
-    return list(weights)[-1]  # where rounding has left nothing over
 
 
 def _log_share(weights: Mapping[T, float], value: T) -> float:

@@ -16,6 +16,7 @@ from ._results import (
 )
 from ._row import FACTS as FACTS, Cell as Cell, TrialRow as TrialRow
 from ._salvage import salvage as salvage
+from ._searching import SearchStatus as SearchStatus, StrategyStatus as StrategyStatus
 from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
 from ._surplus import dropped_crashes as dropped_crashes
 from ._tables import write_parquet as write_parquet, write_text as write_text

@@ -317,9 +317,9 @@ class Hunt:
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
-        progress.ended_here += 1
-        progress.outcomes[str(result.outcome)] += 1
-        if result.outcome in settings.crash_on:
+        crashed = result.outcome in settings.crash_on
+        progress.count(result, crashed=crashed)
+        if crashed:
             if progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
             else:
@@ -391,6 +391,7 @@ class Hunt:
             progress.disturbed if self._disturber is not None else None,
             progress.stressed,
             progress.branched,
+            progress.searching.status(),
         )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.faculties import offers
 from crashhunt.executors import HasNodes
 from crashhunt.hunts._kinds import Kinds, kind_data
+from crashhunt.hunts._searching import Searching, SearchStatus
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
@@ -48,6 +49,7 @@ class HuntStatus:
         stressed: the trial of this run for whose crash it would have taken the least; None where nobody asked, or where
             nothing plausible would have done it.
         branched: how many branches of trials of this run have crashed.
+        search: which strategies have had trials in this run, and when the greatest danger grew.
     """
 
     phase: str
@@ -67,6 +69,7 @@ class HuntStatus:
     disturbed: int | None = None
     stressed: TrialResult | None = None
     branched: int = 0
+    search: SearchStatus = field(default_factory=SearchStatus)
 
     @property
     def seconds_left(self) -> float:
@@ -101,6 +104,7 @@ class Progress:
     audit: AuditReport | None = None
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
+    searching: Searching = field(default_factory=Searching)
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
@@ -111,10 +115,19 @@ class Progress:
             dropped = before.get("dropped")
             self.kinds = Kinds(wanted, crashes, newest, only_at_fault=run.only_at_fault, dropped=dropped)
 
+    def count(self, result: TrialResult, *, crashed: bool) -> None:
+        """Count a trial that has ended."""
+        self.ended_here += 1
+        self.outcomes[str(result.outcome)] += 1
+        self.searching.take(result, crashed=crashed)
+
     def take(self, result: TrialResult) -> None:
-        """Take note of a trial without a crash."""
+        """Take note of a trial without a crash, which has been counted."""
         if result.collision is None and result.failure is None:
-            self.nearest = max(self.nearest or result, result, key=lambda one: one.nearness)
+            before = self.nearest
+            self.nearest = max(before or result, result, key=lambda one: one.nearness)
+            if self.nearest is not before:
+                self.searching.grow()
         if result.branches is not None:
             self.branched += len(result.branches.crashes)
         if result.stress is not None and result.stress.disturbance is not None:

@@ -71,6 +71,16 @@ class TrialRow:
         return self.data.get("danger")
 
     @property
+    def origin(self) -> str:
+        """Which strategy of a sampler proposed it; empty where none did."""
+        return self.data["spec"].get("origin", "")
+
+    @property
+    def parent(self) -> int | None:
+        """The number of the trial that it was made from; None where there is none."""
+        return self.data["spec"].get("parent")
+
+    @property
     def stress_margin(self) -> float | None:
         """How little it would have taken, 0 to 1; None where nobody asked."""
         stress = self.data.get("stress")
@@ -107,8 +117,8 @@ class TrialRow:
             "required_deceleration": closest.get("required_deceleration"),
             "wall_s": data.get("wall_s"),
             "digest": data.get("digest"),
-            "parent": spec.get("parent"),
-            "origin": spec.get("origin", ""),
+            "parent": self.parent,
+            "origin": self.origin,
             "disturbances": len(data.get("disturbances", ())),
             "log_likelihood": data.get("log_likelihood"),
             "stress_margin": self.stress_margin,

@@ -19,6 +19,7 @@ from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
 from crashhunt.report._disturbances import by_likelihood, traffic_of
+from crashhunt.report._search import UNCHOSEN, importance_of, lineage_of, values_of
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._units import argument_units
@@ -27,7 +28,7 @@ from crashhunt.trial import Outcome, steps_of
 from crashhunt.world import approaches
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Encounter
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import TrialResult, Value
     from crashhunt.world import Actor
 
 __all__ = ["report_data", "write_report"]
@@ -93,6 +94,22 @@ def report_data(
         },
         **_trials(directory),
         **_crashes(bundles, watch),
+        "lineages": _lineages(directory, bundles),
+    }
+
+
+def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list[object]]]:
+    """Id of a crash to the trials that it was made from, where it was made from any: number, origin and danger."""
+    path = directory / layout.LEDGER
+    if not bundles or not has_begun(path):
+        return {}
+    ledger = Ledger(path)
+    try:
+        lines = {bundle.id: lineage_of(bundle.result.spec.number, ledger.result) for bundle in bundles}
+    finally:
+        ledger.close()
+    return {
+        crash: [[one.spec.number, one.spec.origin, one.danger] for one in line] for crash, line in lines.items() if line
     }
 
 
@@ -125,32 +142,35 @@ def _trials(directory: Path) -> dict[str, object]:
     """Outcomes, and what was tried against how it went."""
     path = directory / layout.LEDGER
     if not has_begun(path):
-        return {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "thinned": False}
+        nothing = {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "thinned": False}
+        return {**nothing, "importance": []}
     ledger = Ledger(path)
     try:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
         every = max(1, math.ceil(total / _DOTS))
         trials, stress = [], None
+        unchosen: list[tuple[Mapping[str, Value], float]] = []
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
             outcome, margin = row.outcome, row.stress_margin
             if margin is not None and (stress is None or margin < stress["margin"]):
                 stress = {"margin": margin, "trial": row.number}
-            if number % every == 0 or outcome.category != "no crash":
-                values = {
-                    f"{agent}.{name}" if len(row.arguments) > 1 else name: value
-                    for agent, given in row.arguments.items()
-                    for name, value in given.items()
-                }
+            crashed = outcome.category != "no crash"
+            danger = 1.0 if crashed else row.danger
+            if row.origin in UNCHOSEN and danger is not None and number % every == 0:
+                unchosen.append((values_of(row), danger))
+            if number % every == 0 or crashed:
                 time_s = row.time_to_collision_s
                 trials.append(
                     {
                         "number": row.number,
                         "outcome": str(outcome),
                         "category": outcome.category,
-                        "values": {**values, **row.scenario_arguments},
+                        "values": values_of(row),
                         "ttc": round(time_s, 3) if time_s is not None else None,
                         "danger": round(row.danger, 4) if row.danger is not None else None,
+                        "origin": row.origin,
+                        "parent": row.parent,
                     }
                 )
         return {
@@ -160,6 +180,7 @@ def _trials(directory: Path) -> dict[str, object]:
             "trials": trials,
             "stress": stress,
             "thinned": every > 1,
+            "importance": importance_of(unchosen),
         }
     finally:
         ledger.close()

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
-    from crashhunt.hunts import HuntStatus
+    from crashhunt.hunts import HuntStatus, SearchStatus
     from crashhunt.trial import TrialResult, Value
 
 __all__ = ["Watcher", "format_arguments", "format_seconds"]
@@ -96,8 +96,11 @@ class Watcher:
             rows.append(kinds + Text(one_line(each), "dim"))
         # What is below the last line of a terminal is not shown, and the last line belongs to the cursor.
         left = height - 1 - len(self._console.render_lines(Group(*rows)))
+        if status.search.strategies and len(status.workers) < left:
+            rows.append(Text(one_line(_strategies(status.search)), no_wrap=True, overflow="ellipsis"))
+            left -= 1
         if status.nearest is not None:
-            near = Text(one_line(f"nearest miss: {_near(status.nearest)}"), overflow="fold")
+            near = Text(one_line(f"nearest miss{_grown(status.search)}: {_near(status.nearest)}"), overflow="fold")
             if len(self._console.render_lines(near)) + len(status.workers) > left:
                 near = Text(near.plain, no_wrap=True, overflow="ellipsis")
             left -= len(self._console.render_lines(near))
@@ -232,6 +235,24 @@ def _stressed(result: TrialResult) -> str:
     assert stress is not None
     what = stress.disturbance.words if stress.disturbance is not None else ""
     return f"least stress margin: {stress.margin:.2f}, trial {result.spec.number}, {what}, {format_arguments(result)}"
+
+
+def _strategies(search: SearchStatus) -> str:
+    """What has been tried, with the mean danger of it."""
+    told = []
+    for one in search.strategies:
+        came = [] if one.danger is None else [f"danger {one.danger:.2f}"]
+        came += [f"{one.crashes} {'crash' if one.crashes == 1 else 'crashes'}"] if one.crashes else []
+        told.append(f"{one.name} {one.share:.0%}" + (f" ({', '.join(came)})" if came else ""))
+    return f"tried: {', '.join(told)}"
+
+
+def _grown(search: SearchStatus) -> str:
+    """How long ago the greatest danger grew."""
+    if search.grown_trials is None or search.grown_s is None:
+        return ""
+    count = search.grown_trials
+    return f", {count} {'trial' if count == 1 else 'trials'} ago ({format_seconds(search.grown_s)})"
 
 
 def _near(result: TrialResult) -> str:

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from crashhunt.executors import NodeFigures
-from crashhunt.hunts import HuntStatus
+from crashhunt.hunts import HuntStatus, SearchStatus, StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher
 from crashhunt.report._status_screen import _line, describe_kinds
@@ -51,6 +51,17 @@ def test_every_worker_is_on_the_screen(width, height, workers):
     for number in range(120, 120 + workers):
         shown = "setting up" if number == 120 else f"step {number - 20}"
         assert any(str(number) in line and shown in line for line in lines), number
+
+
+def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is_room():
+    tried = StrategyStatus("mutation", 60, 0.6, 0.3125, 1), StrategyStatus("random", 40, 0.4, None, 0)
+    found = replace(status(2), search=SearchStatus(tried, 1, 65.0))
+    for height, shown in ((12, True), (6, False)):
+        console = Console(width=120, height=height, force_terminal=True, color_system=None)
+        with console.capture() as seen:
+            console.print(Watcher(console, TITLE)._screen(found))
+        assert ("tried: mutation 60% (danger 0.31, 1 crash), random 40%" in seen.get()) is shown
+        assert "nearest miss, 1 trial ago (1:05): trial 123" in seen.get()
 
 
 def test_the_least_stress_margin_is_shown_where_there_is_room():

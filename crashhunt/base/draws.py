@@ -1,0 +1,24 @@
+"""Draws from weights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+
+__all__ = ["one_of"]
+
+T = TypeVar("T")
+
+
+def one_of(weights: Mapping[T, float], rng: np.random.Generator) -> T:
+    """Draw one of some values, each as likely as its share of all weights, which are positive."""
+    place = rng.random() * sum(weights.values())
+    for value, weight in weights.items():
+        place -= weight
+        if place < 0:
+            return value
+    return list(weights)[-1]  # where rounding has left nothing over
