@@ -14,6 +14,41 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+def test_what_goes_into_a_wheel_is_all_there_is(tmp_path):
+    """The list that the wheel is built from; by night it is built and used."""
+    builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
+    files = {file.distribution_path: file.path for file in builder.recurse_included_files()}
+    kept = subprocess.run(["git", "ls-files", "crashhunt", "scenarios"], cwd=ROOT, capture_output=True, text=True)
+    if kept.returncode:
+        pytest.skip("this is no work tree of git")
+    tracked = set(kept.stdout.splitlines())
+    wanted = {name if name.startswith("crashhunt/") else f"crashhunt/{name}" for name in tracked}
+    assert wanted - files.keys() == set()
+    site = tmp_path / "site"
+    for name, path in files.items():
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, site / name)
+    shipped = {path.parent.name for path in (ROOT / "scenarios").glob("*/scenario.toml")}
+    assert {entry["name"] for entry in installed(site)("scenarios")["scenarios"]} == shipped
+
+
+def installed(site):
+    """Runs commands of what is in a folder, before the editable installation of this environment."""
+    program = f"import sys; sys.path.insert(0, {str(site)!r}); from crashhunt.cli import main; sys.exit(main())"
+    environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin", "HOME": str(site.parent)}
+
+    def crashhunt(*words: str) -> dict:
+        done = subprocess.run(
+            [sys.executable, "-c", program, *words, "--json"], cwd=site.parent, env=environment, capture_output=True,
+            text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return crashhunt
+
+
+@pytest.mark.nightly
 @pytest.mark.timeout(300)
 def test_a_wheel_brings_its_scenarios_along(tmp_path):
     source = tmp_path / "source"
@@ -28,18 +63,7 @@ def test_a_wheel_brings_its_scenarios_along(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)  # as pip does it; what it depends on is in this environment already
     shutil.rmtree(source)
-    # Before the editable installation of this environment.
-    program = f"import sys; sys.path.insert(0, {str(site)!r}); from crashhunt.cli import main; sys.exit(main())"
-    environment = {"PYTHONPATH": str(site), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
-
-    def crashhunt(*words: str) -> dict:
-        done = subprocess.run(
-            [sys.executable, "-c", program, *words, "--json"], cwd=tmp_path, env=environment, capture_output=True,
-            text=True, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout)
-
+    crashhunt = installed(site)
     shipped = {path.parent.name for path in (ROOT / "scenarios").glob("*/scenario.toml")}
     assert {entry["name"] for entry in crashhunt("scenarios")["scenarios"]} == shipped
     pages = {path.stem for path in (ROOT / "crashhunt" / "guide").rglob("*.md")} - {"index"}
