@@ -124,8 +124,8 @@ def test_a_value_of_an_actor_is_named(column, place):
         (2, column_of[2], -1.0),
         (3, column_of[3], column_of[3]),
     ]
-    assert values_around(recorded(), changed(2, change), divergence)[0][0] == 0
-    assert values_around(recorded(), changed(2, change), divergence)[-1] == (4, None, None)
+    assert values_around(recorded(), changed(2, change), divergence, reach=2)[0][0] == 0
+    assert values_around(recorded(), changed(2, change), divergence, reach=2)[-1] == (4, None, None)
 
 
 def test_observations_come_before_actions_and_actions_before_the_scene():
@@ -155,7 +155,7 @@ def test_observations_come_before_actions_and_actions_before_the_scene():
     assert found(3, action) == (3, "ego", "action[target_speed]", 13.0, 5.0)
     divergence = first_divergence(recorded(), changed(3, action))
     assert divergence.place == ("action", (0,))
-    assert values_around(recorded(), changed(3, action), divergence) == [
+    assert values_around(recorded(), changed(3, action), divergence, reach=2) == [
         (1, 11.0, 11.0), (2, 12.0, 12.0), (3, 13.0, 5.0), (4, None, None), (5, None, None),
     ]  # fmt: skip
     assert divergence.to_json() == {
@@ -194,7 +194,7 @@ def test_who_acts_and_who_is_there():
     assert (divergence.step, divergence.agent, divergence.field) == (2, "other", "observation")
     assert (divergence.recorded, divergence.replayed, divergence.place) == ([2.0, 3.0, 4.0], None, None)
     assert first_divergence(without, recorded()).recorded is None
-    assert values_around(recorded(), without, divergence) == []
+    assert values_around(recorded(), without, divergence, reach=2) == []
 
     def roster(*actors):
         def change(step):
