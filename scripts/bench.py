@@ -250,23 +250,40 @@ def bench_warmup() -> Iterator[Figure]:
     steps, few, many = 85, 12, 112
     for scenario, target in (("loop", 2.5), ("merge", None)):
         costs: dict[str, list[float]] = {"0": [], "8": []}
+        worked: dict[str, list[float]] = {"0": [], "8": []}  # processor time, which a busy machine changes less
         for _ in range(2):
             for copies, spent in costs.items():
-                wall_s = []
+                wall_s, cpu_s = [], []
                 for trials in (few, many):
                     with folder() as place:
                         options = (*QUIET, "--crash-on", "hang", "--scenario", scenario, "--seeds", "4")
+                        before = sum(os.times()[2:4])
                         found = hunt(place / "h", 1, trials, steps, *options, "--warm-copies", copies)
                         wall_s.append(found["wall_s"])
+                        cpu_s.append(sum(os.times()[2:4]) - before)
                 spent.append((wall_s[1] - wall_s[0]) / (many - few))
+                worked[copies].append((cpu_s[1] - cpu_s[0]) / (many - few))
         alone, shared = (statistics.fmean(spent) for spent in costs.values())
         note = (
             f"{60 / shared:.0f} against {60 / alone:.0f} trials a minute on {scenario}, {steps} steps each, one worker"
         )
         yield Figure(f"warmup_{scenario}", alone / shared, "x", "higher", target, note)
+        alone, shared = (statistics.fmean(spent) for spent in worked.values())
+        note = f"the same in processor time: {1e3 * shared:.0f} against {1e3 * alone:.0f} ms a trial"
+        yield Figure(f"warmup_{scenario}_cpu", alone / shared, "x", "higher", None, note)
     found = in_child("child_fork")
     yield Figure("fork", found["ms"], "ms", "lower", None, "CPU time of a copy on loop, its end included")
     yield Figure("fork_probe", found["probe_ms"], "ms", "lower", None, "the same, with 50 steps in the copy")
+
+
+def bench_first_crash() -> Iterator[Figure]:
+    """Steps to the first crash by disturbance, with probes and branches against without; counted, not timed."""
+    import first_crash
+
+    found = first_crash.ratios(first_crash.measured(("merge",), repetitions=4, most=12000))
+    for problem, (pairs, alone, copies, ratio) in found.items():
+        note = f"{copies:.0f} against {alone:.0f} steps on {problem}, {pairs} pairs; scripts/first_crash has all six"
+        yield Figure("first_crash", ratio, "x", "lower", 1 / 3, note)
 
 
 def child_fork() -> dict[str, float]:
@@ -828,6 +845,7 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "ceiling": bench_ceiling,
     "waves": bench_waves,
     "warmup": bench_warmup,
+    "first_crash": bench_first_crash,
     "help": bench_help,
     "memory": bench_memory,
     "bundle": bench_bundle,

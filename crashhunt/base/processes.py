@@ -18,6 +18,7 @@ from pathlib import Path
 __all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill"]
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
+_libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, and not in every copy of this process
 _PATIENCE_S = 2.0  # for processes that do not die at once; those of another user never do
 
 
@@ -120,5 +121,5 @@ def _children_by_search(pid: int) -> list[int]:
 
 
 def _prctl(option: int, value: int) -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+    if _libc is not None:
+        _libc.prctl(option, value, 0, 0, 0)
