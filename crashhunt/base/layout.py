@@ -9,6 +9,7 @@ __all__ = [
     "ANSWER",
     "ARCHIVE_INDEX",
     "ARCHIVE_KEY",
+    "BESIDE",
     "BLACK_BOX",
     "BRANCHES",
     "BUILDING",
@@ -60,6 +61,8 @@ CRASHES: Final = "crashes"
 NEAR_MISSES: Final = "near-misses"
 PROBES: Final = "probes"
 BRANCHES: Final = "branches"
+BESIDE: Final = (NEAR_MISSES, PROBES, BRANCHES)
+"""Folders of bundles that are no crashes of the hunt's own trials."""
 TRIALS: Final = "trials"
 REPORT: Final = "report.html"
 

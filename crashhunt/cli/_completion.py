@@ -125,7 +125,7 @@ def _crashes(parsed_args: argparse.Namespace, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
     if not folder:
         return []
-    places = (layout.CRASHES, layout.NEAR_MISSES)
+    places = (layout.CRASHES, *layout.BESIDE)
     return sorted(path.parent.name for place in places for path in Path(folder).glob(f"{place}/*/{layout.CRASH}"))
 
 

@@ -162,7 +162,7 @@ def _checked(archive: zipfile.ZipFile, index: ArchiveIndex, path: Path) -> list[
         parts = PurePosixPath(name).parts
         if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or ":" in parts[0]:
             raise _refusal(path, f"the name {name!r} leads out of it")
-        if parts[0] not in (layout.HUNT, layout.CRASHES, layout.NEAR_MISSES, layout.SNAPSHOTS):
+        if parts[0] not in (layout.HUNT, layout.CRASHES, *layout.BESIDE, layout.SNAPSHOTS):
             raise _refusal(path, f"it has {name!r}, which is no part of a crash")
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG) or name.endswith("/"):

@@ -40,12 +40,12 @@ def _folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
     """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
 
-    Of a hunt that has near misses only, that is the most dangerous of them.
+    Of a hunt that has near misses only, that is the most dangerous of them; and else one that copies have found.
 
     Args:
         directory: of the hunt, or of the bundle itself.
-        crash: its id or that of a near miss, the beginning of it, or its trial's number, with leading zeros or without.
-            One that was made smaller is only meant by its whole id.
+        crash: its id or that of a near miss, or else of what probes or branches have found; the beginning of it, or its
+            trial's number, with leading zeros or without. One that was made smaller is only meant by its whole id.
 
     Raises:
         BundleError: there is no such crash.
@@ -55,7 +55,13 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     small = directory / layout.CRASHES / crash
     if crash.endswith(layout.SMALL) and small.parent == directory / layout.CRASHES and small.is_dir():
         return read_bundle(small)
-    bundles = _readable(directory, crash) if crash else list_bundles(directory) or list_near_misses(directory)[:1]
+    if crash:
+        # What copies have found of a trial has its number as well, and may have the name of a crash.
+        found = (_readable(directory, crash, places) for places in _PLACES)
+        bundles = next((some for some in found if any(_may_be(bundle, crash) for bundle in some)), None)
+        bundles = bundles if bundles is not None else _readable(directory, crash, _PLACES[0])
+    else:
+        bundles = list_bundles(directory) or list_near_misses(directory)[:1] or _of_copies(directory)
     if not bundles:
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
@@ -68,10 +74,21 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
     return _named(bundles, crash, directory)
 
 
-def _readable(directory: Path, crash: str) -> list[Bundle]:
+_PLACES = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANCHES,))
+
+
+def _of_copies(directory: Path) -> list[Bundle]:
+    return [read_bundle(folder) for place in (layout.PROBES, layout.BRANCHES) for folder in _folders(directory, place)]
+
+
+def _may_be(bundle: Bundle, crash: str) -> bool:
+    return bundle.id.startswith(crash) or (crash.isdecimal() and bundle.result.spec.number == int(crash))
+
+
+def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle]:
     """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
     found = []
-    for path in (*_folders(directory), *_folders(directory, layout.NEAR_MISSES)):
+    for path in (folder for place in places for folder in _folders(directory, place)):
         try:
             found.append(read_bundle(path))
         except BundleError:

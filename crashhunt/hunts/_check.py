@@ -262,8 +262,8 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         bundle = _check_bundle(found, folder)
         if bundle is not None:
             bundles[folder.name] = bundle
-    near = _check_near_misses(found, hunt)
-    needed = {bundle.snapshot: bundle.id for bundle in (*near, *reversed(bundles.values()))}
+    beside = _check_beside(found, hunt)
+    needed = {bundle.snapshot: bundle.id for bundle in (*beside, *reversed(bundles.values()))}
     there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
     for name in sorted(there | needed.keys()):
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
@@ -295,18 +295,20 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
     return bundle
 
 
-def _check_near_misses(found: Checked, hunt: Path) -> list[Bundle]:
-    """Those that are whole; what is lost with one is had again from the ledger."""
+def _check_beside(found: Checked, hunt: Path) -> list[Bundle]:
+    """Near misses, and what probes and branches have found, where they are whole; the ledger has what makes them."""
     whole = []
-    for folder in sorted((hunt / layout.NEAR_MISSES).glob(layout.SHOWN)):
-        one = Checked(folder, "crash")
-        bundle = _check_bundle(one, folder)
-        if bundle is not None:
-            whole.append(bundle)
-        fix = "remove it: the same hunt with --near-misses makes it again"
-        for finding in one.findings:
-            lost = f"the near miss {folder.name}"
-            found.findings.append(replace(finding, lost=lost, fix=fix) if finding.damaged else finding)
+    options = {layout.NEAR_MISSES: "--near-misses", layout.PROBES: "--probe", layout.BRANCHES: "--branch"}
+    for place, option in options.items():
+        for folder in sorted((hunt / place).glob(layout.SHOWN)):
+            one = Checked(folder, "crash")
+            bundle = _check_bundle(one, folder)
+            if bundle is not None:
+                whole.append(bundle)
+            fix = f"remove it: the same hunt with {option} makes it again"
+            lost = f"the near miss {folder.name}" if place == layout.NEAR_MISSES else f"{place}/{folder.name}"
+            for finding in one.findings:
+                found.findings.append(replace(finding, lost=lost, fix=fix) if finding.damaged else finding)
     return whole
 
 
@@ -373,7 +375,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
     places = (
         hunt.glob(".*.*"),
         (hunt / layout.CRASHES).glob(".*"),
-        (hunt / layout.NEAR_MISSES).glob(".*"),
+        *((hunt / place).glob(".*") for place in layout.BESIDE),
         (hunt / layout.SNAPSHOTS).glob(".*"),
         hunt.glob(".scratch"),
     )

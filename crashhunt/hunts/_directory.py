@@ -25,7 +25,7 @@ _DIFFERENCES_SHOWN = 4
 _OWN = (
     "snapshots",
     "crashes",
-    layout.NEAR_MISSES,
+    *layout.BESIDE,
     "trials",
     layout.LEDGER,
     "ledger.sqlite-wal",

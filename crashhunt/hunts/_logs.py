@@ -50,7 +50,7 @@ class LogReader:
             if "state" in self._kinds:
                 yield from self._states()
             yield from self._texts(self._hunt, "")
-        places = (layout.CRASHES, layout.NEAR_MISSES, layout.TRIALS)
+        places = (layout.CRASHES, *layout.BESIDE, layout.TRIALS)
         folders = [folder for place in places for folder in (self._hunt / place).glob(layout.SHOWN)]
         for folder in sorted(folders, key=lambda folder: folder.name):
             number = folder.name.partition("-")[0]

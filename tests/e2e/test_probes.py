@@ -45,6 +45,16 @@ def test_a_hunt_tells_how_little_it_would_take_and_confirms_it_from_the_start(sh
     rows = list(csv.DictReader(io.StringIO(shell.crashhunt("trials", "h", "--format", "csv").out)))
     assert min(float(row["stress_margin"]) for row in rows) == found["least"]
     assert "reproduced" in shell.crashhunt("replay", crash["path"]).out
+    shell.crashhunt("export", "h", "crash.zip", "--crash", "1")
+    assert "ego drove into leader" in shell.crashhunt("show", "crash.zip").out
+    assert shell.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == 0
+    assert shell.crashhunt("check", "h").code == 0
+    (shell.folder / "h" / "probes" / "000001-collision" / "log.mcap").unlink()
+    (damaged,) = shell.crashhunt("check", "h", "--json", expect=1).json["hunts"]
+    assert [finding["lost"] for finding in damaged["findings"]] == ["probes/000001-collision"]
+    assert damaged["damaged_crashes"] == []
+    shell.crashhunt(*words, "--overwrite", "--seed", "5")
+    assert not (shell.folder / "h" / "probes").exists()  # which were of the hunt before
 
 
 def test_how_often_has_to_be_a_time(shell):
