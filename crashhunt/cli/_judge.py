@@ -108,7 +108,8 @@ def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *,
         )
     known = judgement_of(bundle)
     bundle = with_judgement(bundle, found)
-    if write and found.runs and (not stops or known is None):  # half an answer does not replace a whole one
+    ran = found.runs or (found.why is not None and found.why.runs)
+    if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()
     story = Story(bundle)
     say(

@@ -11,7 +11,7 @@ from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing, visible_from
 from crashhunt.replays._avoiding import CannotError, Search, Tried
 from crashhunt.replays._prepare import ReplayOptions, prepare
-from crashhunt.replays._warm import Reruns, StoppedError
+from crashhunt.replays._warm import NotUnderstoodError, Reruns, StoppedError
 from crashhunt.replays._why import find_why
 from crashhunt.trial import Outcome
 
@@ -111,9 +111,9 @@ class _Trials:
         try:
             for ended in self.reruns.run(made):
                 yield self._tried(steps[ended.place], ended)
-        except RecorderError:
-            raise
-        except CannotError:
+        except NotUnderstoodError as error:
+            raise CannotError(error.message) from error
+        except (RecorderError, CannotError):
             raise
         except CrashhuntError as error:
             if manoeuvre == "brake":

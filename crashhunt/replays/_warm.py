@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
+from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.recording import Recording, read_black_box
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.replays._prepare import Rerun
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Ended", "Reruns", "StoppedError"]
+__all__ = ["Ended", "NotUnderstoodError", "Reruns", "StoppedError"]
 
 _LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 _WARM_COPIES = 2  # of each worker: most runs begin as the crash did
@@ -31,6 +31,10 @@ _WARM_COPIES = 2  # of each worker: most runs begin as the crash did
 
 class StoppedError(Exception):
     """Somebody has asked to give up."""
+
+
+class NotUnderstoodError(CrashhuntError):
+    """What ran the trial has left out what it does not know of it, and so has run another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +78,7 @@ class Reruns:
 
         Raises:
             StoppedError: somebody has asked for it.
+            NotUnderstoodError: the crashhunt that runs them does not know what is asked.
             CrashhuntError: the trials could not be run.
         """
         asked = {number: (place, spec) for (place, spec), number in zip(enumerate(specs), self._numbers, strict=False)}
@@ -83,7 +88,8 @@ class Reruns:
             while asked:
                 for result in list(self._executor.completed(_LOOK_EVERY_S)):
                     if result.spec.number in asked:  # else it is of what has been given up
-                        place, _ = asked.pop(result.spec.number)
+                        place, spec = asked.pop(result.spec.number)
+                        _see_that_it_was_run(spec, result.spec)
                         yield self._ended(place, result, recorded=recorded)
                 if asked and self._stopped():
                     raise StoppedError
@@ -102,3 +108,13 @@ class Reruns:
                 recording = Recording(read_black_box(folder / layout.BLACK_BOX))
         shutil.rmtree(folder, ignore_errors=True)
         return Ended(place, result, recording)
+
+
+def _see_that_it_was_run(asked: TrialSpec, run: TrialSpec) -> None:
+    """See that what determines a trial came back as it was asked: early versions leave out what they do not know.
+
+    Raises:
+        NotUnderstoodError: something did not.
+    """
+    if (asked.overruled, asked.disturbances, asked.only) != (run.overruled, run.disturbances, run.only):
+        raise NotUnderstoodError("the crashhunt in its snapshot is too old for that")

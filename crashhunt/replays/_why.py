@@ -105,7 +105,7 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
             except CrashhuntError as error:
                 if not inside:
                     raise
-                why_not = str(error)
+                why_not = error.message
     except StoppedError:
         why_not = INTERRUPTED
     return Why(tuple(one.answered for one in asked if one.endings), search.steps, left, why_not)

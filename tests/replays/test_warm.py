@@ -1,0 +1,40 @@
+"""What an early crashhunt leaves out of a trial is noticed: it has run another one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from crashhunt.crashes import find_bundle, open_archive
+from crashhunt.replays import judge
+from crashhunt.replays._warm import NotUnderstoodError, _see_that_it_was_run
+from crashhunt.trial import Disturbance, Overruled, TrialSpec
+
+SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"overruled": Overruled("ego", 3)},
+        {"overruled": Overruled("ego", 3, keeps="lane")},
+        {"disturbances": (Disturbance(3, "itself", "gone", 0.0, 9.0, "ego", "other"),)},
+        {"only": ()},
+    ],
+)
+def test_another_trial_than_was_asked_for_says_nothing(asked):
+    spec = replace(SPEC, **asked)
+    _see_that_it_was_run(spec, TrialSpec.from_json(spec.to_json()))
+    with pytest.raises(NotUnderstoodError, match="too old"):
+        _see_that_it_was_run(spec, SPEC)
+
+
+@pytest.mark.nightly
+def test_a_crash_of_the_first_version_is_judged_by_what_it_understands(request):
+    with open_archive(request.path.parent.parent / "e2e" / "bundles" / "crashhunt-0.1.0.zip") as archive:
+        found = judge(find_bundle(archive.directory), runs=2, why=10, parallel=2)
+    assert (found.attempts, found.why_not) == ((), "the crashhunt in its snapshot is too old for that")
+    assert found.why is not None
+    assert {factor.kind for factor in found.why.factors} <= {"argument", "seed"}
+    assert found.why.why_not == found.why_not
