@@ -144,6 +144,15 @@ def test_where_nothing_milder_is_left_nobody_else_is_asked():
     assert len(road.asked) == again
 
 
+def test_as_long_as_something_milder_is_left_it_is_asked_for():
+    asker, _ = prober()
+    road = Road({"brake": 2 / 16})
+    asker.ask(road)
+    road.crashes["stop"] = 1 / 16
+    asker.ask(road)  # at the next moment
+    assert stress_of(asker).margin == 1 / 16
+
+
 def test_of_a_trial_that_crashes_anyway_a_disturbance_says_nothing():
     asker, _ = prober()
     road = Road({"brake": 0.5}, doomed=True)

@@ -7,7 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision, TrafficEvents, merge_findings
+from crashhunt.oracles import (
+    Finding,
+    OffRoad,
+    OffRoute,
+    Overlap,
+    RedLight,
+    ReportedCollision,
+    Teleport,
+    TrafficEvents,
+    WrongWay,
+    merge_findings,
+)
 from crashhunt.trial import Collision, Outcome
 from crashhunt.world import Actor, Contact, Event, Roster, Scene, first_contact
 
@@ -190,6 +201,20 @@ def test_events_are_those_of_the_agents():
     (finding,) = TrafficEvents().check(view, ["ego"])
     assert (finding.outcome, finding.event.what, finding.collision) == (Outcome.TELEPORT, "y", None)
     assert len(TrafficEvents().check(view, ["ego", "other"])) == 2
+
+
+@pytest.mark.parametrize(
+    ("oracle", "kind"),
+    [(RedLight, "red_light"), (Teleport, "teleport"), (WrongWay, "wrong_way"), (OffRoute, "off_route")],
+)
+def test_whoever_looks_for_one_kind_of_event_sees_that_of_the_agents_only(oracle, kind):
+    view = scene(*REAR_END)
+    other = "teleport" if kind != "teleport" else "red_light"
+    view.events = (Event(kind, "other", "theirs"), Event(other, "ego", "another"), Event(kind, "ego", "ours"))
+    (finding,) = oracle().check(view, ["ego"])
+    assert (finding.outcome, finding.event.what) == (Outcome(kind), "ours")
+    assert len(oracle().check(view, ["other", "ego"])) == 2
+    assert oracle().check(view, ["third"]) == []
 
 
 def test_findings_of_others_are_not_credited():

@@ -22,6 +22,7 @@ from crashhunt.recording import (
     first_divergence,
     values_around,
 )
+from crashhunt.trial import Disturbance
 from crashhunt.world import Actor, Contact, Event, Roster, Scene
 
 AGENTS = (
@@ -102,6 +103,23 @@ def test_every_part_of_a_scene_is_compared(number, name, value, other):
     assert (step, agent, field) == (number, "", name if name == "time_s" else f"scene.{name}")
     assert now == (other if name == "time_s" else str(other))
     assert was == (number / 2 if name == "time_s" else value) or name == "contacts"
+
+
+def test_disturbances_that_took_place_are_compared():
+    def brakes(how_strong):
+        def change(step):
+            step.more["disturbance"] = [Disturbance(2, "ahead", "brake", how_strong, 1.0, "ego", "bus")]
+
+        return change
+
+    step, agent, field, was, now = found(2, brakes(3.0))
+    assert (step, agent, field, was) == (2, "", "disturbance", "[]")
+    assert "'how_strong': 3.0" in now
+    both = [changed(2, brakes(strong)) for strong in (3.0, 3.0, 4.0)]
+    assert first_divergence(both[0], both[1]) is None
+    divergence = first_divergence(both[0], both[2])
+    assert "3.0" in divergence.recorded
+    assert "4.0" in divergence.replayed
 
 
 @pytest.mark.parametrize(("column", "place"), [("x", 0), ("y", 1), ("heading", 2), ("speed", 3)])

@@ -125,5 +125,7 @@ def test_each_part_of_a_bent_one_counts_and_of_the_agent_the_first():
     assert track.half_length[0] <= 5.0
     assert len(others.sample) >= 2
     assert set(others.sample.tolist()) == {0}
+    assert set(others.half_width.tolist()) == {1.25}
+    assert track.half_width.tolist() == [1.0]
     near = tracks([(bent, np.array([0.0]))], "ego", 1.0)[1]
     assert len(near.sample) < len(others.sample)
