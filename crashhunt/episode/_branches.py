@@ -6,6 +6,7 @@ what has become of it: then the copies from that moment, and from some seconds b
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from dataclasses import dataclass, replace
@@ -59,12 +60,21 @@ class Brancher(Observer):
         words: how often what disturbs, ``NAME=RATE`` each, or what does in which step.
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
+        tell: called with what people should know.
 
     Attributes:
         why_not: why there are no branches any more, in words; empty where there are.
     """
 
-    def __init__(self, words: Sequence[str], crash_on: Sequence[Outcome], delay: Callable[[float], None]) -> None:
+    def __init__(
+        self,
+        words: Sequence[str],
+        crash_on: Sequence[Outcome],
+        delay: Callable[[float], None],
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._tell = tell
+        self._owner = os.getpid()
         self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
@@ -83,6 +93,7 @@ class Brancher(Observer):
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
         self._branches, self._draws, self._rests_until = Branches(), 0, 0
+        self._owner = os.getpid()
         self._any = False
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -103,6 +114,8 @@ class Brancher(Observer):
                 copy = episode.leave_asleep(self._go_on)
                 self._any = True
                 self._asleep.append(_Sleeper(episode.steps, copy))
+            else:
+                self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
             self._look(episode, episode.steps)
         except CrashhuntError as error:
             self.why_not = error.message
@@ -110,8 +123,8 @@ class Brancher(Observer):
             self._delay(time.monotonic() - began)
 
     def close(self) -> None:
-        """End all copies."""
-        while self._asleep:
+        """End all copies, unless an agent has forked, and this is what it has forked: they are not its own."""
+        while self._asleep and os.getpid() == self._owner:
             self._asleep.pop().copy.end()
 
     def result(self, result: TrialResult) -> TrialResult:

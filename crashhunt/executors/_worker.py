@@ -81,7 +81,8 @@ class Worker:
         self._pid = os.getpid()
         self._is_copy = False
         self._prober = Prober(settings.probe_s, settings.crash_on, self._delay) if settings.probe_s else None
-        self._brancher = Brancher(settings.branch, settings.crash_on, self._delay) if settings.branch else None
+        about = settings.branch, settings.crash_on, self._delay, self._notice
+        self._brancher = Brancher(*about) if settings.branch else None
         self._first_copy = FirstCopy(self._no_copies) if settings.probe_s or settings.branch else None
         self._settings = settings
         self._simulator: Simulator | None = None

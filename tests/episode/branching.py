@@ -91,6 +91,10 @@ def ends(stage):
         brancher = Brancher(RATES, CRASHES, lambda _: None)
         result = place.run(brancher, Sleeps(how))
         found[name] = [str(result.outcome), brancher.why_not, len(children_of(os.getpid()))]
+    module.free_memory, told = lambda: 0.2, []
+    result = place.run(Brancher(RATES, CRASHES, lambda _: None, told.append), steps=40)
+    found["full"] = [str(result.outcome), result.branches, told[0]]
+    module.free_memory = lambda: 1.0
     brancher = Brancher(RATES, CRASHES, lambda _: None)
     brancher.close = lambda: None  # as if it were killed now
     place.run(brancher, steps=40)

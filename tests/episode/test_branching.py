@@ -63,6 +63,11 @@ def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
     found = ask("ends")
     for how in ("hangs", "dies"):
         assert found[how] == ["survived", "a copy died, or hung", 0]
+    assert found["full"] == [
+        "survived",
+        None,
+        "less than 25% of the memory is free: trials branch less than they might",
+    ]
     assert len(found["left"]) == 3
     deadline = time.monotonic() + 10.0
     for pid in found["left"]:
