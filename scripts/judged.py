@@ -130,8 +130,8 @@ def _about_scenario(name: str, crashes: int, found: list[dict[str, Any]]) -> str
 
 
 def _was_put(told: dict[str, Any]) -> bool:
-    done = [ending for ending in told["first"] if ending != "cannot"]
-    return bool(done) and all(ending == "hit" for ending in done)
+    first = told["first"]
+    return first[0] == "hit" and all(ending in ("hit", "other", "cannot") for ending in first)
 
 
 def _about_rules(found: list[dict[str, Any]]) -> str:

@@ -132,7 +132,7 @@ class Judgement:
     def verdict(self) -> JudgementVerdict:
         """Whether it could be avoided, as far as the agent could see what was coming."""
         best, visible = self.best, self.visible_step
-        if self.avoidable is False and all(attempt.endings[0] == "hit" for attempt in self.attempts):
+        if self.avoidable is False and self.attempts[0].endings[0] == "hit":
             return "invalid"
         if visible is not None and best is not None and (best.last_step or 0) >= visible:
             return "avoidable"
