@@ -47,6 +47,7 @@ class HuntFigures:
         outcomes: how many trials ended how, invalid ones too; of all trials.
         counted: the origin of the trials that all other figures are of, where the hunt guided the rest of them: only
             of these does it say something how often they crash. Empty where it is all trials.
+        disturbed: how many of the crashes had disturbances; None where the hunt has none.
     """
 
     dir: str
@@ -61,6 +62,7 @@ class HuntFigures:
     median_time_to_collision_s: float
     outcomes: dict[str, int]
     counted: str = ""
+    disturbed: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +201,11 @@ def _table(hunt: HuntResults) -> NDArray[np.void]:
     return np.sort(table, order="number")
 
 
+def _disturbed(hunt: HuntResults, crashed: set[int]) -> int:
+    found = hunt.results(outcomes=tuple(map(str, hunt.settings.crash_on)))
+    return sum(result.disturbed for result in found if result.spec.number in crashed)
+
+
 def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
     valid = table[table["valid"]]
     crashes = int(valid["crash"].sum())
@@ -223,6 +230,7 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
         float(np.median(fine["ttc"])) if len(fine) else float("nan"),
         hunt.state.outcomes,
         hunt.plain_origin,
+        _disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
     )
 
 

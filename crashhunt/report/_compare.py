@@ -60,7 +60,7 @@ def describe_comparison(found: Comparison) -> str:
         (
             hunt.dir,
             str(hunt.trials),
-            str(hunt.crashes),
+            f"{hunt.crashes} ({hunt.disturbed} disturbed)" if hunt.disturbed is not None else str(hunt.crashes),
             f"{hunt.crash_rate:.2%}" if hunt.trials else "-",
             f"{hunt.interval[0]:.2%} to {hunt.interval[1]:.2%}" if hunt.interval else "-",
             f"{hunt.median_steps_to_crash:g}" if hunt.crashes else "-",
@@ -117,6 +117,8 @@ def _rates(hunts: Sequence[HuntFigures], colors: dict[str, str]) -> str:
     for hunt in hunts:
         rate = hunt.crash_rate if hunt.trials else 0.0
         said = f"{rate:.2%} ({hunt.crashes} of {hunt.trials})"
+        if hunt.disturbed is not None:
+            said += f", {hunt.disturbed} of them disturbed"
         bar = f'<span style="left:0;width:{rate * scale:.2f}%;background:{colors[hunt.dir]}"></span>'
         if hunt.counted:
             said += f", of origin {html.escape(hunt.counted)} only, as the hunt guided all others"
