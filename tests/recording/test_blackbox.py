@@ -128,6 +128,7 @@ def test_notes_are_no_part_of_the_evidence(box):
     lanes = Record(Tag.LANES, 0, b"a").encode()
     assert b"".join(box.evidence()) == begun + lanes
     assert len(bytes(box.committed())) == len(begun + lanes) + 3 * 16
+    assert {record.aux for record in decode_records(bytes(box.committed()))} == {0}
     box.append(Tag.LANES, 0, b"a")
     assert b"".join(box.evidence()) == begun + 2 * lanes
     box.begin(pid=1, trial=1, started=0.0)

@@ -204,6 +204,17 @@ def test_towards_somebody_who_stands_it_is_the_braking_that_it_takes(seed):
     assert most.other == "other"
 
 
+def test_who_would_have_passed_before_the_other_one_came_need_not_have_braked():
+    """It stops, and 2 s later somebody crosses where it would have been gone."""
+    way = straight(0, 0, 0, 10)
+    way[:, 0] = np.minimum(way[:, 0], 9.0)  # as of a sample
+    for late_s, needed in ((2.5, False), (0.6, True)):
+        crossing = straight(16, -10 * (1 + late_s), math.pi / 2, 10)
+        steps, _ = level(way, crossing)
+        assert (steps.max() > 0.05) == needed, late_s
+        assert needed or steps.max() < 0.02
+
+
 def test_who_is_meant_is_the_nearest_of_several():
     """The nearest in time; of two that are as near in time, the nearer one in space."""
     row = [straight(x, 0, 0, 10) for x in (0, 35, 20, 50)]
