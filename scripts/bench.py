@@ -184,6 +184,52 @@ def bench_step() -> Iterator[Figure]:
                     yield Figure(f"step_{label.removeprefix('part ').replace(' ', '_')}", value, "µs", "lower", None)
 
 
+def child_core(scenario: str) -> dict[str, float]:
+    """Whole trials as a worker runs them, with the compiled core and without, in turns in one process."""
+    from dataclasses import replace
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.executors import Worker
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.scenario.backends.sumo import SumoSetup
+    from crashhunt.trial import TrialSpec
+
+    chosen, rounds, clock = load_scenario(scenario), 9, time.process_time
+    answer = os.dup(1)  # the worker takes standard output over
+    spent: dict[tuple[int, bool], list[float]] = {}
+    with folder() as scratch:
+        workers = {}
+        for native in (True, False):
+            (place := scratch / str(native)).mkdir()
+            one = chosen.with_table(replace(chosen.table(SumoSetup), native=None if native else False))
+            oracles = ("reported-collision", "overlap", "off-road")
+            workers[native] = Worker(WorkerSettings(scenario=one, oracles=oracles, crash_on=(), scratch=place))
+        for number in range(rounds + 1):
+            for turn, steps in enumerate((85, 600)):
+                trial = 2 * number + turn
+                for native, worker in workers.items():
+                    began = clock()
+                    worker.run(TrialSpec(trial, number, {"ego": {"speed": 8.0}}, argument_values(chosen), steps))
+                    if number:  # the first warms everything up
+                        spent.setdefault((steps, native), []).append(clock() - began)
+        os.dup2(answer, 1)
+    found = {f"{steps}_{native}": statistics.median(seconds) for (steps, native), seconds in spent.items()}
+    for steps in (85, 600):
+        pairs = zip(spent[steps, False], spent[steps, True], strict=True)
+        found[f"{steps}_ratio"] = statistics.median(without / with_it for without, with_it in pairs)
+    return found
+
+
+def bench_core() -> Iterator[Figure]:
+    """Trials a minute with the compiled core against those without."""
+    for scenario in ("loop", "merge", "intersection"):
+        found = in_child("child_core", scenario)
+        for steps in (85, 600):
+            with_it, without = found[f"{steps}_True"], found[f"{steps}_False"]
+            note = f"{60 / with_it:.0f} against {60 / without:.0f} trials a minute of CPU time, {steps} steps each"
+            yield Figure(f"core_{scenario}_{steps}", found[f"{steps}_ratio"], "x", "higher", None, note)
+
+
 def bench_parallel() -> Iterator[Figure]:
     """Trials a second with two workers against one."""
     ratios = []
@@ -840,6 +886,7 @@ def bench_ray() -> Iterator[Figure]:
 
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
+    "core": bench_core,
     "parallel": bench_parallel,
     "orchestration": bench_orchestration,
     "ceiling": bench_ceiling,

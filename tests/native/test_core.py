@@ -86,6 +86,17 @@ def test_the_same_are_within_reach(scenes):
         assert ours == theirs
 
 
+def test_a_heading_beyond_north_is_no_turn_around():
+    # Seen from SUMO's angles, north is where headings jump by a whole turn; nobody there reaches further for it.
+    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "ab"))
+    was = Scene(0.0, roster, [(0.0, 0.0), (0.0, 5.6)], [math.pi / 2] * 2, [0.0, 0.0])
+    now = Scene(0.1, roster, [(0.0, 0.0), (0.0, 5.6)], [math.pi / 2 - math.tau] * 2, [0.0, 0.0])
+    now.follow(was)
+    for row in (0, 1):
+        ours, theirs = both_ways(now, lambda row=row: _within_reach(now, was, row))
+        assert ours == theirs == []
+
+
 def test_somebody_is_within_reach():
     roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "abc"))
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])

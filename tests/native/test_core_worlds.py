@@ -1,0 +1,80 @@
+"""The compiled core where the world is not only cars on a plane: persons, bridges, buses in a bend, long steps."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.episode import run_episode
+from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
+from crashhunt.recording import BlackBox
+from crashhunt.scenario import load_scenario
+from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.trial import TrialSpec
+
+core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
+
+NETS = Path(__file__).parents[1] / "simulators" / "nets"
+WALKERS = (
+    '<vType id="wide" width="2.8"/><vType id="ghost" vClass="pedestrian" maxSpeed="0.01"/>'
+    '<vehicle id="ego" type="wide" depart="0" departPos="10" departSpeed="10"><route edges="wc ce"/></vehicle>'
+    '<person id="ego" type="ghost" depart="0" departPos="80"><walk edges="wc" arrivalPos="20"/></person>'
+    '<person id="rider" depart="0"><ride from="wc" to="ce" lines="ego"/></person>'
+    '<vehicle id="one" depart="1"><route edges="wc ce"/></vehicle>'
+    '<vehicle id="ü" depart="4"><route edges="wc"/></vehicle>'
+)
+BRIDGE = (
+    '<vehicle id="above" depart="0" departPos="60" departSpeed="0"><route edges="bridge down"/>'
+    '<stop lane="bridge_0" endPos="60" duration="999"/></vehicle>'
+    '<vehicle id="ego" depart="0" departPos="50" departSpeed="15"><route edges="up bridge"/></vehicle>'
+)
+BEND = (
+    '<vType id="bus" vClass="bus" length="18"/>'
+    '<vehicle id="ego" type="bus" depart="0" departPos="230" departSpeed="max">'
+    '<route edges="outa outb outc"/></vehicle>'
+    '<vehicle id="car" depart="0" departSpeed="max"><route edges="inb inc"/></vehicle>'
+)
+WORLDS = {
+    "walkers": ("street", WALKERS, 0.1, 80),
+    "long steps": ("street", WALKERS, 1.0, 30),
+    "bridge": ("bridge", BRIDGE, 0.1, 60),
+    "bend": ("rail", BEND, 0.1, 120),
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_trial_in_another_world_is_the_same_to_the_bit(tmp_path, world):
+    from crashhunt.simulators.sumo import SumoSimulator
+
+    net, traffic, step_s, steps = WORLDS[world]
+    shutil.copy(NETS / f"{net}.net.xml", tmp_path)
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>", encoding="utf-8")
+    (tmp_path / "scenario.toml").write_text(
+        f'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = {step_s}\nwarmup_s = 0.0\n'
+        f'[sumo]\nnet = "{net}.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nexisting = true\n'
+    )
+    found, used = [], []
+    for native in (None, False):
+        scenario = load_scenario(tmp_path)
+        scenario = scenario.with_table(replace(scenario.table(SumoSetup), native=native))
+        stage = tmp_path / f"stage-{native}"
+        stage.mkdir()
+        simulator = SumoSimulator(scenario, stage)
+        box = BlackBox(stage / "box")
+        box.begin(pid=0, trial=0, started=0.0)
+        result = run_episode(
+            TrialSpec(0, 1, {}, {}, steps), simulator=simulator, make_agent=lambda *_: KeepLaneWithSpeed(12.0),
+            box=box, oracles=(ReportedCollision(), Overlap(), OffRoad()),
+        )  # fmt: skip
+        used.append(simulator._sight.core is core)
+        found.append((repr(replace(result, setup_s=0.0, wall_s=0.0)), bytes(box.committed())))
+        simulator.close()
+        box.close()
+        assert result.steps > 5, result.failure
+        assert not simulator.notices
+    assert used == [True, False]
+    assert found[0] == found[1]
