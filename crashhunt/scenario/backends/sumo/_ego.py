@@ -49,6 +49,11 @@ class _Departure:
 
 
 def number(text: str, option: str, path: Path) -> float:
+    """Return a number of a configuration or a route file.
+
+    Raises:
+        ScenarioError: it is none.
+    """
     try:
         return float(text)
     except ValueError:
@@ -56,6 +61,11 @@ def number(text: str, option: str, path: Path) -> float:
 
 
 def seconds(text: str, path: Path) -> float:
+    """Return a time as SUMO writes it, ``90`` or ``0:01:30``, in s.
+
+    Raises:
+        ScenarioError: it is none.
+    """
     try:
         parts = [float(part) for part in text.split(":")]
     except ValueError:
