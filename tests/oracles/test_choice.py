@@ -127,5 +127,6 @@ def test_a_near_miss_is_a_gap_below_the_limit_and_no_contact(turn):
 
 def test_whoever_creeps_up_in_a_queue_has_no_near_miss():
     assert TooClose(gap_m=0.5, speed=1.0).check(scene(0.3, speed=5.5), ["ego"]) == []
+    assert [bool(TooClose(speed=0.0).check(scene(gap, speed=5.5), ["ego"])) for gap in (0.4, 0.6)] == [True, False]
     assert TooClose(gap_m=0.5, speed=0.0).check(scene(0.3, speed=5.5), ["ego"]) != []
     assert TooClose(gap_m=0.5, speed=0.0).check(scene(0.3, speed=0.0), ["ego"]) == []  # it has not come near
