@@ -171,9 +171,10 @@ def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:
     if late is not None:
         fix = f"give a step up to {request.max_steps}, or more MAX_STEPS"
         raise UsageError(f"--disturb {late.what}@{late.step}: a trial has {request.max_steps} steps", fix=fix)
+    begun = [one for one in fixed if one.step <= request.max_steps]  # a scenario is for trials of any length
     return (
         *(f"{name}={rate!r}" for name, rate in parse_rates(words).items()),
-        *(word_of(one, agents) for one in fixed),
+        *(word_of(one, agents) for one in begun),
     )
 
 

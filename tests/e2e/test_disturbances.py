@@ -244,3 +244,5 @@ def test_what_every_trial_has_in_the_hunt_the_scenario_and_the_replay(toy):
     scenario.write_text(f'{scenario.read_text()}\n[disturbances]\nbrake = 1\n"stop@30" = "ahead:6:8"\n')
     hunt(toy, "--overwrite", "--set", "gap_m=5", trials="1")
     assert '"brake=1.0",\n    "stop@30=ahead:6.0:8.0",' in file.read_text()
+    toy.crashhunt("run", "short", "1", "1", "20", *WORDS)  # in which that is never
+    assert crashhunt.load(toy.folder / "short").settings.disturb == ("brake=1.0",)
