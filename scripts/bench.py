@@ -195,6 +195,7 @@ def child_core(scenario: str) -> dict[str, float]:
     from crashhunt.trial import TrialSpec
 
     chosen, rounds, clock = load_scenario(scenario), 9, time.process_time
+    arguments = {"ego": {"speed": 8.0}} if scenario == "loop" else {}  # of the agents that they name
     answer = os.dup(1)  # the worker takes standard output over
     spent: dict[tuple[int, bool], list[float]] = {}
     with folder() as scratch:
@@ -209,7 +210,9 @@ def child_core(scenario: str) -> dict[str, float]:
                 trial = 2 * number + turn
                 for native, worker in workers.items():
                     began = clock()
-                    worker.run(TrialSpec(trial, number, {"ego": {"speed": 8.0}}, argument_values(chosen), steps))
+                    result = worker.run(TrialSpec(trial, number, arguments, argument_values(chosen), steps))
+                    if not result.steps:
+                        raise RuntimeError(f"the trial failed: {result.failure}")
                     if number:  # the first warms everything up
                         spent.setdefault((steps, native), []).append(clock() - began)
         os.dup2(answer, 1)

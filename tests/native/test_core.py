@@ -97,6 +97,16 @@ def test_a_heading_beyond_north_is_no_turn_around():
         assert ours == theirs == []
 
 
+def test_who_has_got_as_far_away_as_anybody_can_is_within_reach():
+    # Back to back: bumpers 12.35 m apart, which is all that length and hard braking allow, and they touched before.
+    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "ab"))
+    was = Scene(0.0, roster, [(0.0, 0.0), (8.35, 0.0)], [math.pi, 0.0], [0.0, 0.0])
+    now = Scene(0.1, roster, [(0.0, 0.0), (12.35, 0.0)], [math.pi, 0.0], [0.0, 0.0])
+    now.follow(was)
+    ours, theirs = both_ways(now, lambda: _within_reach(now, was, 0))
+    assert ours == theirs == [1]
+
+
 def test_somebody_is_within_reach():
     roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "abc"))
     was = Scene(0.0, roster, [(0.0, 0.0), (8.0, 0.0), (90.0, 0.0)], [0.0] * 3, [30.0, 0.0, 0.0])
