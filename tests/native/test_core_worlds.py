@@ -38,7 +38,18 @@ BEND = (
     '<route edges="outa outb outc"/></vehicle>'
     '<vehicle id="car" depart="0" departSpeed="max"><route edges="inb inc"/></vehicle>'
 )
+EGO = '<vehicle id="ego" depart="0" departPos="10" departSpeed="10"><route edges="wc ce"/></vehicle>'
+CRASH = EGO + (
+    '<vehicle id="ahead" depart="0" departPos="60" departSpeed="0"><route edges="wc"/>'
+    '<stop lane="wc_0" endPos="60" duration="999"/></vehicle>'
+)
+COME_AND_GO = EGO + (
+    '<vehicle id="short" depart="0" departPos="-13" departSpeed="10"><route edges="wc"/></vehicle>'
+    '<person id="late" depart="3.3" departPos="70"><walk edges="wc" arrivalPos="20"/></person>'
+)
 WORLDS = {
+    "crash": ("street", CRASH, 0.1, 80),
+    "come and go": ("street", COME_AND_GO, 0.1, 50),
     "walkers": ("street", WALKERS, 0.1, 80),
     "long steps": ("street", WALKERS, 1.0, 30),
     "bridge": ("bridge", BRIDGE, 0.1, 60),
