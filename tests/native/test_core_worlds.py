@@ -45,11 +45,12 @@ CRASH = EGO + (
 )
 COME_AND_GO = EGO + (
     '<vehicle id="short" depart="0" departPos="-13" departSpeed="10"><route edges="wc"/></vehicle>'
+    '<vehicle id="shorter" depart="2.5" departPos="-12" departSpeed="7"><route edges="wc"/></vehicle>'
     '<person id="late" depart="3.3" departPos="70"><walk edges="wc" arrivalPos="20"/></person>'
 )
 WORLDS = {
     "crash": ("street", CRASH, 0.1, 80),
-    "come and go": ("street", COME_AND_GO, 0.1, 50),
+    "come and go": ("street", COME_AND_GO, 0.1, 75),
     "walkers": ("street", WALKERS, 0.1, 80),
     "long steps": ("street", WALKERS, 1.0, 30),
     "bridge": ("bridge", BRIDGE, 0.1, 60),
