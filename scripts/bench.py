@@ -825,13 +825,14 @@ def _large_bundle(directory: Path, *, actors: int, steps: int) -> None:
 def bench_search() -> Iterator[Figure]:
     """Trials to the first crash, guided against random; scripts/search.py has all samplers, peers and problems."""
     from problems import PROBLEMS
-    from search import FIRST_SEED, all_runs, summary
+    from search import FIRST_SEED, all_runs
+    from search_plot import costs
 
     count = 10
     runs = all_runs(("random", "guided"), range(FIRST_SEED, FIRST_SEED + count), tuple(PROBLEMS), 2)
     note = f"mean of {count} hunts; random draws by calculation: 1"
     rare = []
-    for name, row in summary(list(runs)).items():
+    for name, row in costs(list(runs)).items():
         problem = PROBLEMS[name]
         if problem.hint and problem.rate <= 1 / 200:
             rare.append(row["guided"])

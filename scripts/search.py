@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import statistics
 import sys
 import tempfile
 import time
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from peers import PEERS
 from problems import PROBLEMS, REAL
+from search_plot import GIVE_UP, table, write_plot
 
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialSpec
 
 LAG = 4
-GIVE_UP = 3.0  # times what random draws need
 OURS = ("random", "halton", "sobol", "guided", "cross-entropy", "mutation", "cma-es")
 FIRST_SEED = 100
 
@@ -224,20 +223,6 @@ def real_runs(name: str, samplers: Sequence[str], seeds: Sequence[int], parallel
             pool.close()
 
 
-def cost(runs: Sequence[Run], of_random: Sequence[Run]) -> float:
-    """Mean cost, given up hunts as they are, as a share of what random draws need.
-
-    Without a simulator that is trials, and what random draws need is known by calculation; else it is steps, and what
-    random draws of the same seeds did need.
-    """
-    problem = PROBLEMS.get(runs[0].problem)
-    if problem is not None:
-        return statistics.fmean(run.trials for run in runs) * problem.rate / (1.0 - math.exp(-GIVE_UP))
-    steps = {run.seed: run.steps for run in of_random}
-    both = [run for run in runs if run.seed in steps]
-    return sum(run.steps for run in both) / sum(steps[run.seed] for run in both) if both else math.nan
-
-
 def all_runs(samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str], workers: int) -> Iterator[Run]:
     """Every sampler on every problem without a simulator."""
     with ProcessPoolExecutor(workers) as pool:
@@ -247,30 +232,6 @@ def all_runs(samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str]
         ]  # fmt: skip
         for job in jobs:
             yield job.result()
-
-
-def summary(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
-    """Problem to sampler to cost."""
-    found: dict[str, dict[str, float]] = {}
-    for name in dict.fromkeys(run.problem for run in runs):
-        of = [run for run in runs if run.problem == name]
-        of_random = [run for run in of if run.sampler == "random"]
-        found[name] = {
-            sampler: cost([run for run in of if run.sampler == sampler], of_random)
-            for sampler in dict.fromkeys(run.sampler for run in of)
-        }
-    return found
-
-
-def table(costs: dict[str, dict[str, float]]) -> str:
-    """Return it as Markdown."""
-    samplers = list(dict.fromkeys(sampler for row in costs.values() for sampler in row))
-    lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]
-    for name, row in costs.items():
-        rate = (PROBLEMS.get(name) or REAL[name]).rate
-        cells = [f"{row[sampler]:.2f}" if sampler in row else "-" for sampler in samplers]
-        lines.append(f"| {name} | {1 / rate:.0f} | {' | '.join(cells)} |")
-    return "\n".join(lines)
 
 
 def store(path: Path, runs: Sequence[Run]) -> None:
@@ -308,8 +269,12 @@ def main() -> int:
     parser.add_argument("--problems", default=",".join(PROBLEMS), help="some of these, and of " + ", ".join(REAL))
     parser.add_argument("--repetitions", type=int, default=30)
     parser.add_argument("--parallel", type=int, default=2)
+    parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
+    parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
     options = parser.parse_args()
+    if options.quick:
+        options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
     seeds = range(FIRST_SEED, FIRST_SEED + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
@@ -321,7 +286,9 @@ def main() -> int:
             runs[run.problem, run.sampler, run.seed] = run
             if options.store is not None:
                 store(options.store, [*runs.values()])
-    print(table(summary([*runs.values()])))
+    print(table([*runs.values()]))
+    if options.plot is not None:
+        write_plot([*runs.values()], options.plot)
     return 0
 
 

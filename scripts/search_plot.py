@@ -1,0 +1,186 @@
+"""The table and the plot of what ``scripts/search`` has measured, of the hunts that it has stored."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+from problems import PROBLEMS, REAL
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from search import Run
+
+__all__ = ["costs", "interval", "rare", "table", "write_plot"]
+
+GIVE_UP = 3.0  # times what random draws need
+_LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 74
+_LEAST, _MOST = 0.03, 5.0
+_MARKS = {
+    "guided": ("#1f5fbf", "#7db0ff", "disc"),
+    "cross-entropy": ("#b06a00", "#ffc247", "square"),
+    "mutation": ("#00866b", "#4fd3b5", "square"),
+    "halton": ("#7d8b9c", "#8593a6", "ring"),
+    "plain-mutation": ("#00866b", "#4fd3b5", "ring"),
+    "optuna-tpe": ("#c62828", "#ff6b6b", "ring"),
+    "optuna-cma-es": ("#c62828", "#ff6b6b", "cross"),
+    "verifai-ce": ("#8e24aa", "#d78bff", "ring"),
+    "verifai-mab": ("#8e24aa", "#d78bff", "cross"),
+}
+"""Sampler to its colour in the light, in the dark, and its form."""
+
+
+def _paid(problem: str, runs: Sequence[Run]) -> list[int]:
+    return [run.steps if problem in REAL else run.trials for run in runs]
+
+
+def _needed(problem: str, of_random: Sequence[Run]) -> float:
+    """What random draws need: by calculation without a simulator, else as measured."""
+    if problem in PROBLEMS:
+        return (1.0 - math.exp(-GIVE_UP)) / PROBLEMS[problem].rate
+    return statistics.fmean(_paid(problem, of_random)) if of_random else math.nan
+
+
+def costs(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
+    """Return, by problem and sampler, the mean cost as a share of what random draws need; given up hunts as they are.
+
+    The cost is trials without a simulator, where all take as long, and steps of everything with one.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for problem in (*PROBLEMS, *REAL):
+        of = [run for run in runs if run.problem == problem]
+        needed = _needed(problem, [run for run in of if run.sampler == "random"])
+        for sampler in dict.fromkeys(run.sampler for run in of):
+            paid = _paid(problem, [run for run in of if run.sampler == sampler])
+            found.setdefault(problem, {})[sampler] = statistics.fmean(paid) / needed
+    return found
+
+
+def interval(runs: Sequence[Run], problem: str, sampler: str) -> tuple[float, float]:
+    """Return an interval of 95 % of a cost, by bootstrap over hunts; of the random ones too, if measured."""
+    rng = np.random.default_rng(0)
+
+    def means(name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        paid = np.array(_paid(problem, [run for run in runs if (run.problem, run.sampler) == (problem, name)]))
+        drawn: np.ndarray[tuple[int], np.dtype[np.float64]] = paid[
+            rng.integers(len(paid), size=(2000, len(paid)))
+        ].mean(1)
+        return drawn
+
+    needed = means("random") if problem in REAL else np.full(2000, _needed(problem, ()))
+    low, high = np.percentile(means(sampler) / needed, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def rare(found: dict[str, dict[str, float]], sampler: str) -> float:
+    """Return the geometric mean over the problems of one in 200 and rarer on which danger says something."""
+    names = [name for name, problem in PROBLEMS.items() if problem.hint and problem.rate <= 1 / 200]
+    values = [found[name][sampler] for name in names if sampler in found.get(name, {})]
+    return statistics.geometric_mean(values) if len(values) == len(names) else math.nan
+
+
+def table(runs: Sequence[Run]) -> str:
+    """Return it as Markdown."""
+    found = costs(runs)
+    samplers = [name for name in ("random", "sobol", "cma-es", *_MARKS) if any(name in row for row in found.values())]
+    samplers.sort(key=lambda name: ["random", "guided"].index(name) if name in ("random", "guided") else 2)
+    lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]
+    for name, row in found.items():
+        cells = [_cell(runs, name, sampler, row) for sampler in samplers]
+        lines.append(f"| {name} | {1 / (PROBLEMS.get(name) or REAL[name]).rate:.0f} | {' | '.join(cells)} |")
+    means = [rare(found, sampler) for sampler in samplers]
+    lines.append(f"| *rare, with a hint* | | {' | '.join('-' if math.isnan(one) else f'{one:.2f}' for one in means)} |")
+    return "\n".join(lines)
+
+
+def _cell(runs: Sequence[Run], problem: str, sampler: str, row: dict[str, float]) -> str:
+    if sampler not in row:
+        return "-"
+    if sampler != "guided" or (problem in REAL and "random" not in row):
+        return f"{row[sampler]:.2f}"
+    low, high = interval(runs, problem, sampler)
+    return f"{row[sampler]:.2f} ({low:.2f}-{high:.2f})"
+
+
+def write_plot(runs: Sequence[Run], target: Path) -> None:
+    """Write it as SVG: a row a problem, a mark a sampler, and the interval of guided."""
+    found = costs(runs)
+    height = _TOP + _ROW * len(found) + 46
+    rules = [f".s{place} {{ --c: {light}; }}" for place, (light, _, _) in enumerate(_MARKS.values())]
+    dark = [f".s{place} {{ --c: {shade}; }}" for place, (_, shade, _) in enumerate(_MARKS.values())]
+    parts = [
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" '
+            'font-family="system-ui, sans-serif" font-size="12">'
+        ),
+        "<title>Cost to the first crash, as a share of what random draws need</title>",
+        "<style>:root { --page: #ffffff; --text: #1b2430; --faint: #5d6b7d; --line: #d9dfe7; }",
+        *rules,
+        "@media (prefers-color-scheme: dark) {",
+        ":root { --page: #12171e; --text: #e6ebf2; --faint: #9aa8ba; --line: #313b48; }",
+        *dark,
+        "}",
+        (
+            "text { fill: var(--text); } .faint { fill: var(--faint); } .line { stroke: var(--line); } "
+            ".one { stroke: var(--faint); stroke-dasharray: 4 3; }"
+        ),
+        (
+            ".disc, .square { fill: var(--c); } .ring, .cross { fill: none; stroke: var(--c); stroke-width: 1.8; } "
+            ".bar { stroke: var(--c); stroke-width: 2.5; }</style>"
+        ),
+        f'<rect width="{_WIDTH}" height="{height}" fill="var(--page)"/>',
+        (
+            '<text x="12" y="20" font-weight="600">Cost to the first crash, as a share of what random draws need '
+            "(left is better)</text>"
+        ),
+        *_legend(),
+    ]
+    bottom = _TOP + _ROW * len(found)
+    for share in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0):
+        x = _x(share)
+        parts.append(f'<line class="{"one" if share == 1 else "line"}" x1="{x}" x2="{x}" y1="{_TOP}" y2="{bottom}"/>')
+        parts.append(f'<text class="faint" x="{x}" y="{bottom + 16}" text-anchor="middle">{share:g}</text>')
+    parts.append(f'<text class="faint" x="{_x(1)}" y="{bottom + 32}" text-anchor="middle">random draws</text>')
+    for place, (name, row) in enumerate(found.items()):
+        y = _TOP + _ROW * place + _ROW / 2
+        problem = PROBLEMS.get(name) or REAL[name]
+        parts.append(
+            f'<text x="12" y="{y + 4}">{escape(name)} <tspan class="faint">1 in {1 / problem.rate:.0f}</tspan></text>'
+        )
+        if name in REAL and place and list(found)[place - 1] in PROBLEMS:
+            parts.append(f'<line class="line" x1="12" x2="{_WIDTH - 12}" y1="{y - _ROW / 2}" y2="{y - _ROW / 2}"/>')
+        if "guided" in row:
+            low, high = interval(runs, name, "guided")
+            parts.append(f'<line class="bar s0" x1="{_x(low)}" x2="{_x(high)}" y1="{y}" y2="{y}"/>')
+        parts += [_mark(sampler, _x(row[sampler]), y) for sampler in reversed(_MARKS) if sampler in row]
+    target.write_text("\n".join([*parts, "</svg>"]) + "\n", encoding="utf-8")
+
+
+def _x(share: float) -> float:
+    within = math.log(min(max(share, _LEAST), _MOST) / _LEAST) / math.log(_MOST / _LEAST)
+    return round(_LEFT + (_WIDTH - 24 - _LEFT) * within, 1)
+
+
+def _legend() -> list[str]:
+    parts = []
+    for place, name in enumerate(_MARKS):
+        x, y = 18 + 168 * (place % 5), 40 + 18 * (place // 5)
+        parts += [_mark(name, x, y), f'<text x="{x + 10}" y="{y + 4}">{name}</text>']
+    return parts
+
+
+def _mark(sampler: str, x: float, y: float) -> str:
+    place, (_, _, form) = list(_MARKS).index(sampler), _MARKS[sampler]
+    told = f'class="{form} s{place}"'
+    match form:
+        case "disc" | "ring":
+            return f'<circle {told} cx="{x}" cy="{y}" r="{6 if form == "disc" else 4}"/>'
+        case "square":
+            return f'<rect {told} x="{x - 4}" y="{y - 4}" width="8" height="8"/>'
+        case _:
+            return f'<path {told} d="M{x - 4} {y - 4}l8 8m0-8l-8 8"/>'
