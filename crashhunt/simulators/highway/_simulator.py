@@ -36,7 +36,9 @@ from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._left_out import LeftOut
-from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene, rectangle_gap
+from crashhunt.simulators.highway._shapes import gap, lanes_of
+from crashhunt.simulators.highway._taking_part import TakingPart
+from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -52,7 +54,6 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwaySimulator"]
 
-_LANE_STEP_M = 2.0  # between the points of a bend
 _LANES_EVERY = 10  # steps; how often a scene says the lane of each vehicle
 
 assert highway_env  # importing it registers its environments
@@ -110,6 +111,11 @@ class HighwaySimulator:
         self._crashed: set[str] = set()
         self._contacts: list[Contact] = []
         self._steps = 0
+        self._taking_part: TakingPart | None = None
+        if (only := (options or {}).get("only")) is not None:
+            self._taking_part = TakingPart(env.road, only, self.agents, self._objects, self._actor)
+            if self._taking_part.remove():
+                shown = env.observation_type.observe()
         self._driven = dict.fromkeys(self.agents, 0.0)
         self._places = {agent: vehicle.position.tolist() for agent, vehicle in self._controlled.items()}
         self._on_road = {agent: bool(vehicle.on_road) for agent, vehicle in self._controlled.items()}
@@ -129,6 +135,8 @@ class HighwaySimulator:
         self._contacts = []
         shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
         self._steps += 1
+        if self._taking_part is not None:
+            self._taking_part.remove()
         off_road: list[str] = []
         arrived: list[str] = []
         for agent, vehicle in self._controlled.items():
@@ -161,13 +169,7 @@ class HighwaySimulator:
 
     def lanes(self) -> list[Lane]:
         """Return all lanes; those that bend as points 2 m apart."""
-        found = []
-        for (start, end, number), lane in self._env.road.network.lanes_dict().items():
-            count = 2 if type(lane).__name__ == "StraightLane" else max(2, math.ceil(lane.length / _LANE_STEP_M) + 1)
-            points = [lane.position(lane.length * index / (count - 1), 0.0).tolist() for index in range(count)]
-            shape = tuple((float(x), -float(y)) for x, y in points)
-            found.append(Lane(self._lane_name((start, end, number)), float(lane.width_at(lane.length / 2)), shape))
-        return found
+        return lanes_of(self._env.road.network, self._lane_name)
 
     def full_braking(self, agent: str) -> FullBraking | None:
         """Return how a vehicle brakes as hard as its actions allow; None where they do not keep it in its lane."""
@@ -195,6 +197,11 @@ class HighwaySimulator:
         present = {id(thing) for thing in self._env.road.vehicles}
         found = (thing for thing, actor in self._known.values() if actor.id == vehicle and id(thing) in present)
         return self._disturbances.hold(next(found, None), what)
+
+    @property
+    def entered(self) -> list[str]:
+        """Who has come, where somebody may be left out."""
+        return [] if self._taking_part is None else self._taking_part.entered
 
     def tidy(self) -> None:
         """Undo what the environment has changed in classes."""
@@ -310,7 +317,7 @@ class HighwaySimulator:
             for other in self._objects()
             if other is not vehicle and (other.crashed or isinstance(other, Obstacle))
         ]
-        hit = min(others, key=lambda other: _gap(vehicle, other), default=None)
+        hit = min(others, key=lambda other: gap(vehicle, other), default=None)
         lane = self._lane_name(vehicle.lane_index)
         if hit is None:
             return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
@@ -389,12 +396,3 @@ def _form(kind: ActionType) -> ActionForm:
     if isinstance(kind, DiscreteMetaAction):
         return MetaAction(tuple(kind.actions[number] for number in range(len(kind.actions))))
     return action_form(kind.space())
-
-
-def _gap(one: RoadObject, two: RoadObject) -> float:
-    """The distance between two outlines, in m."""
-    x, y = (two.position - one.position).tolist()
-    c, s = math.cos(one.heading), math.sin(one.heading)
-    halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
-    turn = np.array([two.heading - one.heading])
-    return float(rectangle_gap(np.array([[x * c + y * s, y * c - x * s]]), turn, *halves)[0])
