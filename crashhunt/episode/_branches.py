@@ -190,9 +190,11 @@ class Brancher(Observer):
         drawn = [Disturbance.from_json(one) for one in cast("list[DisturbanceData]", job["disturbances"])]
         until, began = cast(int, job["until"]), copy.steps
         copy.replan(drawn)
+        fixed = self._draws_of(copy).fixed  # these take place in the trial as well, so they are no reason to go on
+        first = next((one for one in drawn if one not in fixed), drawn[0])
         while copy.result is None and copy.steps < until:
             copy.step()
-            if copy.steps == drawn[0].step and not copy.takes_place(drawn[0]):
+            if copy.steps == first.step and not copy.takes_place(first):
                 break  # nobody was there
         outcome, likely = "", None
         if copy.result is not None:
