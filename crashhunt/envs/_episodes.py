@@ -1,4 +1,4 @@
-"""What is behind the Gymnasium environment: the simulation of SUMO, the crash rules and the picture."""
+"""What is behind the Gymnasium environment: SUMO, the reward, the end of an episode, the picture."""
 
 from __future__ import annotations
 

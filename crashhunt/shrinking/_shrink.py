@@ -1,4 +1,4 @@
-"""Making a crash smaller: what is taken away in which order, and the bundle of what is left."""
+"""Making a crash smaller, from the crash to the bundle of what is left."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
-from crashhunt.simulators.highway._left_out import LeftOut
+from crashhunt.simulators.highway._hidden import Hidden
 from crashhunt.simulators.highway._shapes import gap, lanes_of
 from crashhunt.simulators.highway._taking_part import TakingPart
 from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene
@@ -189,7 +189,7 @@ class HighwaySimulator:
         if disturbance.what == "unseen":
             if self._kinematics is not None:
                 return Unseen(self._kinematics, disturbance.agent, vehicle)
-            return LeftOut(self._env.road, self._seeing[disturbance.agent], thing)
+            return Hidden(self._env.road, self._seeing[disturbance.agent], thing)
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
     def hold(self, vehicle: str, what: str) -> Disturbing | None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.scenario import AgentSetup, Scenario
-    from crashhunt.simulators.sumo._left_out import LeftOut
+    from crashhunt.simulators.sumo._taking_part import TakingPart
     from crashhunt.trial import Value
 
 __all__ = ["enter", "replaced_by"]
@@ -25,7 +25,7 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
 
 
 def enter(
-    scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], left_out: LeftOut | None
+    scenario: Scenario, setups: Mapping[str, AgentSetup], replaced: Mapping[str, str], taking_part: TakingPart | None
 ) -> None:
     """Warm up, add the vehicles that are not part of the traffic, and wait until all are on the road.
 
@@ -33,15 +33,15 @@ def enter(
         scenario: how long it warms up, and how long is waited.
         setups: of the agents that drive.
         replaced: vehicles of the traffic to the agents that take their places.
-        left_out: who of the traffic takes no part; None where all do.
+        taking_part: who of the traffic takes part; None where all do.
 
     Raises:
         InvalidEpisodeError: one of them did not enter in time, or had left again.
     """
     begin = libsumo.simulation.getTime()
     if scenario.warmup_s > 0:
-        if left_out is not None:
-            left_out.warm_up(begin + scenario.warmup_s)
+        if taking_part is not None:
+            taking_part.warm_up(begin + scenario.warmup_s)
         else:
             libsumo.simulationStep(begin + scenario.warmup_s)
     for agent, setup in setups.items():
@@ -60,8 +60,8 @@ def enter(
                 fix="raise insertion_timeout_s, lower the demand, or choose another vehicle, lane or position",
             )
         libsumo.simulationStep()
-        if left_out is not None:
-            left_out.remove()
+        if taking_part is not None:
+            taking_part.remove()
         departed = set(libsumo.simulation.getDepartedIDList())
         waiting -= departed
         for vehicle in departed & replaced.keys():

@@ -23,9 +23,9 @@ from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._entering import enter, replaced_by
 from crashhunt.simulators.sumo._holding import held_back
-from crashhunt.simulators.sumo._left_out import LeftOut
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
+from crashhunt.simulators.sumo._taking_part import TakingPart
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
@@ -93,7 +93,7 @@ class SumoSimulator:
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
-        self._left_out: LeftOut | None = None
+        self._taking_part: TakingPart | None = None
         self.scripted = False
         self._setups = scenario.agents
         self._look_with: Sight | ScriptedSight = self._sight
@@ -138,7 +138,7 @@ class SumoSimulator:
                 libsumo.start([*self._program, *command])
                 _keep_xml_ready()
             _current = weakref.ref(self)
-            enter(self._scenario, self._setups, self._replaced, self._left_out)
+            enter(self._scenario, self._setups, self._replaced, self._taking_part)
             if script := options.get("script"):
                 place_agents(script)
         except _TRACI_ERRORS as error:
@@ -171,8 +171,8 @@ class SumoSimulator:
             for agent, action in actions.items():
                 self._apply(agent, action)
             libsumo.simulationStep()
-            if self._left_out is not None:
-                self._left_out.remove()
+            if self._taking_part is not None:
+                self._taking_part.remove()
             self._steps += 1
             self._look()
             scene, present = self._scene, self._scene.roster.index
@@ -236,7 +236,7 @@ class SumoSimulator:
     @property
     def entered(self) -> list[str]:
         """Who has entered, where somebody may be left out."""
-        return [] if self._left_out is None else self._left_out.entered
+        return [] if self._taking_part is None else self._taking_part.entered
 
     def close(self) -> None:
         """End the simulation, unless another simulator of this process has begun one since."""
@@ -261,7 +261,7 @@ class SumoSimulator:
         self._setups, self._replaced = setups, replaced_by(setups, arguments)
         self._moved = {**self._scenario.agents, **dict.fromkeys(script.names if script is not None else ())}
         stay = (*(only or ()), *setups, *self._replaced)
-        self._left_out = None if only is None else LeftOut(stay, self._sight.leaving)
+        self._taking_part = None if only is None else TakingPart(stay, self._sight.leaving)
 
     def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
         setup = self._scenario.agents[agent]

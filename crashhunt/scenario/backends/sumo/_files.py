@@ -7,7 +7,7 @@ import string
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
-from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, canonical, is_output, is_shown
+from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, USUALLY, canonical, is_output, is_shown
 from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.scenario.backends.sumo._xml import read_xml, references, rewritten
 
@@ -77,8 +77,7 @@ class StagedFiles:
                 except CrashhuntError as error:
                     raise InvalidEpisodeError(error.message, fix=error.fix, where=path.name) from None
                 self._rendered[path] = text
-        options = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
-        options |= {canonical(name): _text(value) for name, value in self._sumo.options.items()}
+        options = USUALLY | {canonical(name): _text(value) for name, value in self._sumo.options.items()}
         for name, setup in self._scenario.arguments.items():
             if setup.option and name in values:
                 options[canonical(setup.option)] = _text(values[name])

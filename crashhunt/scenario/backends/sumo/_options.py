@@ -7,8 +7,21 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["ALWAYS", "HARMLESS", "INPUTS", "RESERVED", "canonical", "is_output", "is_shown", "is_true", "writes"]
+__all__ = [
+    "ALWAYS",
+    "HARMLESS",
+    "INPUTS",
+    "RESERVED",
+    "USUALLY",
+    "canonical",
+    "is_output",
+    "is_shown",
+    "is_true",
+    "writes",
+]
 
+USUALLY = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
+"""What SUMO gets where a scenario says nothing else."""
 ALWAYS = {
     "random": "false",
     "threads": "1",  # results depend on it

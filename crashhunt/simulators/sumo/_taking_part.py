@@ -12,10 +12,10 @@ from crashhunt.world import PERSON
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["LeftOut"]
+__all__ = ["TakingPart"]
 
 
-class LeftOut:
+class TakingPart:
     """Takes vehicles off the road at the end of the step in which they enter, before anybody has seen them.
 
     Only then are they known by name: those of a flow are made one after another as time goes on. A person leaves with

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from highway_env.road.road import Road
 
-__all__ = ["LeftOut"]
+__all__ = ["Hidden"]
 
 
-class LeftOut:
+class Hidden:
     """Takes one vehicle off the road for as long as an agent looks, from the next observation on.
 
     Args:
