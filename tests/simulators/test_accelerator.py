@@ -23,7 +23,7 @@ from conftest import mostly_nightly
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.controller import ControlledVehicle
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from hypothesis import given, settings, strategies as st
 
@@ -257,6 +257,30 @@ def test_a_subclass_is_as_its_author_wrote_it(kind):
     assert (Timid.asked > 0) == (kind is Timid)
     assert (kind_of(kind).drives == "idm") == (kind in (Hurried, Slippery))
     assert kind_of(kind).moves == (kind in (Hurried, Timid))
+
+
+@pytest.mark.parametrize(("speeds", "known"), [([8, 16, 24], True), ([0, 2**60], False)])
+def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch):
+    """NumPy's whole numbers, which floats hold: the target speeds of u-turns, roundabouts and exits."""
+
+    def played():
+        road = small_road(IDMVehicle, ControlledVehicle, IDMVehicle)
+        road.vehicles[1] = MDPVehicle(road, [20.0, 4.0], 0.0, 17.5, target_speeds=speeds)
+        road.vehicles[0].POLITENESS = 0.5
+        road.vehicles[2].target_speed = np.int64(24)
+        for number in range(20):
+            road.vehicles[1].act(["FASTER", "LANE_LEFT", None][number % 3])
+            road.act()
+            road.step(0.1)
+        return plain([[v.position, v.heading, v.speed, v.action, v.target_lane_index] for v in road.vehicles])
+
+    slow = played()
+    assert switch_on() == ""
+    decided = []
+    decide = accelerator.decide
+    monkeypatch.setattr(accelerator, "decide", lambda *given: decided.append(decide(*given)) or decided[-1])
+    assert played() == slow
+    assert decided == [known] * 20
 
 
 def test_a_method_of_one_vehicle_is_called():

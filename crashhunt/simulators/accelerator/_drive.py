@@ -33,6 +33,7 @@ _FOLLOWING = attrgetter("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DELTA", "DISTANCE
 _THINKING = attrgetter(
     "ACC_MAX", "POLITENESS", "LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED", "timer"
 )
+_WHOLE = 2**53  # up to here, floats hold whole numbers
 
 
 def decide(road: Road, frame: Frame) -> bool:
@@ -64,11 +65,13 @@ class _Decisions:
         self.following = {id(vehicle): _FOLLOWING(vehicle) for vehicle, how in drivers if how == "idm"}
         read = [*self.steering.values(), *self.following.values()]
         read += [_THINKING(vehicle) for vehicle, how in drivers if how == "idm"]
-        read += [(vehicle.target_speed, vehicle.KP_A) for vehicle, _ in drivers]
+        read += [(vehicle.KP_A,) for vehicle, _ in drivers]
         read += [(thing.heading, thing.speed) for thing in frame.things]
         #: whether all that they reckon with are numbers of the usual kinds, whose road is this one
-        self.are_usual = are_numbers(chain.from_iterable(read)) and all(
-            vehicle.road is road for vehicle in road.vehicles
+        self.are_usual = (
+            are_numbers(chain.from_iterable(read))
+            and all(_is_speed(vehicle.target_speed) for vehicle, _ in drivers)
+            and all(vehicle.road is road for vehicle in road.vehicles)
         )
         if not self.are_usual:
             return
@@ -262,6 +265,11 @@ class _Decisions:
         slip = np.arcsin(np.clip(length / 2 / speed * rate, -1, 1))
         found_angles: list[float] = np.clip(np.arctan(2 * np.tan(slip)), -most, most).tolist()
         return found_angles
+
+
+def _is_speed(value: object) -> bool:
+    """Whether a target speed is a usual number, or a whole one of NumPy's that a float holds: one out of a list."""
+    return are_numbers((value,)) or (isinstance(value, np.int64) and -_WHOLE < int(value) < _WHOLE)
 
 
 def _target_speed(vehicle: Vehicle) -> float:
