@@ -20,11 +20,13 @@ import highway_env
 import numpy as np
 import pytest
 from conftest import mostly_nightly
+from highway_env.envs.common import observation
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.simulators.accelerator import (
@@ -60,6 +62,7 @@ ALWAYS = [
     for name in ("intersection-v2", "intersection-multi-agent-v2", "merge-generic-v1", "roundabout-generic-v1")
 ]
 ALWAYS += [(name, config, 0) for name in ("highway-fast-v0", "racetrack-oval-v0") for config in CONFIGS]
+ALWAYS += [("parking-parked-v0", "default", 0)]
 STEPS = {"highway-v0": 4, "lane-keeping-v0": 40}
 
 
@@ -281,6 +284,46 @@ def test_whole_speeds_out_of_a_list_are_known(speeds, known, monkeypatch):
     monkeypatch.setattr(accelerator, "decide", lambda *given: decided.append(decide(*given)) or decided[-1])
     assert played() == slow
     assert decided == [known] * 20
+
+
+class Elsewhere(Landmark):
+    def to_dict(self, origin_vehicle=None, observe_intentions=True):
+        return super().to_dict(origin_vehicle, observe_intentions) | {"x": 1.0}
+
+
+@pytest.mark.parametrize("change", ["nothing", "whole", "presence", "class", "method", "unknown", "no goal"])
+def test_a_goal_is_shown_without_data_frames_where_it_is_known(change, monkeypatch):
+    env = gymnasium.make("parking-v0", disable_env_checker=True).unwrapped
+    env.reset(seed=3)
+    seen = env.observation_type
+    if change == "whole":
+        env.vehicle.heading = 2
+    elif change == "presence":
+        seen.features, seen.scales = ["presence", "y", "y"], np.array([2, 3, 4])
+    elif change == "class":
+        env.vehicle.goal.__class__ = Elsewhere
+    elif change == "method":
+        env.vehicle.to_dict = lambda *given: dict.fromkeys(seen.features, 7.0)
+    elif change == "unknown":
+        seen.features = [*seen.features[:-1], "long_off"]
+    elif change == "no goal":
+        del env.vehicle.goal
+
+    def shown():
+        try:
+            found = seen.observe()
+        except Exception as error:
+            return repr(error)
+        assert found["observation"] is not found["achieved_goal"]
+        return type(found), plain(found), [array.dtype for array in found.values()]
+
+    slow = shown()
+    assert switch_on() == ""
+    frames = []
+    build = observation.pd.DataFrame.from_records
+    monkeypatch.setattr(observation.pd.DataFrame, "from_records", lambda rows: frames.append(1) or build(rows))
+    assert shown() == slow
+    assert bool(frames) == (change in ("class", "method", "unknown", "no goal"))
 
 
 def test_a_method_of_one_vehicle_is_called():

@@ -128,7 +128,7 @@ class _Decisions:
     def _neighbours(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[RoadObject | None, RoadObject | None]:
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
-            found = originals["neighbour_vehicles"](self.road, vehicle, key)
+            found = originals["Road.neighbour_vehicles"](self.road, vehicle, key)
         return found
 
     def _follow_road(self, row: int, vehicle: Vehicle) -> None:

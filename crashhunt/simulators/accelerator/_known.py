@@ -58,7 +58,7 @@ _ORIGINALS = {
 _OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
 
 originals: dict[str, Callable[..., Any]] = {}
-"""The methods of highway-env that are replaced, by name, as they were; nothing before the first time."""
+"""The methods of highway-env that are replaced, by class and name, as they were; nothing before the first time."""
 
 
 class Own:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,10 +11,15 @@ from highway_env import utils
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane
 from highway_env.vehicle.kinematics import Vehicle
 
+from crashhunt.simulators.accelerator._frame import are_plain
 from crashhunt.simulators.accelerator._known import are_numbers, kind_of
 
 if TYPE_CHECKING:
-    from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
+    from highway_env.envs.common.observation import (
+        KinematicObservation,
+        KinematicsGoalObservation,
+        OccupancyGridObservation,
+    )
     from highway_env.road.road import Road
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
@@ -21,7 +27,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators.accelerator._frame import Frame
     from crashhunt.simulators.accelerator._network import Network
 
-__all__ = ["close_objects", "fill_lanes", "observe"]
+__all__ = ["close_objects", "fill_lanes", "observe", "observe_goal"]
 
 _KNOWN = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
 _OF_OBJECTS = _KNOWN - {"heading"}
@@ -94,6 +100,20 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
     if kinematic.order == "shuffled":
         env.np_random.shuffle(shown[1:])
     return shown.astype(np.float32)
+
+
+def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:
+    """`KinematicsGoalObservation.observe`; None where that must be asked."""
+    vehicle, features = kinematic.observer_vehicle, kinematic.features
+    goal = getattr(vehicle, "goal", None)
+    if vehicle is None or goal is None or type(features) is not list or not _KNOWN.issuperset(features):
+        return None
+    things = [vehicle, goal]
+    if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
+        return None
+    here, there = (np.array([values[name] for name in features]) for values in (_values(vehicle), _values(goal)))
+    scales = kinematic.scales
+    return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
 
 
 def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> None:

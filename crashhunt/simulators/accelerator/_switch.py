@@ -9,7 +9,11 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Any
 
-from highway_env.envs.common.observation import KinematicObservation, OccupancyGridObservation
+from highway_env.envs.common.observation import (
+    KinematicObservation,
+    KinematicsGoalObservation,
+    OccupancyGridObservation,
+)
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
@@ -18,7 +22,7 @@ from crashhunt.simulators.accelerator._frame import Frame
 from crashhunt.simulators.accelerator._known import Own, left_alone, originals, reason_against
 from crashhunt.simulators.accelerator._move import collide, enforce, move
 from crashhunt.simulators.accelerator._network import Network
-from crashhunt.simulators.accelerator._observe import close_objects, fill_lanes, observe
+from crashhunt.simulators.accelerator._observe import close_objects, fill_lanes, observe, observe_goal
 from crashhunt.simulators.accelerator._watch import Watch, is_plain
 
 if TYPE_CHECKING:
@@ -45,10 +49,10 @@ def switch_on() -> str:
     reason = reason_against()
     if not reason:
         for owner, name, faster in _REPLACED:
-            originals[name] = getattr(owner, name)
+            originals[_name(owner, name)] = getattr(owner, name)
             setattr(owner, name, faster)
         # Whoever replaces one of ours has it called; but vehicles that decide together ask nobody for neighbours.
-        ours = {f"{owner.__qualname__}.{name}" for owner, name, _ in _REPLACED}
+        ours = {_name(owner, name) for owner, name, _ in _REPLACED}
         _state["roads"] = Watch.of_roads(ours - {"Road.neighbour_vehicles"})
         _state["observations"] = Watch.of_observations(ours)
     return reason
@@ -60,7 +64,11 @@ def switch_off() -> None:
     _state.clear()
     for owner, name, faster in _REPLACED:
         if vars(owner).get(name) is faster:
-            setattr(owner, name, originals[name])
+            setattr(owner, name, originals[_name(owner, name)])
+
+
+def _name(owner: type, name: str) -> str:
+    return f"{owner.__qualname__}.{name}"
 
 
 def is_on() -> bool:
@@ -141,12 +149,12 @@ def _frame_of(road: Road) -> Frame | None:
 def _act(self: Road) -> None:
     frame = _frame_of(self) if len(self.vehicles) > 1 else None
     if frame is None or not decide(self, frame):
-        originals["act"](self)
+        originals["Road.act"](self)
 
 
 def _step(self: Road, dt: float) -> None:
     if len(self.vehicles) + len(self.objects) < 2 or not _is_known(self):
-        originals["step"](self, dt)
+        originals["Road.step"](self, dt)
         return
     found = _prepared(self)
     frame = move(self, found.network, dt) if found is not None else None
@@ -166,7 +174,7 @@ def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | No
         found = frame.neighbours(vehicle, row, key)
         if found is not None:
             return found
-    return originals["neighbour_vehicles"](self, vehicle, lane_index)
+    return originals["Road.neighbour_vehicles"](self, vehicle, lane_index)
 
 
 def _close_objects_to(
@@ -185,12 +193,12 @@ def _close_objects_to(
         )
         if found is not None:
             return found
-    return originals["close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
+    return originals["Road.close_objects_to"](self, vehicle, distance, count, see_behind, sort, vehicles_only)
 
 
 def _enforce_road_rules(self: RegulatedRoad) -> None:
     if _prepared(self) is None or not enforce(self):
-        originals["enforce_road_rules"](self)
+        originals["RegulatedRoad.enforce_road_rules"](self)
 
 
 def _observe(self: KinematicObservation) -> object:
@@ -198,7 +206,12 @@ def _observe(self: KinematicObservation) -> object:
         found = observe(self, _frame_of(self.env.road))
         if found is not None:
             return found
-    return originals["observe"](self)
+    return originals["KinematicObservation.observe"](self)
+
+
+def _observe_goal(self: KinematicsGoalObservation) -> object:
+    found = observe_goal(self) if _is_plain(self, KinematicsGoalObservation) else None
+    return found if found is not None else originals["KinematicsGoalObservation.observe"](self)
 
 
 def _fill_road_layer_by_lanes(
@@ -208,7 +221,7 @@ def _fill_road_layer_by_lanes(
     if network is not None:
         fill_lanes(self, network, layer_index, lane_perception_distance)
     else:
-        originals["fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
+        originals["OccupancyGridObservation.fill_road_layer_by_lanes"](self, layer_index, lane_perception_distance)
 
 
 def _is_plain(observation: KinematicObservation | OccupancyGridObservation, kind: Any) -> bool:
@@ -226,7 +239,8 @@ def _methods(kind: type) -> frozenset[str]:
     return frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name)))
 
 
-_SHOWN = {kind: _methods(kind) for kind in (KinematicObservation, OccupancyGridObservation)}
+_OBSERVATIONS = (KinematicObservation, KinematicsGoalObservation, OccupancyGridObservation)
+_SHOWN = {kind: _methods(kind) for kind in _OBSERVATIONS}
 _ROAD_METHODS = _methods(RegulatedRoad) - _CALLED
 _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (Road, "act", _act),
@@ -235,5 +249,6 @@ _REPLACED: tuple[tuple[type, str, Callable[..., object]], ...] = (
     (Road, "close_objects_to", _close_objects_to),
     (RegulatedRoad, "enforce_road_rules", _enforce_road_rules),
     (KinematicObservation, "observe", _observe),
+    (KinematicsGoalObservation, "observe", _observe_goal),
     (OccupancyGridObservation, "fill_road_layer_by_lanes", _fill_road_layer_by_lanes),
 )
