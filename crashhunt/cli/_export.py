@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import add_crash, add_json, say
+from crashhunt.base.errors import UsageError
+from crashhunt.cli._common import add_crash, add_json, opened_crash, say
 from crashhunt.cli._progress import shown_progress
 
 if TYPE_CHECKING:
@@ -16,22 +17,39 @@ if TYPE_CHECKING:
 
 __all__ = ["add_export"]
 
+_FORMATS = ("commonroad",)
+
 
 def add_export(commands: Commands) -> None:
     """Add the command."""
     export = commands.add_parser(
         "export",
-        help="write a crash into one file, for another machine",
+        help="write a crash into one file, for another machine or another tool",
         description="Write a crash with its snapshot into one zip file. crashhunt replay, show and report take the "
-        "file wherever they take a DIR.",
+        "file wherever they take a DIR. With --as, write what was recorded as a scenario that tools of others run.",
     )
     add_crash(export)
-    export.add_argument("file", metavar="FILE", type=Path, help="the zip file to write")
+    export.add_argument("file", metavar="FILE", type=Path, help="the file to write: zip, or as --as says")
+    export.add_argument(
+        "--as",
+        dest="form",
+        choices=_FORMATS,
+        help="commonroad: a CommonRoad scenario (2020a, XML): the others as they drove, the agent as planning problem",
+    )
+    export.add_argument(
+        "--recorded-agent",
+        action="store_true",
+        help="with --as: the way that the agent drove is there as an obstacle, too",
+    )
     add_json(export)
     export.set_defaults(command=_export)
 
 
 def _export(options: argparse.Namespace, _words: list[str]) -> int:
+    if options.form:
+        return _hand_on(options)
+    if options.recorded_agent:
+        raise UsageError("--recorded-agent is for another format", fix=f"add --as {_FORMATS[0]}")
     from crashhunt.crashes import export_crash, find_bundle
 
     bundle = find_bundle(options.directory, options.crash)
@@ -40,4 +58,22 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB)", as_json=options.json)
     if options.json:
         print(json.dumps({"crash": bundle.id, "file": str(options.file), "bytes": size}))
+    return 0
+
+
+def _hand_on(options: argparse.Namespace) -> int:
+    from crashhunt.formats import write_commonroad
+
+    if options.file.suffix.lower() == ".zip":
+        raise UsageError(f"{options.file}: --as {options.form} writes XML", fix="call it FILE.xml, or leave --as away")
+    with opened_crash(options.directory, options.crash) as (bundle, _):
+        numbers = write_commonroad(bundle, options.file, with_agents=options.recorded_agent)
+    size = options.file.stat().st_size
+    say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB), for {options.form}", as_json=options.json)
+    if options.json:
+        print(
+            json.dumps(
+                {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": numbers}
+            )
+        )
     return 0

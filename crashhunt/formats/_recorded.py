@@ -1,0 +1,208 @@
+"""What of a crash is handed on: who drove where, on which lanes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError
+from crashhunt.recording import read_lanes
+from crashhunt.world import paths_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.world import Path
+
+__all__ = ["Pose", "Recorded", "Road", "Way", "recorded_of"]
+
+_SAME_PLACE_M = 1e-3  # a lane goes on where another begins: maps give such points to the centimetre, or better
+_SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only crosses there is another's
+
+
+class Pose(NamedTuple):
+    """Where the middle of an actor is after a step.
+
+    Args:
+        step: 0 is before the first.
+        x: in m.
+        y: likewise.
+        z: likewise; 0 where the map is flat.
+        heading: in rad, from -pi to pi, counter-clockwise from the x axis.
+        speed: in m/s.
+    """
+
+    step: int
+    x: float
+    y: float
+    z: float
+    heading: float
+    speed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The way of an actor while it was in sight; of one who came back, there are several.
+
+    Args:
+        path: as it was recorded.
+        name: unique in the file, of letters, digits, points, dashes and underscores.
+    """
+
+    path: Path
+    name: str
+
+    @property
+    def poses(self) -> list[Pose]:
+        """Its middle, after each step: it was recorded by the middle of its front bumper."""
+        half = self.path.actor.length / 2
+        return [
+            Pose(
+                step,
+                state.x - half * math.cos(state.heading),
+                state.y - half * math.sin(state.heading),
+                state.z - half * state.grade,
+                math.remainder(state.heading, math.tau) if abs(state.heading) > math.pi else state.heading,
+                state.speed,
+            )
+            for step, state in enumerate(self.path.states, self.path.first)
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """A lane, with the lanes that it leads to.
+
+    Args:
+        right: its right border, shape (n, 2), in m.
+        left: its left one, with as many points.
+        after: which ones begin where it ends, by their number: told from the shapes, since no recording says.
+        before: which ones end where it begins.
+    """
+
+    right: NDArray[np.float64]
+    left: NDArray[np.float64]
+    after: tuple[int, ...]
+    before: tuple[int, ...]
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Its centre line, shape (n, 2), in m."""
+        return (self.right + self.left) / 2
+
+    @property
+    def width(self) -> float:
+        """In m, where it begins."""
+        return float(np.hypot(*(self.left[0] - self.right[0])))
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A crash as it is handed on.
+
+    Args:
+        title: what it is, in one line.
+        number: of its trial.
+        step_length_s: in s.
+        steps: how many were recorded.
+        agents: the ways of the controlled vehicles.
+        others: those of everybody else.
+        roads: the lanes that an agent came near.
+    """
+
+    title: str
+    number: int
+    step_length_s: float
+    steps: int
+    agents: tuple[Way, ...]
+    others: tuple[Way, ...]
+    roads: tuple[Road, ...]
+
+
+def recorded_of(bundle: Bundle) -> Recorded:
+    """Return what of a crash can be handed on.
+
+    Raises:
+        BundleError: nothing: it has no scenes, its agent is in none, or no map was recorded; or its log is damaged.
+    """
+    recording = bundle.recording()
+    paths = paths_of(recording.scenes(), recording.agents)
+    lanes = read_lanes(bundle.path / layout.LOG)
+    if not paths.agents:
+        raise BundleError(
+            f"{bundle.id} has no scene with its agent, so there is nothing to hand on",
+            fix="export it without --as; of a Gymnasium environment no vehicles are recorded",
+        )
+    if not lanes:
+        raise BundleError(
+            f"{bundle.id} has no map of lanes, so there is no road to hand on",
+            fix="export it without --as, or hunt with a simulator that has lanes",
+        )
+    for path in (*paths.agents, *paths.others):
+        for step, state in enumerate(path.states, path.first):
+            if not all(map(math.isfinite, state)):
+                raise BundleError(
+                    f"{bundle.id}: {path.actor.id!r} is nowhere after step {step}: {tuple(state)}",
+                    fix="export it without --as: no other format can say that",
+                )
+    names = _names([*paths.agents, *paths.others])
+    ways = [Way(path, name) for path, name in zip((*paths.agents, *paths.others), names, strict=True)]
+    spec, count = bundle.result.spec, len(paths.agents)
+    return Recorded(
+        f"{bundle.id}, trial {spec.number} with seed {spec.seed}: {bundle.result.outcome}",
+        spec.number,
+        recording.prologue.step_length_s,
+        paths.steps,
+        tuple(ways[:count]),
+        tuple(ways[count:]),
+        _roads(lanes),
+    )
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return a name for each that every format takes: some give ``$`` and blanks a meaning."""
+    names: dict[str, None] = {}
+    for path in paths:
+        name = plain = "".join(c if c.isascii() and (c.isalnum() or c in ".-_") else "_" for c in path.actor.id) or "_"
+        again = 1
+        while name in names:
+            again += 1
+            name = f"{plain}__{again}"
+        names[name] = None
+    return list(names)
+
+
+def _roads(lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> tuple[Road, ...]:
+    borders = [pair for pair in map(_without_doubles, lanes) if len(pair[0]) > 1]
+    lines = [(right + left) / 2 for right, left in borders]
+    starts = np.array([line[0] for line in lines]).reshape(-1, 2)
+    into = [_direction(line[0], line[1]) for line in lines]
+    after: list[tuple[int, ...]] = []
+    for line in lines:
+        near = np.flatnonzero(np.hypot(*(starts - line[-1]).T) <= _SAME_PLACE_M)
+        out_of = _direction(line[-2], line[-1])
+        straight = (abs(math.remainder(into[other] - out_of, math.tau)) <= _SAME_WAY_RAD for other in near)
+        after.append(tuple(int(other) for other, goes_on in zip(near, straight, strict=True) if goes_on))
+    before = [tuple(one for one, found in enumerate(after) if number in found) for number in range(len(lines))]
+    return tuple(Road(*pair, *ends) for pair, *ends in zip(borders, after, before, strict=True))
+
+
+def _without_doubles(
+    lane: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the borders without points that are where the one before was: they have no direction."""
+    right, left = lane
+    centre = (right + left) / 2
+    kept = np.append(True, np.hypot(*np.diff(centre, axis=0).T) > _SAME_PLACE_M)
+    return right[kept], left[kept]
+
+
+def _direction(begin: NDArray[np.float64], end: NDArray[np.float64]) -> float:
+    return math.atan2(end[1] - begin[1], end[0] - begin[0])
