@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_completion", "complete"]
 
+_OPTUNA = ("tpe", "cma-es", "gp", "nsgaii", "nsgaiii", "qmc", "random")  # to ask it itself takes most of a second
 _HOW = """\
 put one of these lines where your shell starts:
   ~/.bashrc                      eval "$(crashhunt completion bash)"
@@ -64,7 +65,7 @@ def _attach(parser: argparse.ArgumentParser) -> None:
     known: dict[str, Completer] = {
         "--scenario": lambda prefix, **_: [*_scenarios(), *_paths(*_endings())(prefix)],
         "--agent": lambda **_: _registered("agents"),
-        "--sampler": lambda **_: _registered("samplers"),
+        "--sampler": lambda **_: [*_registered("samplers"), *(f"optuna:{name}" for name in _OPTUNA)],
         "--executor": lambda **_: _registered("executors"),
         "--disturb": _several(lambda **_: [f"{name}=" for name in _registered("disturbances")]),
         "--crash-on": _several(lambda **_: _outcomes(crashes=True)),

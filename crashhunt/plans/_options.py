@@ -101,7 +101,8 @@ class TrialOptions(_Options):
 
     sampler: str = option(
         "random", "its name",
-        help="random, halton, sobol, grid or sweep; or one that learns: guided, cross-entropy, mutation, cma-es",
+        help="random, halton, sobol, grid or sweep; or one that learns: guided, cross-entropy, mutation, cma-es, "
+        "optuna:NAME, as in optuna:tpe",
         flag="--sampler", metavar="NAME",
     )  # fmt: skip
     points: int = option(

@@ -30,6 +30,8 @@ class Cube:
         self._fixed = {key: known.quantile(0.5) for key, known in self._space.items() if key not in self._axes}
         self.categorical = np.array([isinstance(known, Choice) for known in self._axes.values()], dtype=bool)
         """Of which dimensions the values have no order."""
+        self.options = tuple(len(known.options) if isinstance(known, Choice) else 0 for known in self._axes.values())
+        """Of how many values a dimension is a choice; 0 of those that have an order."""
 
     @property
     def dimensions(self) -> int:

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from crashhunt.samplers._strategy import Strategy
     from crashhunt.trial import TrialResult
 
-__all__ = ["CmaEsSampler", "CrossEntropySampler", "GuidedSampler", "MutationSampler"]
+__all__ = ["CmaEsSampler", "CrossEntropySampler", "GuidedSampler", "Learning", "MutationSampler"]
 
 _PLAIN_EVERY = 5  # trials, of which the first is a plain random one
 _PLAIN, _START = "random", "start"
 
 
-class _Learning:
+class Learning:
     """What all of them are: every fifth trial is random, the others are a strategy's.
 
     Args:
@@ -68,7 +68,7 @@ class _Learning:
             self._strategy.tell(told)
 
 
-class CrossEntropySampler(_Learning):
+class CrossEntropySampler(Learning):
     """Draws from what is fitted to the most dangerous trials (`CrossEntropy`)."""
 
     origin = "cross-entropy"
@@ -77,7 +77,7 @@ class CrossEntropySampler(_Learning):
         return CrossEntropy(self._cube)
 
 
-class MutationSampler(_Learning):
+class MutationSampler(Learning):
     """Changes the most dangerous trials, with the same traffic or with other (`Mutation`)."""
 
     origin = "mutation"
@@ -86,7 +86,7 @@ class MutationSampler(_Learning):
         return Mutation(self._cube)
 
 
-class CmaEsSampler(_Learning):
+class CmaEsSampler(Learning):
     """Follows danger uphill by CMA-ES, which needs two arguments or more that vary (`CmaEs`)."""
 
     origin = "cma-es"
@@ -95,7 +95,7 @@ class CmaEsSampler(_Learning):
         return CmaEs(self._cube)
 
 
-class GuidedSampler(_Learning):
+class GuidedSampler(Learning):
     """Gives each strategy what it has earned (`Portfolio`)."""
 
     origin = "guided"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError
@@ -26,7 +26,7 @@ class NamedSampler:
     """A sampler by its name, of which everything that it answers is checked.
 
     Args:
-        name: a registered name, or ``module:attribute``.
+        name: a registered name, ``optuna:NAME``, or ``module:attribute``.
         space: what to sample.
         points: how many values to try of a range without a step.
         hunt: what one that wants it may know of the hunt.
@@ -39,7 +39,7 @@ class NamedSampler:
     def __init__(self, name: str, space: Space, *, points: int, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
         self._name = name
         self._keys = space.keys()
-        make = locate("samplers", name)
+        make = _maker(name)
         more = {"hunt": hunt} if isinstance(make, WantsHunt) and make.wants_hunt else {}
         try:
             self._sampler: Sampler = make(space, points=points, **more)
@@ -133,5 +133,13 @@ def varies_only_asked(name: str) -> bool:
     Raises:
         PluginError: there is no such sampler.
     """
-    kind = locate("samplers", name)
+    kind = _maker(name)
     return isinstance(kind, OnlyAsked) and kind.only_asked
+
+
+def _maker(name: str) -> Any:
+    if not name.lower().startswith("optuna:"):
+        return locate("samplers", name)
+    from crashhunt.samplers._optuna import optuna_maker  # Optuna is imported by nobody else
+
+    return optuna_maker(name)

@@ -24,6 +24,7 @@ from crashhunt.samplers import (
     GuidedSampler,
     HaltonSampler,
     MutationSampler,
+    NamedSampler,
     RandomSampler,
     SobolSampler,
     SweepSampler,
@@ -139,6 +140,21 @@ class TestSamplersThatLearn(SamplerContract):
         if kind is CmaEsSampler:
             pytest.importorskip("cmaes")
         return kind
+
+    @pytest.fixture
+    def space(self):
+        return SPACE
+
+
+OPTUNA = ["cma-es", "nsgaii", "nsgaiii", "qmc", "random"]  # by day, its own tests are enough
+
+
+@pytest.mark.parametrize("name", ["tpe", *(pytest.param(name, marks=pytest.mark.nightly) for name in OPTUNA)])
+class TestOptunaSamplers(SamplerContract):
+    @pytest.fixture
+    def make(self, name):
+        pytest.importorskip("optuna")
+        return lambda space: NamedSampler(f"optuna:{name}", space, points=3)
 
     @pytest.fixture
     def space(self):

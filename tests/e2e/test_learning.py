@@ -51,12 +51,13 @@ def trials(hunt):
     return {}
 
 
-def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own):
-    words = (*HUNT, "--sampler", "climber:Climber", "--deterministic")
+@pytest.mark.parametrize("sampler", ["climber:Climber", pytest.param("optuna:tpe", marks=pytest.mark.nightly)])
+def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own, sampler):
+    words = (*HUNT, "--sampler", sampler, "--deterministic")
     own.crashhunt("run", "whole", *words)
     whole = trials(own.folder / "whole")
     assert sorted(whole) == list(range(60))
-    assert sum("parent" in spec for spec, _ in whole.values()) > 5
+    assert sum("parent" in spec or spec["origin"] == "optuna" for spec, _ in whole.values()) > 5
     chance = random.Random(5)
     for ends in (chance.randrange(2, 30), chance.randrange(30, 50)):
         process = own.start("run", "killed", *words, "--set", "step_wall_s=0.002")

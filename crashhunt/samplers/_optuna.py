@@ -1,0 +1,194 @@
+"""Samplers of Optuna (Akiba et al. 2019) by their names: ``optuna:TPESampler``, or ``optuna:tpe``."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from crashhunt.base.errors import PluginError, UsageError
+from crashhunt.base.names import one_of
+from crashhunt.samplers._learning import Learning
+from crashhunt.samplers._protocol import HuntFacts
+from crashhunt.samplers._strategy import Draft
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from crashhunt.samplers._protocol import Space
+    from crashhunt.samplers._strategy import Strategy
+    from crashhunt.samplers._told import Told
+
+__all__ = ["ORIGIN", "PREFIX", "OptunaMaker", "optuna_maker"]
+
+PREFIX = "optuna:"
+ORIGIN = "optuna"
+_LONGEST = 2**29  # points of a sequence that are surely there
+_INSTEAD = {
+    "bruteforce": "--sampler grid tries every combination",
+    "grid": "--sampler grid tries every combination",
+    "partialfixed": "--arg NAME=VALUE fixes an argument, whoever searches",
+}
+"""What of Optuna there is no use for here, and what to do instead."""
+_NEEDS = {
+    "cmaes": ("cmaes", "pip install 'crashhunt[search]'"),
+    "gp": ("torch", "pip install 'crashhunt[torch]'"),
+}
+"""Packages that Optuna itself does not bring."""
+
+
+@dataclass(frozen=True, slots=True)
+class OptunaMaker:
+    """Makes samplers of one kind.
+
+    Args:
+        kind: the class in ``optuna.samplers``.
+    """
+
+    kind: str
+    only_asked: ClassVar[bool] = False
+    wants_hunt: ClassVar[bool] = True
+
+    def __call__(self, space: Space, *, points: int = 10, hunt: HuntFacts = HuntFacts()) -> Learning:  # noqa: B008
+        """Return a sampler of a space, beside a stream of plain random trials."""
+        return _OptunaSampler(space, self.kind, points=points, hunt=hunt)
+
+
+def optuna_maker(name: str) -> OptunaMaker:
+    """Return what makes the sampler with a name, such as ``optuna:TPESampler`` or ``optuna:tpe``.
+
+    Raises:
+        UsageError: Optuna is not installed, or the sampler is not for hunts, or needs a package more.
+        PluginError: Optuna has no such sampler.
+    """
+    asked = name[len(PREFIX) :]
+    try:
+        samplers = importlib.import_module("optuna.samplers")
+    except ImportError:
+        raise UsageError(
+            f"the sampler {name!r} needs the package optuna", fix="pip install 'crashhunt[search]'"
+        ) from None
+    kinds = {
+        _short(kind): kind
+        for kind in samplers.__all__
+        if kind.endswith("Sampler") and not kind.startswith("Base")
+    }  # fmt: skip
+    short = _short(asked)
+    if short in _INSTEAD:
+        raise UsageError(f"the sampler {name!r} is not for hunts", fix=_INSTEAD[short])
+    if short not in kinds:
+        known = [kind for key, kind in kinds.items() if key not in _INSTEAD]
+        raise PluginError(f"Optuna has no sampler {asked!r}", fix=one_of(asked, known))
+    package, fix = _NEEDS.get(short, ("optuna", ""))
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        raise UsageError(f"the sampler {name!r} needs the package {package}", fix=fix) from None
+    return OptunaMaker(kinds[short])
+
+
+def _short(name: str) -> str:
+    """``tpe`` for TPESampler, tpe-sampler and TPE."""
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    return plain.removesuffix("sampler")
+
+
+class _OptunaSampler(Learning):
+    """Asks a study of Optuna."""
+
+    origin = ORIGIN
+
+    def __init__(self, space: Space, kind: str, *, points: int, hunt: HuntFacts) -> None:
+        self._kind = kind
+        super().__init__(space, points=points, hunt=hunt)
+
+    def _make(self, space: Space) -> Strategy:
+        return _Study(self._kind, self._cube.options, self._hunt.seed)
+
+
+class _Study:
+    """A study that maximizes danger: a number from 0 to 1 for each argument, a category for each that is a choice.
+
+    What it proposes follows from what it was told, as crashhunt's samplers promise, so that a hunt goes on exactly:
+    for every trial that is asked for or told there is a new sampler, seeded by that trial, on the same study, and what
+    is asked for leaves no trace in that (`Storage`). A trial is asked of Optuna in the moment when it is told.
+
+    Args:
+        kind: the class in ``optuna.samplers``.
+        options: how many values each argument has that is a choice; 0 for those that are none.
+        seed: of the hunt.
+    """
+
+    def __init__(self, kind: str, options: tuple[int, ...], seed: int) -> None:
+        import optuna
+
+        from crashhunt.samplers._optuna_storage import Storage
+
+        self._optuna = optuna
+        self._make: Any = getattr(optuna.samplers, kind)
+        self._kind = kind
+        self._seed = seed % 2**32
+        self._options = options
+        self._distributions: dict[str, Any] = {
+            f"x{index}": optuna.distributions.CategoricalDistribution(range(count))
+            if count
+            else optuna.distributions.FloatDistribution(0.0, 1.0)
+            for index, count in enumerate(options)
+        }
+        self._storage = Storage()
+        self._study: Any = None
+        with self._seeded(self._seed):
+            self._study = optuna.create_study(storage=self._storage, direction="maximize")
+        if self._kind == "QMCSampler":  # learns nothing, but wants to have seen the arguments, and counts its draws
+            self._add([0.5] * len(options), 0.0, 0)
+            with self._seeded(self._seed):
+                _ = self._study.ask().relative_params
+
+    def tell(self, told: Told) -> None:
+        """Tell the study; a generation of CMA-ES is of its own draws alone."""
+        if self._kind == "QMCSampler" or (self._kind == "CmaEsSampler" and told.origin != ORIGIN):
+            return
+        self._add(told.point.tolist(), told.score, told.number)
+
+    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+        """Return what the study suggests."""
+        seed = int(rng.integers(2**31))
+        if self._kind == "QMCSampler":
+            seed = self._seed
+            self._storage.count_from(number % _LONGEST)
+        with self._seeded(seed), self._storage.asking():
+            params = self._study.ask(self._distributions).params
+        shares = [
+            (params[name] + 0.5) / count if count else params[name]
+            for name, count in zip(self._distributions, self._options, strict=True)
+        ]
+        return Draft(np.array(shares, dtype=np.float64))
+
+    def _add(self, point: list[float], score: float, number: int) -> None:
+        shares = zip(self._distributions, point, self._options, strict=True)
+        params = {name: min(int(share * count), count - 1) if count else share for name, share, count in shares}
+        with self._seeded(number):
+            self._study.enqueue_trial(params)
+            trial = self._study.ask(self._distributions)
+            _ = trial.relative_params  # notes in which generation it is, and the like
+            self._study.tell(trial, score)
+
+    @contextmanager
+    def _seeded(self, seed: int) -> Iterator[None]:
+        """Have a new sampler with a seed, and say nothing of what is experimental or logged."""
+        logging, known = self._optuna.logging, self._optuna.logging.get_verbosity()
+        logging.set_verbosity(logging.ERROR)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                more = {"scramble": True} if self._kind == "QMCSampler" else {}
+                if self._study is not None:
+                    self._study.sampler = self._make(seed=seed, **more)
+                yield
+        finally:
+            logging.set_verbosity(known)
