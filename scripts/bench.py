@@ -916,6 +916,10 @@ def main() -> int:
     if sys.argv[1:2] == ["--child"]:
         print(json.dumps(globals()[sys.argv[2]](*sys.argv[3:])))
         return 0
+    if sys.argv[1:2] == ["search"] and any(word.startswith("-") and word != "--json" for word in sys.argv[2:]):
+        from search import main as search  # --quick and the like are its own
+
+        return search(sys.argv[2:])
     parser = argparse.ArgumentParser("scripts/bench", description="Measure what crashhunt promises.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(BENCHES)}; default: all")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -1,7 +1,8 @@
 """Samplers of others, and a plain mutation, in the form of ours, to be measured beside them.
 
-Optuna and VerifAI are installed by whoever measures: ``pip install optuna verifai``, best into an environment of its
-own, as VerifAI brings Scenic, and an attrs of 2022.
+Optuna as its own documentation drives it; ``--sampler optuna:NAME`` gives it a random trial in five besides. VerifAI is
+installed by whoever measures: ``pip install verifai``, best into an environment of its own, as it brings Scenic, and an
+attrs of 2022.
 """
 
 from __future__ import annotations

@@ -262,9 +262,9 @@ def stored(path: Path) -> dict[tuple[str, str, int], Run]:
     return runs
 
 
-def main() -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser("scripts/search.py", description=__doc__)
+    parser = argparse.ArgumentParser("scripts/search", description=__doc__)
     parser.add_argument("--samplers", default=",".join((*OURS, *PEERS)))
     parser.add_argument("--problems", default=",".join(PROBLEMS), help="some of these, and of " + ", ".join(REAL))
     parser.add_argument("--repetitions", type=int, default=30)
@@ -272,7 +272,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     if options.quick:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
     seeds = range(FIRST_SEED, FIRST_SEED + options.repetitions)
