@@ -16,6 +16,7 @@ from highway_env.utils import not_zero
 from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
+from crashhunt.simulators.accelerator._frame import MANY
 from crashhunt.simulators.accelerator._known import are_numbers, kinds_of, originals
 from crashhunt.simulators.accelerator._network import wrap_to_pi
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from highway_env.road.road import LaneIndex, Road
     from highway_env.vehicle.behavior import IDMVehicle
     from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
 
     from crashhunt.simulators.accelerator._frame import Frame
 
@@ -82,7 +84,7 @@ class _Decisions:
 
     def take(self) -> None:
         """Choose lanes one after another, then steer and accelerate."""
-        steering: list[tuple[int, ControlledVehicle]] = []
+        steering: list[tuple[int, int | None]] = []  # row, lane
         following: list[tuple[int, IDMVehicle, Vehicle]] = []  # row, who follows, whom
         changing: list[int] = []  # which of these follow somebody on another lane as well
         index = self.network.index
@@ -92,7 +94,9 @@ class _Decisions:
                 continue
             self._follow_road(row, vehicle)
             if drives == "idm":
-                if vehicle.enable_lane_change:
+                if vehicle.enable_lane_change and (
+                    vehicle.lane_index != vehicle.target_lane_index or vehicle.timer > vehicle.LANE_CHANGE_DELAY
+                ):
                     self._change_lane(row, vehicle)
                 lane, target = vehicle.lane_index, vehicle.target_lane_index
                 following.append((row, vehicle, self._neighbours(row, vehicle, lane)[0]))
@@ -118,13 +122,6 @@ class _Decisions:
                 action["acceleration"] = vehicle.KP_A * (vehicle.target_speed - vehicle.speed)
             vehicle.action = action
 
-    def _coordinates(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[float, float]:
-        lane = self.network.index.get(key)
-        if lane is None:  # such as a key without a number
-            s, r = self.road.network.get_lane(key).local_coordinates(vehicle.position)
-            return float(s), float(r)
-        return self.frame.coordinates(row, lane)
-
     def _neighbours(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[RoadObject | None, RoadObject | None]:
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
@@ -133,12 +130,17 @@ class _Decisions:
 
     def _follow_road(self, row: int, vehicle: Vehicle) -> None:
         key = vehicle.target_lane_index
-        s, _ = self._coordinates(row, vehicle, key)
-        if s > self.road.network.get_lane(key).length - 5 / 2:
+        lane = self.network.index.get(key)
+        if lane is None:  # such as a key without a number
+            found = self.road.network.get_lane(key)
+            s, length = float(found.local_coordinates(vehicle.position)[0]), found.length
+        else:
+            s, length = self.frame.coordinates(row, lane)[0], self.network.lengths[lane]
+        if s > length - 5 / 2:
             vehicle.follow_road()
 
     def _change_lane(self, row: int, vehicle: Vehicle) -> None:
-        """`IDMVehicle.change_lane_policy`."""
+        """`IDMVehicle.change_lane_policy`, where it is time to think of that."""
         lane, target = vehicle.lane_index, vehicle.target_lane_index
         if lane != target:
             if lane[:2] == target[:2]:
@@ -153,8 +155,6 @@ class _Decisions:
                         if 0 < distance < self._desired_gap(row, vehicle, vehicle, other):
                             vehicle.target_lane_index = lane
                             break
-            return
-        if not vehicle.timer > vehicle.LANE_CHANGE_DELAY:
             return
         vehicle.timer = 0
         for key in self.road.network.side_lanes(lane):
@@ -235,19 +235,34 @@ class _Decisions:
             closing = np.vecdot(self.velocities[own] - self.velocities[others], self.directions[own])
             limit = -comfort * braking[some]
             gap = distance_wanted[some] + speed * time_wanted[some] + speed * closing / (2 * np.sqrt(limit))
-            distance = np.array(
-                [not_zero(self._lane_distance(following[n][0], following[n][1], following[n][2])) for n in behind]
-            )
+            distance = self._lane_distances([following[number] for number in behind], own, others)
             wanted[some] -= comfort * np.power(gap / distance, 2)
         found: list[float] = wanted.tolist()
         return found
 
-    def _steer(self, steering: list[tuple[int, ControlledVehicle]]) -> list[float]:
-        """`ControlledVehicle.steering_control` of many."""
-        vehicles = self.road.vehicles
+    def _lane_distances(
+        self, pairs: list[tuple[int, IDMVehicle, Vehicle]], own: NDArray[np.intp], others: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        """`RoadObject.lane_distance_to` of many pairs, of which none is zero."""
+        if len(pairs) < MANY:
+            return np.array([not_zero(self._lane_distance(*pair)) for pair in pairs])
+        number_of, column_of = self.network.number, self.network.axis_column
+        columns = [column_of.get(number_of.get(id(vehicle.lane), -1), -1) for _, vehicle, _ in pairs]
+        if -1 in columns:
+            return np.array([not_zero(self._lane_distance(*pair)) for pair in pairs])
+        along = self.frame.on_axis[0]
+        distance: NDArray[np.float64] = along[others, columns] - along[own, columns]
+        return np.where(np.abs(distance) > 1e-2, distance, np.where(distance >= 0, 1e-2, -1e-2))
+
+    def _places(
+        self, steering: list[tuple[int, int | None]], speed: NDArray[np.float64], pursuit: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How far to the side of their lanes vehicles are, and how these run where they look at."""
+        vehicles, column_of = self.road.vehicles, self.network.axis_column
+        columns = [column_of.get(lane, -1) if lane is not None else -1 for _, lane in steering]
+        if len(steering) >= MANY and -1 not in columns:
+            return self.frame.on_axis[1][[row for row, _ in steering], columns], self.network.heading[columns]
         places, ahead = [], []
-        table = np.array([self.steering[id(vehicles[row])] for row, _ in steering], float).T
-        speed, heading, pursuit, lateral, turning, length, most = table
         for (row, lane), v, tau in zip(steering, speed.tolist(), pursuit.tolist(), strict=True):
             if lane is None:
                 key = vehicles[row].target_lane_index
@@ -258,9 +273,17 @@ class _Decisions:
                 s, r = self.frame.coordinates(row, lane)
                 ahead.append(self.network.heading_at(lane, s + v * tau))
             places.append(r)
+        return np.array(places), np.array(ahead)
+
+    def _steer(self, steering: list[tuple[int, int | None]]) -> list[float]:
+        """`ControlledVehicle.steering_control` of many."""
+        vehicles = self.road.vehicles
+        table = np.array([self.steering[id(vehicles[row])] for row, _ in steering], float).T
+        speed, heading, pursuit, lateral, turning, length, most = table
+        places, ahead = self._places(steering, speed, pursuit)
         speed = np.where(np.abs(speed) > 1e-2, speed, np.where(speed >= 0, 1e-2, -1e-2))
-        command = np.arcsin(np.clip(-lateral * np.array(places) / speed, -1, 1))
-        reference = np.array(ahead) + np.clip(command, -np.pi / 4, np.pi / 4)
+        command = np.arcsin(np.clip(-lateral * places / speed, -1, 1))
+        reference = ahead + np.clip(command, -np.pi / 4, np.pi / 4)
         rate = turning * wrap_to_pi(reference - heading)
         slip = np.arcsin(np.clip(length / 2 / speed * rate, -1, 1))
         found_angles: list[float] = np.clip(np.arctan(2 * np.tan(slip)), -most, most).tolist()

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
     from crashhunt.simulators.accelerator._network import Network
 
-__all__ = ["Frame", "are_plain"]
+__all__ = ["MANY", "Frame", "are_plain"]
+
+MANY = 12  # from so many on, arrays are faster than one after another
 
 
 class Frame:
@@ -64,15 +66,22 @@ class Frame:
         return self.network.on_axis(self.places[:, 0], self.places[:, 1])
 
     @cached_property
+    def no_landmark(self) -> NDArray[np.bool_]:
+        """Which of all somebody may meet on a lane."""
+        return np.array([not isinstance(thing, Landmark) for thing in self.things], bool)
+
+    @cached_property
     def boxes(self) -> NDArray[np.float64]:
         """Lower bounds of the distances of all from the other lanes."""
         return self.network.box_distance(self.places[:, 0], self.places[:, 1])
 
     def coordinates(self, row: int, lane: int) -> tuple[float, float]:
         """Coordinates of one on one lane."""
-        if self.network.is_axis[lane]:
-            s, r = self.column(lane)
-            return s[row], r[row]
+        columns = self._columns.get(lane)
+        if columns is None and self.network.is_axis[lane]:
+            columns = self.column(lane)
+        if columns is not None:
+            return columns[0][row], columns[1][row]
         found = self._single.get((row, lane))
         if found is None:
             found = self._single[row, lane] = self.network.coordinates(lane, self.things[row].position)
@@ -117,6 +126,8 @@ class Frame:
 
     def _queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
         """Those on a lane, and with it on those that lead to it and on from it, by their place along it."""
+        if not self._looks_further and len(self.things) >= MANY and self.network.is_axis[lane]:
+            return self._axis_queue(lane)
         if not self._looks_further:
             found = self._on_lane(lane)
         else:
@@ -129,6 +140,15 @@ class Frame:
                         found.append((s + offset, row))
         found.sort()
         return [s for s, _ in found], [self.things[row] for _, row in found]
+
+    def _axis_queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
+        """The same on one lane along an axis alone."""
+        (s, r), column = self.on_axis, self.network.column[lane]
+        s, r = s[:, column], r[:, column]
+        on = (np.abs(r) <= self.network.half_widths[lane]) & (s >= -5) & (s < self.network.lengths[lane] + 5)
+        rows = np.flatnonzero(on & self.no_landmark)
+        rows = rows[s[rows].argsort(kind="stable")]
+        return s[rows].tolist(), [self.things[row] for row in rows.tolist()]
 
     def _on_lane(self, lane: int) -> list[tuple[float, int]]:
         network = self.network

@@ -80,8 +80,8 @@ class Network:
         boxes = np.array([_box(self.lanes[number]) for number in self.others]).reshape(-1, 4)
         self.low_x, self.low_y, self.high_x, self.high_y = boxes.T
         #: a lane's place among the columns of the arrays of lanes along an axis, and of the others
-        self.column = {number: column for column, number in enumerate(self.axis.tolist())}
-        self.column |= {number: column for column, number in enumerate(self.others)}
+        self.axis_column = {number: column for column, number in enumerate(self.axis.tolist())}
+        self.column = self.axis_column | {number: column for column, number in enumerate(self.others)}
 
     def is_of(self, network: RoadNetwork) -> bool:
         """Whether the network still has these very lanes, in these places, and they are what they were."""

@@ -92,8 +92,11 @@ class _Prepared:
 
 def _prepared(road: Road) -> _Prepared | None:
     """What is known about a road; None where it, its lanes or highway-env itself are not what is known."""
-    if not _is_known(road):
-        return None
+    return _prepared_if_known(road) if _is_known(road) else None
+
+
+def _prepared_if_known(road: Road) -> _Prepared | None:
+    """The same of a road that has just been looked at."""
     found = _roads.get(id(road))
     if found is None or not found.network.is_of(road.network):
         found = _roads[id(road)] = _Prepared(road)
@@ -147,7 +150,11 @@ def _frame_of(road: Road) -> Frame | None:
 
 
 def _act(self: Road) -> None:
-    frame = _frame_of(self) if len(self.vehicles) > 1 else None
+    if len(self.vehicles) < 2:
+        for vehicle in self.vehicles:
+            vehicle.act()
+        return
+    frame = _frame_of(self)
     if frame is None or not decide(self, frame):
         originals["Road.act"](self)
 
@@ -156,7 +163,7 @@ def _step(self: Road, dt: float) -> None:
     if len(self.vehicles) + len(self.objects) < 2 or not _is_known(self):
         originals["Road.step"](self, dt)
         return
-    found = _prepared(self)
+    found = _prepared_if_known(self)
     frame = move(self, found.network, dt) if found is not None else None
     if found is not None and frame is not None:
         found.frame = frame
