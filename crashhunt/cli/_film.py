@@ -12,6 +12,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import integer, number
 from crashhunt.cli._progress import shown_progress
+from crashhunt.crashes import most_dangerous
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -42,7 +43,10 @@ def add_film_options(parser: argparse.ArgumentParser) -> None:
     film.add_argument("--frames", metavar="DIR", type=Path, help="write a folder of PNG files")
     film.add_argument("--fps", metavar="N", type=number, default=0.0, help="pictures a second; default: one a step")
     film.add_argument("--size", metavar="WxH", default="960x540", help="of the scene, in pixels; default: 960x540")
-    film.add_argument("--last-seconds", metavar="S", type=number, default=0.0, help="only the end of it")
+    film.add_argument(
+        "--last-seconds", metavar="S", type=number, default=0.0,
+        help="only the end of it; of a near miss, around the moment when it was nearest (default of one: 10)",
+    )  # fmt: skip
     film.add_argument(
         "--last-step-repeats", metavar="N", type=integer, default=10, help="of the last picture; default: 10"
     )
@@ -95,10 +99,13 @@ def filmed(
         yield chosen
         return
     with tempfile.TemporaryDirectory(prefix="crashhunt-panels-") as folder:
+        from crashhunt.render import shown_steps
+
         first = 0
-        if film.last_s:
-            dt = bundle.recording().prologue.step_length_s
-            first = max(0, bundle.result.steps - round(film.last_s / dt) - 1)
+        if film.last_s or bundle.is_near_miss:
+            recording = bundle.recording()
+            near = most_dangerous(recording) if bundle.is_near_miss else None
+            first = max(0, shown_steps(recording, film.last_s, near.step if near is not None else -1)[0] - 1)
         look = chosen.look or look_at_all(bundle, to_stderr=to_stderr)
         yield replace(chosen, look=look and replace(look, panels=(first, Path(folder))))
 
@@ -116,7 +123,7 @@ def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:
 
 def recorded_shot(bundle: Bundle) -> Shot:
     """Return what was recorded, to be filmed."""
-    return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=True)
+    return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=not bundle.is_near_miss)
 
 
 def write_films(options: argparse.Namespace, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
@@ -147,7 +154,10 @@ def _shot(
     from crashhunt.recording import read_lanes
     from crashhunt.render import Shot
 
+    lanes = read_lanes(bundle.path / layout.LOG)
+    near = most_dangerous(recording) if bundle.is_near_miss and not crashed else None
+    if near is not None:
+        return Shot(recording, lanes, near.agent, near.other, -1, panels, meanings, nearest=near.step)
     hit = result.collision
     other = hit.other if hit else ""
-    lanes = read_lanes(bundle.path / layout.LOG)
     return Shot(recording, lanes, bundle.driver, other, recording.steps if crashed else -1, panels, meanings)

@@ -85,7 +85,9 @@ def add_replay(commands: Commands) -> None:
     )
     stop = look.add_mutually_exclusive_group()
     stop.add_argument("--until", metavar="STEP", type=integer, help="stop after this step")
-    stop.add_argument("--before", metavar="N", type=integer, help="stop N steps before the crash")
+    stop.add_argument(
+        "--before", metavar="N", type=integer, help="stop N steps before the crash, or before a near miss was nearest"
+    )
     look.add_argument(
         "--pdb", action="store_true",
         help="drop into the agent's act in the last step, with agent, observation, scene and step at hand",
@@ -177,7 +179,7 @@ def _refuse_what_would_be_ignored(options: argparse.Namespace, film: FilmOptions
 
 
 def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptions) -> tuple[ReplayReport, ReplayData]:
-    from crashhunt.crashes import partner
+    from crashhunt.crashes import most_dangerous, partner
     from crashhunt.replays import replay
     from crashhunt.report import check_fields, describe_replay, format_table, steps_table
 
@@ -187,7 +189,9 @@ def _replay_one(options: argparse.Namespace, bundle: Bundle, chosen: ReplayOptio
     report = replay(bundle, chosen)
     answer = report.to_json()
     if options.fields:
-        table = steps_table(report.recording, fields, bundle.driver, partner(bundle.result))
+        near = most_dangerous(bundle.recording()) if bundle.is_near_miss else None
+        other = partner(bundle.result) if near is None or near.agent != bundle.driver else near.other
+        table = steps_table(report.recording, fields, bundle.driver, other)
         say("\n".join([*format_table(table), ""]), as_json=options.json)
         answer["table"] = table
     say(describe_replay(report), as_json=options.json)
@@ -222,11 +226,16 @@ def _look(options: argparse.Namespace, bundle: Bundle) -> Look | None:
 
 def _last_step(options: argparse.Namespace, bundle: Bundle) -> int:
     """Where to stop; 0 where that was not asked for."""
-    crash = bundle.result.steps
+    crash, what = bundle.result.steps, "the crash is"
+    if bundle.is_near_miss and (options.before is not None or options.pdb):
+        from crashhunt.crashes import most_dangerous
+
+        near = most_dangerous(bundle.recording())
+        crash, what = (near.step, "it was nearest") if near is not None and near.step else (crash, "it ended")
     if options.before is not None:
         if not 0 <= options.before < crash:
             fix = f"give 0 to {crash - 1}" if crash else "leave it out"
-            raise UsageError(f"--before is {options.before}, and the crash is at step {crash}", fix=fix)
+            raise UsageError(f"--before is {options.before}, and {what} at step {crash}", fix=fix)
         return crash - int(options.before)
     if options.until is not None:
         if options.until < 1:

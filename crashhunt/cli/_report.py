@@ -29,13 +29,19 @@ def add_report(commands: Commands) -> None:
     )
     add_crash(report)
     report.add_argument("--output", "-o", metavar="FILE", type=Path, help="the file; default: DIR/report.html")
-    report.add_argument("--crashes", metavar="N", type=integer, default=20, help="how many to animate; default: 20")
+    report.add_argument(
+        "--crashes",
+        metavar="N",
+        type=integer,
+        default=20,
+        help="how many to animate, and as many near misses; default: 20",
+    )
     add_json(report)
     report.set_defaults(command=_report)
 
 
 def _report(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.crashes import find_bundle, list_bundles
+    from crashhunt.crashes import find_bundle, list_bundles, list_near_misses
     from crashhunt.hunts import hunt_state
     from crashhunt.report import write_report
 
@@ -48,11 +54,16 @@ def _report(options: argparse.Namespace, _words: list[str]) -> int:
         bundles = [find_bundle(hunt, options.crash)] if options.crash else list_bundles(hunt)
         bundles.sort(key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         shown = bundles[: options.crashes]
+        near = [] if options.crash else list_near_misses(hunt)[: options.crashes]
         target = options.output or (Path(f"{options.directory}.html") if exported else hunt / layout.REPORT)
         with shown_progress(f"writing {target}", as_json=options.json) as watch:
-            size = write_report(hunt, shown, target, name=options.directory.resolve().name, watch=watch)
+            size = write_report(hunt, [*shown, *near], target, name=options.directory.resolve().name, watch=watch)
+    also = f", and the {len(near)} most dangerous near misses" if near else ""
     left = f", the {len(shown)} with the fewest steps" if len(shown) < len(bundles) else ""
-    say(f"{target} ({size / 1e6:.1f} MB) shows {len(shown)} of {len(bundles)} crashes{left}", as_json=options.json)
+    say(
+        f"{target} ({size / 1e6:.1f} MB) shows {len(shown)} of {len(bundles)} crashes{left}{also}", as_json=options.json
+    )
     if options.json:
-        print(json.dumps({"file": str(target), "bytes": size, "crashes": [bundle.id for bundle in shown]}))
+        also_json = {"near_misses": [bundle.id for bundle in near]} if near else {}
+        print(json.dumps({"file": str(target), "bytes": size, "crashes": [bundle.id for bundle in shown], **also_json}))
     return 0

@@ -21,10 +21,10 @@ def add_show(commands: Commands) -> None:
     """Add the command."""
     show = commands.add_parser(
         "show",
-        help="tell the last seconds of a crash",
-        description="Tell the last seconds of a crash in words and a table: who was where, how fast, closing how "
-        "quickly, what the agent decided, and until when braking would have avoided it, as the hunt found out by "
-        "running it. Runs no code of the bundle.",
+        help="tell the last seconds of a crash, or those around a near miss",
+        description="Tell the last seconds of a crash, or those around the moment when a near miss was nearest, in "
+        "words and a table: who was where, how fast, closing how quickly, what the agent decided, and until when "
+        "braking would have avoided it, as the hunt found out by running it. Runs no code of the bundle.",
     )
     add_crash(show)
     show.add_argument("--last-seconds", metavar="S", type=number, default=5.0, help="how much of it; default: 5")

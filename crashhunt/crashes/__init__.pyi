@@ -7,6 +7,7 @@ from ._bundle import (
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
+from ._danger import DangerCourse as DangerCourse, danger_course as danger_course, most_dangerous as most_dangerous
 from ._data import CrashData as CrashData, CrashSummary as CrashSummary
 from ._encounter import Encounter as Encounter, Moment as Moment, Position as Position, last_escape as last_escape
 from ._escape import (

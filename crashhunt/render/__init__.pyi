@@ -4,6 +4,7 @@ from ._film import (
     Shot as Shot,
     check_places as check_places,
     frames as frames,
+    shown_steps as shown_steps,
     write_frames as write_frames,
     write_gif as write_gif,
     write_video as write_video,

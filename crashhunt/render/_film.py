@@ -28,10 +28,21 @@ if TYPE_CHECKING:
     from crashhunt.panels import Panel
     from crashhunt.recording import Recording
 
-__all__ = ["FilmOptions", "Layout", "Shot", "check_places", "frames", "write_frames", "write_gif", "write_video"]
+__all__ = [
+    "FilmOptions",
+    "Layout",
+    "Shot",
+    "check_places",
+    "frames",
+    "shown_steps",
+    "write_frames",
+    "write_gif",
+    "write_video",
+]
 
 _PANEL = (240, 160)
 _PAPER = 255
+_AROUND_S = 10.0  # of a near miss, half of it before and half after
 _SHOWN_S = 10.0  # of the built-in curves
 _BUILTIN = ("time to collision s", "gap to the other m", "speed m/s", "action")
 _NEAREST = "nearest gap m"  # of a crash that has no other one
@@ -45,7 +56,8 @@ class FilmOptions:
     Args:
         fps: pictures a second; as many as there are steps by default, so that it runs in real time.
         size: of the scene, in pixels.
-        last_s: only the last so many seconds; 0 for all.
+        last_s: only the last so many seconds, and of a near miss those around the moment when it was nearest; 0 for all
+            of a crash and 10 s of a near miss.
         last_step_repeats: how often the last picture is shown again.
         blank_frames: between two crashes.
         panels: whether to show panels at all.
@@ -73,7 +85,7 @@ class FilmOptions:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One crash of a film.
+    """One crash or near miss of a film.
 
     Args:
         recording: what to show.
@@ -83,6 +95,7 @@ class Shot:
         crash_step: where the crash is.
         panels: step to the agent's own panels, by label, as pictures.
         meanings: what the numbers of its discrete actions stand for, where that is known.
+        nearest: of a near miss, the step that the film is about; -1 of a crash, whose film ends with it.
     """
 
     recording: Recording
@@ -92,6 +105,7 @@ class Shot:
     crash_step: int
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]
     meanings: Sequence[str] = ()
+    nearest: int = -1
 
 
 class Layout:
@@ -181,6 +195,7 @@ def frames(shots: Sequence[Shot], options: FilmOptions) -> Iterator[NDArray[np.u
             height=options.size[1],
             scale=options.scale,
             crash_step=shot.crash_step,
+            nearest_step=shot.nearest,
         )
         builtin = _Builtin(shot) if options.panels else None
         last: tuple[int, NDArray[np.uint8]] | None = None
@@ -331,10 +346,25 @@ class _Builtin:
         return found
 
 
+def shown_steps(recording: Recording, last_s: float, nearest: int) -> tuple[int, int]:
+    """Return the first and the last step of a film.
+
+    Args:
+        recording: of what.
+        last_s: as in `FilmOptions`.
+        nearest: as in `Shot`.
+    """
+    dt, end = recording.prologue.step_length_s, recording.steps
+    if nearest < 0:
+        return max(0, end - round(last_s / dt)) if last_s else 0, end
+    half = round((last_s or _AROUND_S) / 2 / dt)
+    return max(0, nearest - half), min(end, nearest + half)
+
+
 def _steps(shot: Shot, options: FilmOptions) -> list[int]:
     """Which step each picture shows."""
-    dt, last = shot.recording.prologue.step_length_s, shot.recording.steps
-    first = max(0, last - round(options.last_s / dt)) if options.last_s else 0
+    dt = shot.recording.prologue.step_length_s
+    first, last = shown_steps(shot.recording, options.last_s, shot.nearest)
     fps = options.fps or 1.0 / dt
     count = math.floor((last - first) * dt * fps + 1e-6) + 1
     steps = [min(last, first + int(number / fps / dt + 1e-6)) for number in range(count)]

@@ -42,6 +42,7 @@ class SceneView:
         height: in pixels.
         scale: pixels a metre.
         crash_step: where to mark the crash; -1 for nowhere.
+        nearest_step: where to mark that a near miss was nearest, for a second; -1 for nowhere.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class SceneView:
         height: int = 540,
         scale: float = 8.0,
         crash_step: int = -1,
+        nearest_step: int = -1,
     ) -> None:
         self.width, self.height = width, height
         self._recording = recording
@@ -62,7 +64,8 @@ class SceneView:
         self._agent, self._other = agent, other
         self._agents = set(recording.agents)
         self._scale = scale
-        self._crash_step = crash_step
+        self._crash_step, self._nearest_step = crash_step, nearest_step
+        self._second = round(1.0 / recording.prologue.step_length_s)
         self._center = np.zeros(2)
         self._trail = round(_TRAIL_S / recording.prologue.step_length_s)
 
@@ -87,13 +90,21 @@ class SceneView:
             self._draw_actor(draw, scene, other, self._color(scene.roster.actors[other].id))
         for one in self._going(step):
             self._ring(draw, scene, one.vehicle)
-        if step == self._crash_step and row is not None:
+        if self._marked(step) and row is not None:
             x, y = self._place(np.array([scene.points[row]]))[0]
             for radius in (34, 38):
                 draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=_CRASH, width=3)
         smooth = image.reduce(_FINE)
         self._label(ImageDraw.Draw(smooth), scene, step, row)
         return as_array(smooth)
+
+    def _marked(self, step: int) -> str:
+        """What is written above a step that is marked; empty where none is."""
+        if step == self._crash_step:
+            return "CRASH"
+        # One picture alone would be gone before anybody has seen it.
+        since = step - self._nearest_step
+        return "NEAREST" if self._nearest_step >= 0 and 0 <= since <= self._second else ""
 
     def _place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Metres to pixels of the fine image."""
@@ -174,8 +185,8 @@ class SceneView:
         for place, one in enumerate(self._going(step)):
             top = 40 + _LEGEND_STEP * (len([name for name, _ in names if name]) + place)
             draw.text((12, top), one.words.replace("²", "^2"), _DISTURBED, font(13))  # the font has no ²
-        if step == self._crash_step:
-            draw.text((self.width / 2, 14), "CRASH", _CRASH, font(26), anchor="ma")
+        if mark := self._marked(step):
+            draw.text((self.width / 2, 14), mark, _CRASH, font(26), anchor="ma")
         if not self._recording.actors:
             middle = self.width / 2, self.height / 2
             draw.text(middle, "this simulator shows no scene", FAINT, font(15), anchor="mm")

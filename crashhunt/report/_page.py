@@ -52,7 +52,7 @@ def write_report(
 
     Args:
         directory: of the hunt; its ledger may be missing, as in an exported crash.
-        bundles: the crashes to animate.
+        bundles: the crashes and near misses to animate.
         target: the file; one that is there is replaced.
         name: of the hunt, for the title; its directory's by default.
         watch: called after each crash with how many are done, and how many there are.
@@ -116,9 +116,15 @@ def _lineages(directory: Path, bundles: Sequence[Bundle]) -> dict[str, list[list
 def _crashes(bundles: Sequence[Bundle], watch: Watch | None) -> dict[str, object]:
     """The crashes in the order of the page, and their kinds, each with where its crashes are in it."""
     crashes, signed, place = [], [], {}
-    for number, bundle in enumerate(watched(by_likelihood(bundles), len(bundles), watch)):
+    crashed = [bundle for bundle in bundles if not bundle.is_near_miss]
+    shown = [*by_likelihood(crashed), *(bundle for bundle in bundles if bundle.is_near_miss)]
+    for number, bundle in enumerate(watched(shown, len(shown), watch)):
         story = Story(bundle)
-        crashes.append({**_crash(bundle, story), "traffic": traffic_of(bundle, bundles)})
+        near = f"near miss at step {story.nearest.step}, danger {story.nearest.danger:.2f}" if story.nearest else ""
+        traffic = near if bundle.is_near_miss else traffic_of(bundle, crashed)
+        crashes.append({**_crash(bundle, story), "traffic": traffic})
+        if bundle.is_near_miss:
+            continue
         signed.append((signature_of(bundle, story.recording), bundle))
         place[bundle.path] = number
     kinds = [
@@ -200,13 +206,16 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "seed": str(result.spec.seed),
             "steps": str(result.steps),
             "simulation time": f"{result.sim_time_s:.1f} s",
-            **({"at fault": story.fault.verdict} if story.encounter is not None else {}),
+            **({"at fault": story.fault.verdict} if story.encounter is not None and story.nearest is None else {}),
+            **({"danger": f"{result.danger:.2f}"} if bundle.is_near_miss and result.danger is not None else {}),
             "digest": result.digest,
             "snapshot": bundle.snapshot,
             **_disturbances(result),
             "confirmed": {True: "yes, to the bit", False: "no: flaky", None: "not tried"}[bundle.confirmed],
         },
         "escape": story.escape,
+        "nearest": story.nearest.step if story.nearest is not None else None,
+        **_danger(story),
         "agent": story.agent,
         "other": story.other,
         "agents": list(recording.agents),
@@ -219,6 +228,12 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             for one in result.disturbances
         ],
     }
+
+
+def _danger(story: Story) -> dict[str, object]:
+    """The agent's own danger over time, and that by those behind it."""
+    course = story.danger
+    return {"danger": _packed(course.own), "behind": _packed(course.behind)} if course is not None else {}
 
 
 def _disturbances(result: TrialResult) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The last seconds of a crash, in plain words and a table."""
+"""The last seconds of a crash, or those around a near miss, in plain words and a table."""
 
 from __future__ import annotations
 
@@ -7,10 +7,20 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.crashes import Encounter, judgement_of, last_escape
+from crashhunt.crashes import Encounter, danger_course, judgement_of, last_escape, most_dangerous
+from crashhunt.report._danger import (
+    COLUMNS,
+    about_danger,
+    about_nearest,
+    danger_cells,
+    danger_to_json,
+    nearest_to_json,
+    window_of,
+)
 from crashhunt.report._disturbances import about_disturbances
 from crashhunt.report._events import about_events
 from crashhunt.report._judgement import about_judgement
+from crashhunt.report._positions import STANDS, about_gap, about_place
 from crashhunt.report._status_screen import format_arguments
 from crashhunt.report._table import NEAREST, aligned, steps_table
 from crashhunt.report._why import about_why
@@ -19,34 +29,21 @@ from crashhunt.triage import fault_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from crashhunt.crashes import Bundle, Moment, Position
+    from crashhunt.crashes import Bundle, Moment
     from crashhunt.recording import StepRecord
     from crashhunt.report._table import TableCell
 
 __all__ = ["Story"]
 
 _ROWS = 20  # of the table; longer stretches are thinned out
-_PLACES = {
-    "ahead": "ahead of {agent}",
-    "behind": "behind {agent}",
-    "left": "to the left of {agent}",
-    "right": "to the right of {agent}",
-}
-_WAYS = {
-    "same": "going the same way",
-    "other": "going the other way",
-    "left": "crossing from right to left",
-    "right": "crossing from left to right",
-}
-_STANDS = 0.05  # m/s; what is less is shown as 0
 
 
 class Story:
-    """What happened in the last seconds of a crash; no code of the bundle is run.
+    """What happened in the last seconds of a crash, or around a near miss; no code of the bundle is run.
 
     Args:
-        bundle: the crash.
-        last_s: how much of it, in s.
+        bundle: the crash or near miss.
+        last_s: how much of it, in s; of a near miss, half of that before it was nearest, and half after.
         braking: a deceleration, in m/s²; it is calculated until when that would have helped. Without one it is told
             what the hunt found out by running it.
     """
@@ -54,11 +51,13 @@ class Story:
     def __init__(self, bundle: Bundle, *, last_s: float = 5.0, braking: float | None = None) -> None:
         self.bundle = bundle
         self.recording = bundle.recording()
-        self._last_s = last_s
         self._braking = braking
         hit = bundle.result.collision
-        self.agent = bundle.driver
-        self.other = hit.other if hit else ""
+        self.nearest = most_dangerous(self.recording) if bundle.is_near_miss else None
+        near = self.nearest
+        self.agent, self.other = (near.agent, near.other) if near else (bundle.driver, hit.other if hit else "")
+        self.danger = danger_course(self.recording, self.agent)
+        self._first, self._last = window_of(self.recording, last_s, near)
         self.encounter = Encounter(self.recording, self.agent, self.other) if self.other else None
         self.judgement = judgement_of(bundle)
         self.fault = fault_of(bundle, self.recording)
@@ -87,6 +86,8 @@ class Story:
             },
             "judged": self.judgement.to_json() if self.judgement is not None else None,
             "fault": self.fault.to_json(),
+            "nearest": nearest_to_json(self.nearest),
+            "danger": danger_to_json(self.danger, self.bundle, self._first, self._last),
             "moments": [
                 {
                     name: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -94,7 +95,7 @@ class Story:
                 }
                 | {"action": self._action(moment.step)}
                 for moment in moments
-                if moment.step >= self._first_step()
+                if self._first <= moment.step <= self._last
             ],
         }
 
@@ -105,16 +106,20 @@ class Story:
         scenes = recording.scenes()
         lasted = self._end_s - scenes[0].time_s if scenes else 0.0
         sentences = [f"{result.summary}, {lasted:.1f} s after the episode began."]
-        sentences += about_disturbances(recording, result, self._first_step())
-        if self.encounter is not None and self.encounter.moments:
+        sentences += about_disturbances(recording, result, self._first)
+        if self.encounter is not None and self.nearest is not None:
+            sentences += about_nearest(self.encounter, self.nearest)
+        elif self.encounter is not None and self.encounter.moments:
             sentences += self._about_encounter(self.encounter)
             sentences += self._about_fault()
-        sentences += about_events(recording, self._first_step(), besides=result.event)
+        sentences += about_events(recording, self._first, besides=result.event)
         hit = result.collision
         if result.event is not None or (hit is not None and hit.role == "alone"):
             before = self._action(end)
             whose = "Its" if result.event is None else f"{self.agent}'s"
             sentences.append(f"{whose} last decision was {_words(before, self._names())}.")
+        if self.danger is not None:
+            sentences.append(about_danger(self.danger))
         if result.failure is not None:
             sentences += self._about_failure()
         return sentences
@@ -136,10 +141,12 @@ class Story:
         if self.encounter is not None:
             header += [f"{self.other} m/s", "gap to it m", "closing m/s", "TTC to it s"]
             header += ["needs m/s²"] if drives_into else []
+        header += COLUMNS if self.danger is not None else ()
         moments = {moment.step: moment for moment in self.encounter.moments} if self.encounter else {}
         rows = []
-        steps = [step for step in self.recording.all_steps if step.step >= self._first_step()]
-        for step in _thinned(steps, _ROWS, always=self.escape):
+        steps = [step for step in self.recording.all_steps if self._first <= step.step <= self._last]
+        near = self.nearest
+        for step in _thinned(steps, _ROWS, always=self.escape) if near is None else _around(steps, _ROWS, near.step):
             scene = step.scene
             row = scene.roster.index.get(self.agent) if scene is not None else None
             speed = f"{scene.speeds[row]:.1f}" if scene is not None and row is not None else "-"
@@ -149,6 +156,7 @@ class Story:
                 moment = moments.get(step.step)
                 cells += ["-"] * 5 if moment is None else _cells(moment)
                 cells = cells if drives_into else cells[:-1]
+            cells += danger_cells(self.danger, step.step) if self.danger is not None else []
             rows.append([*cells, self._mark(step.step, moments.get(step.step))])
         return aligned([header, *rows])
 
@@ -156,11 +164,13 @@ class Story:
         """What is said beside a row of the table."""
         if step == self.escape:
             return "<- the last step after which braking helps"
+        if self.nearest is not None and step == self.nearest.step:
+            return "<- nearest"
         hit = self.bundle.result.collision
         if hit is None or moment is None or step != self.recording.steps:
             return ""
         own, its = self._speeds_at_contact()
-        same = abs(own - moment.speed) < _STANDS and abs(its - moment.other_speed) < _STANDS
+        same = abs(own - moment.speed) < STANDS and abs(its - moment.other_speed) < STANDS
         return "" if same or math.isnan(own) or math.isnan(its) else f"<- they touched at {own:.1f} and {its:.1f} m/s"
 
     def _speeds_at_contact(self) -> tuple[float, float]:
@@ -176,20 +186,13 @@ class Story:
         sentences = []
         # What is after the contact says nothing about how it came to it.
         before = [moment for moment in encounter.moments if moment.time_s < self._end_s - 1e-9]
-        shown = [moment for moment in before if moment.step >= self._first_step()]
+        shown = [moment for moment in before if moment.step >= self._first]
         if shown:
             earlier = shown[0]
             middle = next((moment for moment in reversed(shown) if self._end_s - moment.time_s >= 1.0), earlier)
-            position = encounter.position(middle.step)
-            assert position is not None
-            where = f"{_PLACES[position.place].format(agent=agent)}, {_directions(position, middle.other_speed)}"
             sentences = [
-                (
-                    f"{self._end_s - earlier.time_s:.1f} s before, they were {earlier.gap_m:.1f} m apart, "
-                    f"{_closing(earlier.closing_speed)}; {agent} at {earlier.speed:.1f} m/s, {other} at "
-                    f"{earlier.other_speed:.1f} m/s."
-                ),
-                f"{self._end_s - middle.time_s:.1f} s before, {other} was {where}.",
+                f"{self._end_s - earlier.time_s:.1f} s before, {about_gap(encounter, earlier)}.",
+                f"{self._end_s - middle.time_s:.1f} s before, {about_place(encounter, middle)}.",
             ]
         own, its = self._speeds_at_contact()
         if math.isfinite(own) and math.isfinite(its):
@@ -265,7 +268,7 @@ class Story:
         names = self._names()
         if "lane_change" not in names:
             return None
-        for step in range(self.recording.steps, max(0, self._first_step()), -1):
+        for step in range(self.recording.steps, max(0, self._first), -1):
             action = self._action(step)
             change = action[names.index("lane_change")] if action else 0.0
             if change:
@@ -288,9 +291,6 @@ class Story:
         if frames:
             sentences += ["", *frames[-6:]]
         return sentences
-
-    def _first_step(self) -> int:
-        return self.recording.steps - round(self._last_s / self.recording.prologue.step_length_s)
 
     def _names(self) -> tuple[str, ...]:
         channel = next((agent for agent in self.recording.prologue.agents if agent.id == self.agent), None)
@@ -319,16 +319,6 @@ def _cells(moment: Moment) -> list[str]:
         f"{time_s:.1f}" if math.isfinite(time_s) else "-",
         f"{moment.required_deceleration:.1f}" if moment.gap_m > 0 else "-",
     ]
-
-
-def _directions(position: Position, speed: float) -> str:
-    return _WAYS[position.faces] if abs(speed) >= _STANDS else "standing"
-
-
-def _closing(speed: float) -> str:
-    if abs(speed) < _STANDS:
-        return "keeping their distance"
-    return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
 
 
 def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object]:
@@ -373,3 +363,9 @@ def _thinned(steps: list[StepRecord], rows: int, *, always: int | None) -> list[
     every = math.ceil(len(earlier) / (rows - len(recent)))
     kept = {id(step) for step in earlier[::-every]}
     return [*(step for step in earlier if id(step) in kept or step.step == always), *recent]
+
+
+def _around(steps: list[StepRecord], rows: int, middle: int) -> list[StepRecord]:
+    """About so many, evenly, one of them in the middle."""
+    every = math.ceil(len(steps) / rows)
+    return [step for step in steps if (step.step - middle) % every == 0]

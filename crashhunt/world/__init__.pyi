@@ -9,6 +9,7 @@ from ._events import (
     EventData as EventData,
     event_counts as event_counts,
 )
+from ._followers import followers_danger as followers_danger
 from ._geometry import (
     outlines_overlap as outlines_overlap,
     rectangle_gap as rectangle_gap,

@@ -18,7 +18,8 @@ does (TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measur
 2001): integral / (integral + 10 s), and 1 where somebody was touched. Of several agents it is that of the one in the
 greatest danger. The integral ranks trials better than the greatest danger of a step; `scripts/danger` measures that.
 
-Whoever comes from behind on the same way is left out: that is the danger that others are to the agent.
+Whoever comes from behind on the same way is left out: that is the danger that others are to the agent, and a number of
+its own (`followers_danger`), which has no part in the danger of a trial.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["DangerMeter", "DangerousMoment", "dangers"]
+__all__ = ["AHEAD_M", "DangerMeter", "DangerousMoment", "by_step", "dangers", "measured_along", "summed_danger"]
 
 _HALF_S = 10.0  # a trial whose dangers add up to this has 0.5
 _DECAY_S = 1.2  # in which the danger of a time gap falls to 1/e
 _HARDEST = 12.0  # m/s²
 _BLIND_S = 4.0  # how long the agent is taken to go on
-_AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way; further off is no danger worth the time
+AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way; further off is no danger worth the time
 _UNKNOWN_M = 10.0  # at the end of the way: straight on is a guess
 _SAME_WAY = np.cos(np.pi / 6)  # of directions that differ by less than 30°
 _PLACES = 3  # that are looked at together
@@ -102,7 +103,7 @@ class DangerMeter:
     def danger(self) -> float | None:
         """That of all scenes so far; None where no agent was in any of them."""
         found = [total for total in self._summed(self._count).values() if total is not None]
-        return max(found) / (max(found) + _HALF_S) if found else None
+        return summed_danger(max(found)) if found else None
 
     def _summed(self, until: int) -> dict[str, float | None]:
         sums = dict(self._sums)
@@ -134,30 +135,52 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
         at = int(found.argmax())
         if found[at] > most.danger:
             most = DangerousMoment(float(found[at]), round(times[at] / step_length_s), agent, names[who[at]])
-        # A step has the danger of the sample before it, or the greatest one within it.
-        steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
-        held = np.zeros(count)
-        np.maximum.at(held, steps, found)
-        known = np.zeros(count, bool)
-        known[steps] = True
-        last = np.maximum.accumulate(np.where(known, np.arange(count), -1))
-        present = (last >= 0) & (np.arange(count) <= steps[-1])
-        whole = np.maximum(whole, np.where(present, held[last], 0.0))
+        whole = np.maximum(whole, by_step(times, found, count, step_length_s))
     return whole, most
+
+
+def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Array:
+    """Return the danger of so many scenes, each: that of the sample before it, or the greatest one within its step."""
+    steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
+    held = np.zeros(count)
+    np.maximum.at(held, steps, found)
+    known = np.zeros(count, bool)
+    known[steps] = True
+    last = np.maximum.accumulate(np.where(known, np.arange(count), -1))
+    present = (last >= 0) & (np.arange(count) <= steps[-1])
+    whole: Array = np.where(present, held[last], 0.0)
+    return whole
+
+
+def summed_danger(integral_s: float) -> float:
+    """Return the danger of a trial, from the time integral of that of its steps."""
+    return integral_s / (integral_s + _HALF_S)
 
 
 def _measured(
     frames: Sequence[Frame], agent: str, step_length_s: float
 ) -> tuple[Array, Array, NDArray[np.intp], list[str]] | None:
     """Times, dangers and who else, of each sample; and the names of these."""
-    seen = ways(frames, agent, _AHEAD_M, step_length_s)
+    seen = ways(frames, agent, AHEAD_M, step_length_s)
     if seen is None:
         return None
     track, others, names = seen
+    found, who = measured_along(track, others)
+    return track.time, found, who, names
+
+
+def measured_along(track: Track, others: Others, *, same_way: bool = False) -> tuple[Array, NDArray[np.intp]]:
+    """Return the danger of each sample of a track, and the number of who else; -1 for nobody.
+
+    Args:
+        track: of whom the danger is.
+        others: who came near it.
+        same_way: only those count whom it would reach from behind, going their way.
+    """
     gaps, brakes, who = np.full(len(track.time), np.inf), np.zeros(len(track.time)), np.full(len(track.time), -1)
     if len(others.sample):
         way = _Way(track, flat=not (track.z.any() or others.z.any()))
-        ahead, behind = way.first_contacts(others)
+        ahead, behind = way.reaches_from_behind(others) if same_way else way.first_contacts(others)
         late = way.reached(way.along[others.sample] + ahead) - track.time[others.sample]
         early = track.time[others.sample] - way.reached(way.along[others.sample] - behind)
         apart = np.minimum(np.where(np.isfinite(ahead), late, np.inf), np.where(np.isfinite(behind), early, np.inf))
@@ -167,7 +190,7 @@ def _measured(
         harder = brakes / _HARDEST > np.exp(-gaps / _DECAY_S)
         who = np.where(harder & (blockers >= 0), blockers, who)
     found: Array = np.minimum(np.maximum(np.exp(-gaps / _DECAY_S), brakes / _HARDEST), _MOST)
-    return track.time, found, who, names
+    return found, who
 
 
 class _Way:
@@ -198,13 +221,21 @@ class _Way:
         Behind it, only those count that go another way.
         """
         spacing = float(np.clip(1.6 * self._track.half_length.min(), 1.0, 4.0))
-        ahead = self._first(others, spacing, _AHEAD_M)
+        ahead = self._first(others, spacing, AHEAD_M)
         behind = self._first(others, -spacing, _BEHIND_M)
         there = np.isfinite(behind)
         heading = np.interp(self.along[others.sample[there]] + behind[there], self._at, self._heading)
         behind[there] = np.where(np.cos(others.heading[there] - heading) < _SAME_WAY, -behind[there], np.inf)
         behind[~there] = np.inf
         return ahead, behind
+
+    def reaches_from_behind(self, others: Others) -> tuple[Array, Array]:
+        """As `first_contacts`, ahead and with those alone that go the same way there."""
+        ahead, _ = self.first_contacts(others)
+        there = np.isfinite(ahead)
+        heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)
+        ahead[there] = np.where(np.cos(others.heading[there] - heading) >= _SAME_WAY, ahead[there], np.inf)
+        return ahead, np.full(len(ahead), np.inf)
 
     def _first(self, others: Others, spacing: float, far: float) -> Array:
         """The first place where it touches each, of places that far apart, and then more closely."""

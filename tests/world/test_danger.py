@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.world import Actor, DangerMeter, Frame, Roster, dangers, outlines_overlap
+from crashhunt.world import Actor, DangerMeter, Frame, Roster, dangers, followers_danger, outlines_overlap
 
 LENGTH, WIDTH = 5.0, 2.0
 
@@ -51,6 +51,40 @@ def test_who_follows_is_in_danger_and_not_who_is_followed():
     steps, most = level(*ways, agents=("other", "ego"))
     assert most.agent == "ego"
     assert steps.max() == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+
+
+def test_who_closes_in_from_behind_is_a_danger_of_its_own():
+    """10 m between them, at 10 m/s: as many s as the one behind is behind."""
+    frames = [frame(straight(15, 0, 0, 10), straight(0, 0, 0, 10), straight(40, 0, 0, 10))]
+    steps, most, total = followers_danger(frames, "ego", 0.1)
+    assert steps[:60] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
+    assert (most.agent, most.other) == ("ego", "other")
+    meter = DangerMeter(["other"], 0.1)  # whose danger it is, to the one ahead of it
+    meter.add(frames)
+    assert total == pytest.approx(meter.danger, rel=0.03)
+    assert followers_danger(frames, "other", 0.1)[2] == 0.0  # nobody is behind it
+    faster, _, _ = followers_danger([frame(straight(40, 0, 0, 5), straight(0, 0, 0, 15))], "ego", 0.1)
+    assert faster[25] > faster[5] > 0
+
+
+def test_who_crosses_comes_towards_it_or_is_in_another_lane_does_not_close_in_from_behind():
+    crossing = frame(straight(-50, 0, 0, 10), straight(0, -48, math.pi / 2, 10))
+    beside = frame(straight(20, 0, 0, 10), straight(0, 3.5, 0, 12))
+    oncoming = frame(straight(0, 0, 0, 10), straight(120, 0, math.pi, 10))
+    ahead = frame(straight(0, 0, 0, 12), straight(30, 0, 0, 10))
+    for one in (crossing, beside, oncoming, ahead):
+        steps, most, total = followers_danger([one], "ego", 0.1)
+        assert (steps.max(), total, most.other) == (0.0, 0.0, "")
+
+
+def test_who_cuts_in_ahead_of_somebody_is_closed_in_on():
+    time = 0.1 * np.arange(100)
+    aside = 3.5 * np.clip(time - 3, 0, 2) / 2
+    cutting = np.stack((20 + 10 * time, aside, np.where((time > 3) & (time < 5), math.atan2(1.75, 10), 0)), axis=1)
+    steps, most, _ = followers_danger([frame(cutting, straight(0, 3.5, 0, 12))], "ego", 0.1)
+    assert steps[20] == 0.0
+    assert steps[55:70].min() > 0.3
+    assert most.other == "other"
 
 
 def test_oncoming_traffic_in_a_bend_is_no_danger():
