@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import add_crash, add_json, opened_crash, say
@@ -12,12 +12,13 @@ from crashhunt.cli._progress import shown_progress
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable
 
     from crashhunt.cli._common import Commands
 
 __all__ = ["add_export"]
 
-_FORMATS = ("commonroad",)
+_FORMATS = {"commonroad": ".xml", "openscenario": ".xosc"}
 
 
 def add_export(commands: Commands) -> None:
@@ -34,12 +35,14 @@ def add_export(commands: Commands) -> None:
         "--as",
         dest="form",
         choices=_FORMATS,
-        help="commonroad: a CommonRoad scenario (2020a, XML): the others as they drove, the agent as planning problem",
+        help="commonroad: a CommonRoad scenario (2020a), FILE.xml: the others as they drove, the agent as planning "
+        "problem; openscenario: FILE.xosc (OpenSCENARIO 1.0) with FILE.xodr (OpenDRIVE): the others as they drove, the "
+        "agent where it began",
     )
     export.add_argument(
         "--recorded-agent",
         action="store_true",
-        help="with --as: the way that the agent drove is there as an obstacle, too",
+        help="with --as: the way that the agent drove is there, too: as an obstacle, or as what it follows",
     )
     add_json(export)
     export.set_defaults(command=_export)
@@ -49,7 +52,7 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
     if options.form:
         return _hand_on(options)
     if options.recorded_agent:
-        raise UsageError("--recorded-agent is for another format", fix=f"add --as {_FORMATS[0]}")
+        raise UsageError("--recorded-agent is for another format", fix=f"add --as {' or '.join(_FORMATS)}")
     from crashhunt.crashes import export_crash, find_bundle
 
     bundle = find_bundle(options.directory, options.crash)
@@ -62,18 +65,22 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _hand_on(options: argparse.Namespace) -> int:
-    from crashhunt.formats import write_commonroad
+    from crashhunt.formats import write_commonroad, write_openscenario
 
-    if options.file.suffix.lower() == ".zip":
-        raise UsageError(f"{options.file}: --as {options.form} writes XML", fix="call it FILE.xml, or leave --as away")
+    suffix = _FORMATS[options.form]
+    if options.file.suffix != suffix:
+        raise UsageError(
+            f"{options.file}: --as {options.form} writes a {suffix}", fix=f"call it {options.file.with_suffix(suffix)}"
+        )
+    write: Callable[..., Any] = write_openscenario if options.form == "openscenario" else write_commonroad
     with opened_crash(options.directory, options.crash) as (bundle, _):
-        numbers = write_commonroad(bundle, options.file, with_agents=options.recorded_agent)
+        actors = write(bundle, options.file, with_agents=options.recorded_agent)
     size = options.file.stat().st_size
     say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB), for {options.form}", as_json=options.json)
     if options.json:
         print(
             json.dumps(
-                {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": numbers}
+                {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": actors}
             )
         )
     return 0

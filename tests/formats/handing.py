@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import subprocess
 from pathlib import Path
@@ -48,6 +49,15 @@ def recorded_paths(bundle):
     """The ways of agents and others, as they were recorded."""
     recording = bundle.recording()
     return paths_of(recording.scenes(), recording.agents)
+
+
+def middles(path):
+    """Where the middle of an actor was, by step: recorded is the middle of its front."""
+    half = path.actor.length / 2
+    return {
+        step: (state.x - half * math.cos(state.heading), state.y - half * math.sin(state.heading))
+        for step, state in enumerate(path.states, path.first)
+    }
 
 
 def read_back(form, file):

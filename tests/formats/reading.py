@@ -5,6 +5,7 @@ Run by an interpreter of its own: commonroad-io wants a protobuf that nothing el
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -36,5 +37,33 @@ def commonroad(file):
     }
 
 
+def openscenario(file):
+    """What scenariogeneration writes again of what it has read and found valid; what the schema says of the roads."""
+    import warnings
+
+    from lxml import etree
+    from scenariogeneration import xosc
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*not valid.*")
+        root = xosc.ParseOpenScenario(file).get_element()
+    schemas = Path(xosc.__file__).parent.parent.parent / "schemas"
+    schema = etree.XMLSchema(etree.parse(schemas / "opendrive_17_core.xsd"))
+    schema.validate(etree.parse(Path(file).with_suffix(".xodr")))
+    return {
+        "against": [error.message for error in schema.error_log],
+        "entities": [entity.get("name") for entity in root.iter("ScenarioObject")],
+        "ways": {
+            way.get("name"): [
+                [float(vertex.get("time")), *(float(vertex.find(".//WorldPosition").get(key)) for key in "xyh")]
+                for vertex in way.iter("Vertex")
+            ]
+            for way in root.iter("Trajectory")
+        },
+    }
+
+
 if __name__ == "__main__":
-    print(json.dumps({"commonroad": commonroad}[sys.argv[1]](sys.argv[2])))
+    with contextlib.redirect_stdout(sys.stderr):
+        found = {"commonroad": commonroad, "openscenario": openscenario}[sys.argv[1]](sys.argv[2])
+    print(json.dumps(found))

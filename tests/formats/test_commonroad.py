@@ -10,21 +10,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from episodes import Episode, write
-from handing import AGENTS, LANES, crash, read_back, readers, recorded_paths
+from handing import AGENTS, LANES, crash, middles, read_back, readers, recorded_paths
 
 from crashhunt.base import layout
 from crashhunt.errors import BundleError, HuntDirectoryError
 from crashhunt.formats import write_commonroad
 from crashhunt.recording import Recording, read_black_box, write_log
-
-
-def middles(path):
-    """Where the middle of an actor was, by step: recorded is the middle of its front."""
-    half = path.actor.length / 2
-    return {
-        step: (state.x - half * math.cos(state.heading), state.y - half * math.sin(state.heading))
-        for step, state in enumerate(path.states, path.first)
-    }
 
 
 def states_of(element):
@@ -127,9 +118,10 @@ def test_the_command_says_who_is_which_number(shell):
     assert {number for found in done["actors"].values() for number in found} == numbers
     assert done["bytes"] == (shell.folder / "one.xml").stat().st_size
     for words, said in (
-        (("two.zip", "--as", "commonroad"), "FILE.xml"),
+        (("two.zip", "--as", "commonroad"), "two.xml"),
         (("two.zip", "--recorded-agent"), "--as"),
         (("two.xml", "--as", "nothing"), "commonroad"),
+        (("two.xml", "--as", "openscenario"), "two.xosc"),
         (("no/two.xml", "--as", "commonroad"), "no/two.xml"),
     ):
         refused = shell.crashhunt("export", "crashes/000007-collision", *words, expect=2)
