@@ -150,6 +150,25 @@ def test_of_many_far_away_nobody_is_looked_at():
         assert found(odd) is None
 
 
+def test_whoever_is_near_enough_leaves_out_those_further_away():
+    # Outlines 45.6 m and 49.5 m away, and within 50 m it is the one ahead that is nearest, by 49 m at the most.
+    frame = np.array([[0.0, 0.0, 51.0, 0.0, 0.0, 54.9, *[0.0] * 3, *[9.0] * 3]])
+    part = (frame, 0, [5.0] * 3, [2.0] * 3, [0, 1, 2])
+    numbers, _ = core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0)
+    assert np.frombuffer(numbers).reshape(6, -1)[:2].T.tolist() == [[0.0, 0.0], [51.0, 0.0]]
+
+
+def test_scenes_without_the_agent_count_and_others_keep_their_numbers():
+    frame = np.array([[0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 5.0, 5.0]] * 2)
+    part = (frame, 1, [5.0] * 2, [2.0] * 2, [7, 4])
+    absent = (frame, -1, *part[2:])
+    _, places = core.may_be_near([absent, part], 50.0, 10.0, math.inf, math.inf, 0.0)
+    assert np.frombuffer(places, np.int64).reshape(2, -1).tolist() == [[2, 2, 3, 3], [0, 0, 2, 2]]
+    (_, steps), (_, others) = core.tracks([absent, part], 1, 20.0)
+    assert np.frombuffer(steps, np.int64).tolist() == [2, 3]
+    assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
+
+
 @settings(deadline=None, max_examples=60)
 @given(some.lists(two_scenes(), min_size=1, max_size=4), some.sampled_from([0.1, 0.3, 0.9]))
 def test_the_ways_that_were_driven_are_the_same(episodes, step_length_s):
