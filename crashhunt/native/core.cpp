@@ -756,6 +756,7 @@ struct Part {
             return false;
         }
         if (PyObject_GetBuffer(PyTuple_GET_ITEM(given, 0), &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+            PyErr_Clear(); // such as one that is not in order
             return false;
         }
         held = true;

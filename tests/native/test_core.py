@@ -169,6 +169,21 @@ def test_scenes_without_the_agent_count_and_others_keep_their_numbers():
     assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
 
 
+def test_a_part_that_is_not_whole_is_left_to_python():
+    whole = [np.zeros((2, 8)), 0, [5.0] * 2, [2.0] * 2, [0, 1]]
+    odd = {
+        0: [np.zeros(12), np.zeros((2, 8), np.int64), np.zeros((4, 8))[::2]], 1: [-2, 2],
+        2: [[5.0], [5.0] * 3], 3: [[2.0], [2.0] * 3, [2.0, 2]], 4: [[0], [0, 1, 2], (0, 1)],
+    }  # fmt: skip
+    for place, instead in odd.items():
+        for one in instead:
+            part = (*whole[:place], one, *whole[place + 1 :])
+            assert core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0) is None
+            assert core.tracks([part], 1, 20.0) is None
+    for every in (0, -1):
+        assert core.tracks([tuple(whole)], every, 20.0) is None
+
+
 @settings(deadline=None, max_examples=60)
 @given(some.lists(two_scenes(), min_size=1, max_size=4), some.sampled_from([0.1, 0.3, 0.9]))
 def test_the_ways_that_were_driven_are_the_same(episodes, step_length_s):
@@ -205,7 +220,7 @@ def test_the_record_of_a_step_is_the_same(tmp_path_factory, scenes, rewards, ste
         box.begin(pid=1, trial=0, started=0.0)
         box.prologue(b"", len(rewards))
         box.step(step, scene, rewards)
-        written, where = bytes(box.committed()), (box._offset, box._trail[0][1])
+        written, where = bytes(box.committed()), (bytes(box._map[:64]), box._offset, box._trail[0][1])
         box.close()
         return written, where
 
@@ -254,9 +269,16 @@ def test_what_the_core_does_not_know_is_left_to_python(odd):
             core.Vehicles((), numbers, numbers, [1.0, odd])
     for rows in ([], numbers[:1], tuple(numbers)):
         assert core.columns(sizes, points, rows, numbers) is None
+        assert core.columns(sizes, points, numbers, rows) is None
+        for place in range(3):
+            with pytest.raises(TypeError, match="as many of each"):
+                core.Vehicles((), *[rows if place == other else numbers for other in range(3)])
     alone = core.columns(sizes, points[:1], [1.0], [1.0])  # of two, whose sizes are known
     assert core.observe(alone, 0, 4, 1.0, 1.0, 0.0) is None
     assert core.within_reach(alone, alone, 0, 0.1, 10.0) is None
+    assert core.within_reach(alone, lists_of([1.0]), 0, 0.1, 10.0) is None
+    assert core.within_reach(lists_of([1.0]), alone, 0, 0.1, 10.0) is None
+    assert core.within_reach(plain, lists_of([1.0]), 0, 0.1, 10.0) is None
     assert core.least_change(alone, plain) is None
     for row in (-1, 2):
         assert core.observe(plain, row, 4, 1.0, 1.0, 0.0) is None
@@ -274,11 +296,16 @@ def test_what_is_too_large_for_single_precision_is_an_error_as_in_python():
 
 def test_nothing_is_written_beyond_the_end():
     buffer = bytearray(128)
-    for offset in (-1, 0, 63, 81, 2**62):
+    for offset in (-1, 0, 63, 73, 81, 2**62):
         with pytest.raises(ValueError, match="beyond the end"):
             core.write_step(buffer, offset, 5, 0, 0.0, (), lists_of([0.0]), 2)
         with pytest.raises(ValueError, match="beyond the end"):
-            core.write_array(buffer, offset, 5, 0, np.zeros(5), 0, 1)
+            core.write_array(buffer, offset, 5, 0, np.zeros(6 if offset == 73 else 5), 0, 1)
+    for tag, agent in ((-1, 0), (256, 0), (5, -1), (5, 65536)):
+        with pytest.raises(ValueError, match="beyond the end"):
+            core.write_array(buffer, 80, tag, agent, np.zeros(5), 0, 1)
+    for tag in (-1, 256):
+        assert core.write_step(buffer, 72, tag, 0, 0.0, (), lists_of([0.0]), 2) is None
     assert buffer == bytes(128)
     assert core.write_step(buffer, 72, 5, 0, 0.0, (), lists_of([0.0]), 2) == 128
     assert core.write_array(buffer, 80, 5, 0, np.zeros(5), 0, 1) == 128
@@ -440,6 +467,8 @@ def test_a_vehicle_that_has_left_is_refused_as_by_libsumo(run):
         ids, (point,) = core.in_sight(eyes, 1e-9)
         assert (ids, point) == (("ego",), libsumo.vehicle.getPosition("ego"))
         assert set(core.in_sight(eyes, math.inf)[0]) == set(libsumo.vehicle.getIDList())
+        libsumo.vehicle.add("ü", libsumo.vehicle.getRouteID("ego"))
+        assert core.Vehicles(("ü",), *nothing).read().points == [libsumo.vehicle.getPosition("ü")]
         with pytest.raises(TypeError, match="in_sight"):
             core.in_sight("ego", 1.0)
         with pytest.raises(libsumo.TraCIException):

@@ -48,6 +48,17 @@ COME_AND_GO = EGO + (
     '<vehicle id="shorter" depart="2.5" departPos="-12" departSpeed="7"><route edges="wc"/></vehicle>'
     '<person id="late" depart="3.3" departPos="70"><walk edges="wc" arrivalPos="20"/></person>'
 )
+STAND = (
+    '<vehicle id="{0}" type="{5}" depart="0" departPos="{1}" departSpeed="0"><route edges="{2}"/>'
+    '<stop lane="{3}" endPos="{1}" duration="{4}"/></vehicle>'
+)
+# SUMO takes one out of the jam, who finds no room on the next edge until those who stand there drive off.
+JAM = EGO.replace("10", "80", 1) + (
+    '<vType id="tram" length="42"/>'
+    + STAND.format("stopped", 190, "wc ce", "wc_0", 999, "DEFAULT_VEHTYPE")
+    + '<vehicle id="jammed" depart="0" departPos="180" departSpeed="0"><route edges="wc ce"/></vehicle>'
+    + "".join(STAND.format(f"full{row}", 43 + 48 * row, "ce", "ce_0", 6, "tram") for row in range(4))
+)
 WORLDS = {
     "crash": ("street", CRASH, 0.1, 80),
     "come and go": ("street", COME_AND_GO, 0.1, 75),
@@ -55,6 +66,7 @@ WORLDS = {
     "long steps": ("street", WALKERS, 1.0, 30),
     "bridge": ("bridge", BRIDGE, 0.1, 60),
     "bend": ("rail", BEND, 0.1, 120),
+    "jam": ("street", JAM, 0.1, 110),
 }
 
 
@@ -67,7 +79,8 @@ def test_a_trial_in_another_world_is_the_same_to_the_bit(tmp_path, world):
     (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>", encoding="utf-8")
     (tmp_path / "scenario.toml").write_text(
         f'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = {step_s}\nwarmup_s = 0.0\n'
-        f'[sumo]\nnet = "{net}.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nexisting = true\n'
+        f'[sumo]\nnet = "{net}.net.xml"\nroutes = ["r.rou.xml"]\noptions = {{ time-to-teleport = 2 }}\n'
+        "[agents.ego]\nexisting = true\n"
     )
     found, used = [], []
     for native in (None, False):
