@@ -175,7 +175,8 @@ class _Study:
         with self._seeded(number):
             self._study.enqueue_trial(params)
             trial = self._study.ask(self._distributions)
-            _ = trial.relative_params  # notes in which generation it is, and the like
+            if self._kind != "GPSampler":  # which notes nothing, and takes longest
+                _ = trial.relative_params  # notes in which generation it is, and the like
             self._study.tell(trial, score)
 
     @contextmanager
