@@ -77,7 +77,7 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
 
 
 def test_kinds_of_crashes_and_when_the_last_new_one_came():
-    kind = SimpleNamespace(signature="rear end, the agent into the other", bundles=(1, 2))
+    kind = SimpleNamespace(signature="rear end, the agent into the other", count=2)
     found = replace(status(2), kinds=(kind, kind), newest_kind_s=192.0, newest_kind_trials=1)
     for width in (40, 100):
         console = Console(width=width, height=12, force_terminal=True, color_system=None)
