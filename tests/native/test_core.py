@@ -328,6 +328,10 @@ def test_the_record_of_an_array_is_the_same(tmp_path, array):
 
 
 def test_it_is_used_only_where_it_is_known(monkeypatch):
+    from libsumo import _libsumo
+
+    assert core_for("1.28.0", _libsumo.__file__) is core
+    assert core_for("1.28.1", _libsumo.__file__) is None
     assert why_not("1.28.0") == ""
     assert "1.27.0" in why_not("1.27.0")
     assert core_for("1.27.0", "/nowhere") is None
