@@ -14,6 +14,7 @@ import random
 import resource
 import signal
 import sys
+import sysconfig
 import types
 from collections import deque
 from contextlib import suppress
@@ -42,6 +43,7 @@ _IGNORED = frozenset({
     "__warningregistry__", "__builtins__", "_abc_impl", "__annotations__", "__weakref__", "__abstractmethods__",
     "last_exc", "last_type", "last_value", "last_traceback", "_",
 })  # fmt: skip
+_LIBRARY = tuple(os.path.join(sysconfig.get_path(name), "") for name in ("stdlib", "platstdlib"))  # noqa: PTH118
 _MOST = 50_000  # values of a user's that are looked at
 _DEEPEST = 6  # containers within containers; deeper ones are taken for unchanged
 _LIMITS = (
@@ -161,7 +163,12 @@ class Baseline:
         if getattr(module, "__name__", "").partition(".")[0] == "crashhunt":
             return False
         file = getattr(module, "__file__", None)
-        return isinstance(file, str) and file.startswith(self._code) and "site-packages" not in file
+        return (
+            isinstance(file, str)
+            and file.startswith(self._code)
+            and "site-packages" not in file
+            and not file.startswith(_LIBRARY)  # which a working directory such as / has below it as well
+        )
 
     def _table(self, label: str, table: Mapping[Any, Any]) -> None:
         self._tables.append((label, table, dict(table)))

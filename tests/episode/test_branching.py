@@ -31,7 +31,7 @@ def ask(tmp_path):
     return ask_it
 
 
-@pytest.mark.parametrize("scenario", ["toy", "loop"])
+@pytest.mark.parametrize("scenario", ["toy", pytest.param("loop", marks=pytest.mark.nightly)])
 def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scenario):
     found = ask(scenario)
     assert found["outcomes"] == ["survived", "survived"]
