@@ -220,6 +220,8 @@ def test_whom_a_controlled_vehicle_may_replace(town):
     assert drawn("".join(trips[:7])) == ["t20", "t30", "t40", "t50", "t60"]  # less of a warm-up
     tram, odd = '<trip id="x" type="tram" depart="0"/>', '<trip id="a|b" depart="1"/>'
     assert drawn(trips[0] + tram + odd) == []  # only one is left
+    (town / "r.rou.xml").write_text(f'<routes><vType id="tram" vClass="tram"/>{tram.replace("0", "900")}</routes>')
+    assert load_scenario(path, ego="x").agents["x"].depart_s == 900.0  # who is named is waited for, on rails too
     flow = '<flow id="f" begin="0" end="3600" period="0.5" from="a" to="b"/>'
     many = drawn(flow)
     assert len(many) == len(set(many)) == 200

@@ -46,6 +46,7 @@ class _Departure:
 
     vehicle: str
     depart_s: float
+    off_road: bool  # a tram, a train, a ship
 
 
 def number(text: str, option: str, path: Path) -> float:
@@ -86,9 +87,9 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
         ScenarioError: it says something else, or there is nobody.
     """
     kind, _, value = ego.partition("=")
-    if kind == "any" and not value:
-        return _anybody(files, begin, path, "")
-    if ego and not value:
+    if ego in ("", "any"):
+        return _anybody(ego, files, begin, path)
+    if not value:
         kind, value = "vehicle", ego
     if kind == "route":
         return Ego(_EGO, AgentSetup(route=value), f"the controlled vehicle is added on the route {value!r}", {})
@@ -101,28 +102,19 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
         return Ego(
             value, AgentSetup(existing=True, depart_s=depart), f"the controlled vehicle is the vehicle {value!r}", {}
         )
-    if kind:
-        raise ScenarioError(
-            f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
-        )
-    try:
-        return _anybody(files, begin, path, "no --ego was given: ")
-    except ScenarioError:
-        for route in _elements(files, "route"):
-            if route.get("id"):
-                note = f"no --ego was given and no vehicle departs: one is added on the route {route.get('id')!r}"
-                return Ego(_EGO, AgentSetup(route=str(route.get("id"))), note, {})
-        raise
+    raise ScenarioError(
+        f"--ego {ego!r} is not understood", fix="write VEHICLE, route=ID, edges=FROM,TO or any", where=str(path)
+    )
 
 
-def _anybody(files: list[Path], begin: float, path: Path, why: str) -> Ego:
-    """Draw the vehicle in each trial, of those that depart when there is traffic."""
+def _anybody(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
+    """Draw the vehicle in each trial, of those that depart when there is traffic; where none departs, add one."""
+    why = "" if ego else "no --ego was given: "
     # Who would have departed before the simulation begins never does.
-    known = sorted((one for one in _departures(files) if one.depart_s >= begin), key=lambda one: one.depart_s)
+    known = [one for one in _departures(files) if one.depart_s >= begin and not one.off_road]
+    known.sort(key=lambda one: one.depart_s)
     if not known:
-        raise ScenarioError(
-            "no vehicle and no route is defined in its files", fix="give --ego edges=FROM,TO", where=str(path)
-        )
+        return _on_any_route(files, path)
     first, last = known[0].depart_s, known[-1].depart_s
     since = first + min(_BUSY_AFTER_S, (last - first) / 3)
     found = [one for one in known if since <= one.depart_s <= since + _WINDOW_S] or known
@@ -153,27 +145,37 @@ def _anybody(files: list[Path], begin: float, path: Path, why: str) -> Ego:
     )
 
 
+def _on_any_route(files: list[Path], path: Path) -> Ego:
+    for route in _elements(files, "route"):
+        if route.get("id"):
+            note = f"no vehicle departs that the files name: one is added on the route {route.get('id')!r}"
+            return Ego(_EGO, AgentSetup(route=str(route.get("id"))), note, {})
+    raise ScenarioError(
+        "no vehicle and no route is defined in its files", fix="give --ego edges=FROM,TO", where=str(path)
+    )
+
+
 def _departures(files: list[Path]) -> list[_Departure]:
-    """The vehicles of the road that can be named before the simulation has run; of a flow, the first."""
+    """The vehicles that can be named before the simulation has run; of a flow, those that soon depart."""
     found = []
     elements = _elements(files, "vehicle", "trip", "flow", "vType")
     elsewhere = {one.get("id") for one in elements if one.tag == "vType" and one.get("vClass") in _NO_ROAD}
     for element in elements:
         name, begin = element.get("id", ""), element.get("depart", element.get("begin", "0"))
-        if not name or element.tag == "vType" or element.get("type") in elsewhere:  # no name: the flow of a calibrator
+        if not name or element.tag == "vType":  # no name: the flow of a calibrator
             continue
         try:
             depart = seconds(begin, Path())
         except ScenarioError:  # "triggered" and the like: nobody knows when
             continue
         if element.tag == "flow":
-            found += _of_flow(element, name, depart)
+            found += _of_flow(element, name, depart, element.get("type") in elsewhere)
         else:
-            found.append(_Departure(name, depart))
+            found.append(_Departure(name, depart, element.get("type") in elsewhere))
     return found
 
 
-def _of_flow(flow: ET.Element, name: str, begin: float) -> list[_Departure]:
+def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[_Departure]:
     """The vehicles of a flow that depart until whoever is drawn has."""
     try:
         interval = _interval(flow, begin)
@@ -182,18 +184,18 @@ def _of_flow(flow: ET.Element, name: str, begin: float) -> list[_Departure]:
         span = min(end - begin, 2 * (_BUSY_AFTER_S + _WINDOW_S))
         count = max(1, min(most, _MANY, int(span / interval) if interval > 0 else 1))
     except (ScenarioError, ZeroDivisionError, OverflowError, ValueError):
-        return [_Departure(f"{name}.0", begin)]
-    return [_Departure(f"{name}.{index}", begin + index * interval) for index in range(count)]
+        return [_Departure(f"{name}.0", begin, off_road)]
+    return [_Departure(f"{name}.{index}", begin + index * interval, off_road) for index in range(count)]
 
 
 def _departure_of(vehicle: str, files: list[Path]) -> float:
     """When a vehicle departs, as far as its files tell; SUMO calls the vehicles of a flow ``FLOW.0``, ``FLOW.1``."""
-    flow, _, number = vehicle.rpartition(".")
+    flow, _, place = vehicle.rpartition(".")
     for element in _elements(files, "flow"):
-        if element.get("id") == flow and number.isdecimal():
+        if element.get("id") == flow and place.isdecimal():
             try:
                 begin = seconds(element.get("begin", "0"), Path())
-                return begin + int(number) * _interval(element, begin)
+                return begin + int(place) * _interval(element, begin)
             except (ScenarioError, ZeroDivisionError):
                 return 0.0
     return next((found.depart_s for found in _departures(files) if found.vehicle == vehicle), 0.0)
