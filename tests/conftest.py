@@ -176,6 +176,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
+def _modules_of_its_own() -> Iterator[None]:
+    """What a test has imported from its own folder is no other test's, nor found by others."""
+    modules, path = set(sys.modules), [*sys.path]
+    yield
+    sys.path[:] = path
+    for name in sys.modules.keys() - modules:
+        if (getattr(sys.modules[name], "__file__", None) or "").startswith(tempfile.gettempdir() + os.sep):
+            del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
 def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test itself replays, end to end, starts as little as what its commands do."""
     if request.path.parent.name == "e2e":
