@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import functools
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -120,6 +122,14 @@ def test_a_simulator_that_is_named_in_code_is_found(tmp_path):
         '"""SUMO."""\nimport gymnasium\nif x.sumo:\n    """highway"""\n    f(gym=1, y="a sumo")\n'
     )
     assert [line.partition(":")[0] for line in simulators_named(tmp_path / "m.py")] == ["3", "5", "5"]
+
+
+def test_a_command_imports_no_library_before_it_knows_that_it_needs_one():
+    # A slip costs every command a quarter of a second.
+    heavy = "{'numpy', 'gymnasium', 'libsumo', 'mcap', 'pydantic', 'rich', 'PIL', 'sqlite3'}"
+    subprocess.run(
+        [sys.executable, "-c", f"import sys, crashhunt.cli; assert not {heavy} & {{*sys.modules}}"], check=True
+    )
 
 
 def test_no_module_is_longer_than_four_hundred_lines():

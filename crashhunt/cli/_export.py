@@ -75,8 +75,12 @@ def _hand_on(options: argparse.Namespace) -> int:
     write: Callable[..., Any] = write_openscenario if options.form == "openscenario" else write_commonroad
     with opened_crash(options.directory, options.crash) as (bundle, _):
         actors = write(bundle, options.file, with_agents=options.recorded_agent)
-    size = options.file.stat().st_size
-    say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB), for {options.form}", as_json=options.json)
+    files = [options.file]
+    if options.form == "openscenario":
+        files.append(options.file.with_suffix(".xodr"))
+    size = sum(file.stat().st_size for file in files)
+    names = " and ".join(map(str, files))
+    say(f"{bundle.id} is in {names} ({size / 1e6:.2f} MB), for {options.form}", as_json=options.json)
     if options.json:
         print(
             json.dumps(

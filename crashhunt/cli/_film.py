@@ -12,7 +12,6 @@ from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import integer, number
 from crashhunt.cli._progress import shown_progress
-from crashhunt.crashes import most_dangerous
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -99,6 +98,7 @@ def filmed(
         yield chosen
         return
     with tempfile.TemporaryDirectory(prefix="crashhunt-panels-") as folder:
+        from crashhunt.crashes import most_dangerous
         from crashhunt.render import shown_steps
 
         first = 0
@@ -151,6 +151,7 @@ def _shot(
     crashed: bool,
     meanings: Sequence[str] = (),
 ) -> Shot:
+    from crashhunt.crashes import most_dangerous
     from crashhunt.recording import read_lanes
     from crashhunt.render import Shot
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
@@ -74,7 +75,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _unjudged(options: argparse.Namespace) -> list[Bundle]:
-    from crashhunt.crashes import INTERRUPTED, judgement_of, list_bundles
+    from crashhunt.crashes import judgement_of, list_bundles
     from crashhunt.hunts import find_hunts
     from crashhunt.trial import Outcome
 
@@ -87,7 +88,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
         if bundle.result.outcome is Outcome.COLLISION
         and bundle.result.collision is not None
         and bundle.result.collision.other
-        and ((known := judgement_of(bundle)) is None or known.why_not == INTERRUPTED)
+        and ((known := judgement_of(bundle)) is None or known.is_interrupted)
     ]
 
 
@@ -107,8 +108,10 @@ def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *,
             stopped=lambda: bool(stops),
         )
     known = judgement_of(bundle)
-    bundle = with_judgement(bundle, found)
     ran = found.runs or (found.why is not None and found.why.runs)
+    if found.why is None and known is not None:  # not asked for this time
+        found = replace(found, why=known.why)
+    bundle = with_judgement(bundle, found)
     if write and ran and (not stops or known is None):  # half an answer does not replace a whole one
         bundle.write()
     story = Story(bundle)

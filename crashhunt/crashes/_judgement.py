@@ -141,6 +141,11 @@ class Judgement:
         return "avoidable" if best is not None and visible is None else "unknown"
 
     @property
+    def is_interrupted(self) -> bool:
+        """Whether somebody broke it off, so that more could be known."""
+        return INTERRUPTED in (self.why_not, self.why.why_not if self.why is not None else "")
+
+    @property
     def runs(self) -> int:
         """How many trials were run for it."""
         return sum(len(attempt.endings) for attempt in self.attempts)

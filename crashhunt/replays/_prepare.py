@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays._debugger import Look
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import TrialSpec
+    from crashhunt.trial import TrialSpec, Value
 
 __all__ = ["Code", "ReplayOptions", "Rerun", "prepare"]
 
@@ -87,6 +87,15 @@ class Rerun:
     warnings: tuple[str, ...]
     other_traffic: tuple[str, ...] = ()
     elsewhere: bool = False
+
+    @property
+    def defaults(self) -> dict[tuple[str, str], Value | None]:
+        """The default of each argument, by agent (empty for the scenario's own) and name; None where it has none."""
+        scenario = self.worker.scenario
+        found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
+        for agent in scenario.agents:
+            found |= {(agent, name): known.default for name, known in scenario.agent_arguments(agent).items()}
+        return found
 
 
 def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:

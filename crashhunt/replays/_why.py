@@ -23,7 +23,7 @@ from crashhunt.replays._doings import Doing, doings_of, near_ones
 from crashhunt.replays._warm import StoppedError
 from crashhunt.triage import LaneMap
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
-from crashhunt.world import outlines_overlap
+from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from crashhunt.replays._prepare import Rerun
     from crashhunt.replays._warm import Ended, Reruns
     from crashhunt.trial import Distribution, TrialSpec, Value
-    from crashhunt.world import Scene
 
 __all__ = ["find_why"]
 
@@ -151,8 +150,9 @@ class _Search:
             if recording is None or not self._alike(recording, step):
                 return LeftOut(given, "unclear")
             if asked.factor.kind == "other":
-                told = [one.vehicle for one in recording.disturbances if one.vehicle == asked.factor.name]
-                if asked.factor.name not in told:
+                held = asked.runs[place][1].disturbances[-1]
+                told = [(one.step, one.what, one.vehicle) for one in recording.disturbances]
+                if (held.step, held.what, held.vehicle) not in told:
                     return LeftOut(given, "unclear")  # it could not be done
             into = self._into(recording, asked.held, step) if asked.held else ""
         ending: Without = "none"
@@ -182,7 +182,7 @@ class _Search:
             away = np.hypot(*(scene.centers - scene.centers[row]).T)
             for other in np.flatnonzero(away < scene.roster.touch_distance).tolist():
                 name = scene.roster.actors[other].id
-                if name != held and name not in recording.agents and _touch(scene, row, other):
+                if name != held and name not in recording.agents and first_contact(None, scene, row, other):
                     return str(name)
         return ""
 
@@ -236,7 +236,7 @@ class _Search:
 
     def _arguments(self) -> Iterator[_Asked]:
         """Every argument that varies: at its default, and at other values that the hunt may draw."""
-        defaults = self._defaults()
+        defaults = self._rerun.defaults
         for (agent, name), distribution in self._settings.space.items():
             known = self._spec.arguments.get(agent, {}) if agent else self._spec.scenario_arguments
             if isinstance(distribution, Constant) or name not in known:
@@ -245,25 +245,19 @@ class _Search:
             if default is not None and default != was:
                 at_default = [(default, self._with(agent, name, default))]
                 yield _Asked(Factor("argument", title, "default", was=was), at_default)
-            values = [value for value in self._drawn(title, distribution) if value not in (was, default)]
+            drawn = dict.fromkeys(self._drawn(title, distribution))  # the same value again would be the same trial
+            values = [value for value in drawn if value not in (was, default)]
             yield _Asked(
                 Factor("argument", title, "drawn", was=was),
                 [(value, self._with(agent, name, value)) for value in values[:_DRAWS]],
             )
 
     def _drawn(self, title: str, distribution: Distribution) -> list[Value]:
-        if isinstance(distribution, Choice):
-            return list(distribution.options)
         sequence = np.random.SeedSequence(self._spec.seed, spawn_key=(_TRAFFIC, *title.encode()))
         rng = np.random.default_rng(sequence)
+        if isinstance(distribution, Choice):
+            return [distribution.options[place] for place in rng.permutation(len(distribution.options))]
         return [distribution.sample(rng) for _ in range(_DRAWS)]
-
-    def _defaults(self) -> dict[tuple[str, str], Value | None]:
-        scenario = self._rerun.worker.scenario
-        found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
-        for agent in scenario.agents:
-            found |= {(agent, name): known.default for name, known in scenario.agent_arguments(agent).items()}
-        return found
 
     def _with(self, agent: str, name: str, value: Value) -> TrialSpec:
         spec = replace(self._spec, max_steps=self.steps)
@@ -279,12 +273,3 @@ class _Search:
         yield _Asked(
             Factor("seed", "seed", "drawn", was=self._spec.seed), [(seed, replace(spec, seed=seed)) for seed in seeds]
         )
-
-
-def _touch(scene: Scene, row: int, other: int) -> bool:
-    return outlines_overlap(_outline(scene, row), _outline(scene, other))
-
-
-def _outline(scene: Scene, row: int) -> tuple[float, float, float, float, float]:
-    actor, (x, y) = scene.roster.actors[row], scene.points[row]
-    return x, y, scene.headings[row], actor.length, actor.width

@@ -57,24 +57,16 @@ class Scripting:
         """How many were recorded."""
         return self._paths.steps
 
-    def spec(self, part: Part, like: TrialSpec | None = None) -> TrialSpec:
-        """Return the trial.
-
-        Args:
-            part: who takes part, and from when on.
-            like: whose arguments and disturbances it has; without, those that were recorded.
-        """
+    def spec(self, part: Part) -> TrialSpec:
+        """Return the trial of a part, with the arguments that were recorded."""
         paths = self._paths.driven_by(part.agents).only(part.others)
         paths = paths.cut(part.begin, paths.steps, self._step_s).placing()
-        base = like or self._spec
-        disturbances = base.disturbances
-        if base.script is None:  # else they have been shifted; what befell the others is in their ways
-            kept = (one for one in disturbances if one.what in OF_AGENT and one.step > part.begin)
-            disturbances = tuple(replace(one, step=one.step - part.begin) for one in kept)
+        disturbed = (one for one in self._spec.disturbances if one.what in OF_AGENT and one.step > part.begin)
         return replace(
-            base,
-            arguments={agent: given for agent, given in base.arguments.items() if agent in part.agents},
-            disturbances=disturbances,
+            self._spec,
+            arguments={agent: given for agent, given in self._spec.arguments.items() if agent in part.agents},
+            # What befell the others is in their ways.
+            disturbances=tuple(replace(one, step=one.step - part.begin) for one in disturbed),
             only=None,
             script=paths,
             max_steps=paths.steps + max(1, round(_LONGER_S / self._step_s)),

@@ -53,6 +53,7 @@ class Search:
         self._rerun, self._runs, self._form = rerun, runs, form
         self._everybody: tuple[str, ...] = ()
         self._left_out = True
+        self._shortest = runs.most_steps
         self._scripting = Scripting(rerun) if form != "traffic" and can_be_scripted(rerun) else None
 
     def run(self, stopped: Callable[[], bool]) -> tuple[Ended, str]:
@@ -121,11 +122,12 @@ class Search:
             return
         if not self._left_out:
             return
-        self._everybody = self._runs.entered(replace(best, only=(EVERYBODY,)))
+        if not self._everybody:
+            self._everybody = self._runs.entered(replace(best, only=(EVERYBODY,)))
         if not self._everybody:
             self._left_out = False  # the simulator cannot do it
             return
-        shortest, likely = self._runs.most_steps, self._likely()
+        shortest, likely = self._shortest, self._likely()
         middle = min(best.max_steps, round(2 * shortest + _LONGER_S / self._rerun.recorded.prologue.step_length_s))
         lengths = dict.fromkeys((shortest, middle, best.max_steps))
         for most in lengths if self._scripting is None else (shortest, middle):
@@ -162,30 +164,27 @@ class Search:
 
     def _script(self, scripting: Scripting) -> None:
         self._runs.most_steps = max(self._runs.most_steps, 2 * scripting.steps + 100)
-        best = self.best
-        before = len(self.smaller)
-        part = self._fewest_moved(scripting)
-        if part is None:
-            return
-        good = self._try([scripting.spec(one) for one in self._later(scripting, part)])
-        if good is not None:
-            part = self._later(scripting, part)[good]
-        if best.only is not None and not self._is_smaller(part, best):
-            self.best = best
-            del self.smaller[before:]
-            return
-        self._until_nothing_helps(lambda: None)
+        best, before = self.best, len(self.smaller)
+        try:
+            part = self._fewest_moved(scripting)
+            if part is not None:
+                self._try([scripting.spec(replace(part, begin=begin)) for begin in scripting.begins(part.agents)])
+        finally:  # also where it is interrupted: the first that came again may have everybody in it
+            if self.best is not best and not self._is_smaller(best):
+                self.best = best
+                del self.smaller[before:]
+        if self.best.script is not None:
+            self._until_nothing_helps(lambda: None)
 
-    def _is_smaller(self, part: Part, than: TrialSpec) -> bool:
-        """Whether it has fewer actors, agents or steps than one in which the others drive."""
-        only = than.only or ()
-        if self._form == "scripted":
+    def _is_smaller(self, than: TrialSpec) -> bool:
+        """Whether the best has fewer actors, agents or steps than one in which the others drive."""
+        script = self.best.script
+        if self._form == "scripted" or script is None or than.only is None:
             return True
-        if len(part.agents) < len(than.arguments):
+        agents, others = len(script.agents), len(script.names)
+        if agents < len(than.arguments) or agents + others < len(than.arguments) + len(than.only):
             return True
-        if len(part.agents) + len(part.others) < len(than.arguments) + len(only):
-            return True
-        return not only and part.begin > 0
+        return not than.only and self.steps_cut > 0
 
     def _fewest_moved(self, scripting: Scripting) -> Part | None:
         """Leave out all of the others that it does not take; None where it does not come again in this form."""
@@ -210,9 +209,6 @@ class Search:
 
         return replace(found, others=fewest(found.others, tried))
 
-    def _later(self, scripting: Scripting, part: Part) -> list[Part]:
-        return [replace(part, begin=begin) for begin in scripting.begins(part.agents)]
-
     # What both have
 
     def _fewer_disturbances(self) -> None:
@@ -224,7 +220,7 @@ class Search:
         fewest(best.disturbances, tried)
 
     def _plainer_arguments(self) -> None:
-        defaults = self._defaults()
+        defaults = self._rerun.defaults
         at_default = self.best
         for key in _keys(self.best):
             if defaults.get(key) is not None:
@@ -236,13 +232,6 @@ class Search:
             values = plainest(_value(best, key), defaults.get(key))
             if values:
                 self._try([_with(best, key, value) for value in values])
-
-    def _defaults(self) -> dict[tuple[str, str], Value | None]:
-        scenario = self._rerun.worker.scenario
-        found = {("", name): known.default for name, known in scenario.scenario_arguments().items()}
-        for agent in scenario.agents:
-            found |= {(agent, name): known.default for name, known in scenario.agent_arguments(agent).items()}
-        return found
 
     # What came of it
 

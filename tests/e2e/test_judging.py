@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
-from crashhunt.crashes import find_bundle, judgement_of
+from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
 from crashhunt.replays import ReplayOptions, judge
 from crashhunt.replays._avoiding import Search
 
@@ -50,6 +51,20 @@ def test_what_is_found_is_kept_and_told(toy):
     escape = before["escape"]
     assert escape["step"] == brake["last_step"]
     assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
+    # Asked for less, it keeps what it knows; and what was broken off is taken up again.
+    (less,) = toy.crashhunt("judge", "h", "--runs", "9", "--why", "0", "--json").json["judged"]
+    assert less["why"] == judged["why"]
+    bundle = find_bundle(toy.folder / "h")
+    known = judgement_of(bundle)
+    assert known.why is not None
+    assert not known.is_interrupted
+    for broken in (
+        replace(known, why_not=INTERRUPTED),
+        replace(known, why=replace(known.why, why_not=INTERRUPTED)),
+    ):
+        with_judgement(bundle, broken).write()
+        words = ("judge", "h", "--all", "--runs", "1", "--why", "1", "--json")
+        assert [one["crash"] for one in toy.crashhunt(*words).json["judged"]] == [bundle.id]
     assert toy.crashhunt("check", "h").out.endswith("are as written\n")
 
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.shrinking import fewest, plainest
+from crashhunt.shrinking import _stages, fewest, plainest
+from crashhunt.shrinking._runs import OutOfTimeError
+from crashhunt.shrinking._scripting import Part
+from crashhunt.trial import TrialSpec
 
 
 def first(good, seen):
@@ -61,3 +67,67 @@ def test_where_each_is_needed_none_is_left_out_and_nothing_of_nothing():
 def test_values_become_plainer(value, default, plainer):
     assert plainest(value, default) == plainer
     assert list(map(type, plainest(value, default))) == list(map(type, plainer))
+
+
+OTHERS = tuple("abcdefgh")
+
+
+class Scripting:
+    """Parts of a crash of 100 steps."""
+
+    whole, steps = Part(("ego",), OTHERS), 100
+
+    def spec(self, part):
+        script = SimpleNamespace(names=part.others, agents=part.agents)
+        return TrialSpec(0, 1, {"ego": {}}, {}, 110, script=script)
+
+    def begins(self, agents):
+        return []
+
+
+class Runs:
+    """In traffic it takes these three, and where others are moved it takes all.
+
+    Args:
+        scripted: how many runs in which others are moved there is time for.
+    """
+
+    def __init__(self, scripted):
+        self.most_steps, self.left, self.lengths = 100, scripted, []
+
+    def entered(self, spec):
+        return OTHERS
+
+    def first(self, specs, *, again=False):
+        for place, spec in enumerate(specs):
+            if spec.script is None:
+                self.lengths.append(self.most_steps)
+            elif not self.left:
+                raise OutOfTimeError
+            else:
+                self.left -= 1
+            present = OTHERS if spec.only is None else spec.only
+            if spec.script.names == OTHERS if spec.script else {*"abc"} <= {*present}:
+                return place
+        return None
+
+
+@pytest.mark.parametrize("scripted", [0, 1, 8, 10, 10**6])
+def test_time_that_runs_out_while_others_are_moved_takes_nothing_away(monkeypatch, scripted):
+    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS[:6]))
+    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
+    monkeypatch.setattr(_stages.Search, "steps_cut", 0)
+    spec = TrialSpec(0, 1, {"ego": {}}, {}, 300)
+    rerun = SimpleNamespace(
+        spec=spec,
+        defaults={},
+        recorded=SimpleNamespace(agents=("ego",), prologue=SimpleNamespace(step_length_s=0.1)),
+        bundle=SimpleNamespace(
+            confirmed=True, driver="ego", result=SimpleNamespace(collision=SimpleNamespace(other="a"), event=None)
+        ),
+    )
+    search = _stages.Search(rerun, Runs(scripted), "either")
+    search._scripting = Scripting()
+    assert search.run(lambda: False)[0] in ("time", "done")
+    assert search.best == replace(spec, only=("a", "b", "c"))
+    assert search.smaller[-1] == search.best
