@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.hunts._from_the_start import Found
-from crashhunt.trial import TrialResult
+from crashhunt.trial import Branches
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._from_the_start import FromTheStart
-    from crashhunt.hunts._ledger import Ledger
-    from crashhunt.plans import HuntSettings
-    from crashhunt.trial import Branch, Branches
+    from crashhunt.trial import Branch
 
 __all__ = ["BranchReport", "BranchReportData", "look_at_branches"]
 
@@ -79,40 +77,37 @@ class BranchReport:
         }
 
 
-def look_at_branches(ledger: Ledger, settings: HuntSettings, again: FromTheStart) -> BranchReport | None:
+def look_at_branches(copies: FromTheStart) -> BranchReport | None:
     """Sum up what branches came to, and run the likeliest that crashed from the start, in fresh processes.
 
     Args:
-        ledger: of the hunt.
-        settings: of the hunt.
-        again: runs trials from the start.
+        copies: runs from the start what they have found.
 
     Returns:
         None where there were to be none.
     """
-    if not settings.branch:
+    ledger = copies.again.ledger
+    if not copies.again.settings.branch:
         return None
-    asked = [
-        (result, result.branches) for result in map(TrialResult.from_json, ledger.plain_results()) if result.branches
-    ]
-    found = [(result, max(branches.crashes, key=_likely)) for result, branches in asked if branches.crashes]
-    likeliest = sorted(found, key=lambda pair: -_likely(pair[1]))[:_LIKELIEST]
+    sums = [0] * 6
+    found: list[tuple[int, Branch]] = []  # of each trial the likeliest; there may be a million trials
+    for plain in ledger.plain_results():
+        if not (data := plain.get("branches")):
+            continue
+        one = Branches.from_json(data)
+        counts = (1, one.moments, one.asked, one.steps, one.left_out, len(one.crashes))
+        sums = [sum(pair) for pair in zip(sums, counts, strict=True)]
+        if one.crashes:
+            found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
     specs = [
         Found(replace(result.spec, disturbances=branch.disturbances, origin="branch"), branch.outcome, branch.step)
-        for result, branch in likeliest
+        for number, branch in sorted(found, key=lambda pair: -_likely(pair[1]))[:_LIKELIEST]
+        if (result := ledger.result(number)) is not None
     ]
-    every: list[Branches] = [branches for _, branches in asked]
-    return BranchReport(
-        len(every),
-        sum(one.moments for one in every),
-        sum(one.asked for one in every),
-        sum(one.steps for one in every),
-        sum(one.left_out for one in every),
-        sum(len(one.crashes) for one in every),
-        len(found),
-        len(specs),
-        again.crashes(specs, layout.BRANCHES),
-    )
+    crashes = copies.crashes(specs, layout.BRANCHES)
+    trials, moments, branches, steps, left_out, crashed = sums
+    run_again = 0 if copies.is_stopped else len(specs)
+    return BranchReport(trials, moments, branches, steps, left_out, crashed, len(found), run_again, crashes)
 
 
 def _likely(branch: Branch) -> float:

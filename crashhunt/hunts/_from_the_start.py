@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.crashes import write_bundle
-from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, read_map
-from crashhunt.hunts._workers import settings_again
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.replays import confirm
 
 if TYPE_CHECKING:
@@ -17,14 +15,10 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.disturbances import Disturber
-    from crashhunt.hunts._directory import HuntDirectory
-    from crashhunt.plans import HuntSettings
-    from crashhunt.snapshots import Snapshot
+    from crashhunt.hunts._again import RunsAgain
     from crashhunt.trial import TrialSpec
 
 __all__ = ["Found", "FromTheStart"]
-
-_LOOK_EVERY_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,57 +41,46 @@ class FromTheStart:
     """Runs from the start what copies have found.
 
     Args:
-        place: of the hunt.
-        settings: of the hunt.
-        snapshot: of the code that ran.
+        again: runs trials of the hunt again.
         disturber: knows how likely disturbances are; None where the hunt has no models.
-        stops: requests to stop, as they come.
     """
 
-    place: HuntDirectory
-    settings: HuntSettings
-    snapshot: Snapshot
+    again: RunsAgain
     disturber: Disturber | None
-    stops: Sequence[int]
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether somebody wants to stop: what was found may not have been run from the start then."""
+        return bool(len(self.again.stops))
 
     def crashes(self, found: Sequence[Found], folder: str) -> tuple[Bundle, ...]:
         """Return those that crashed in the same way at the same step, and once more to the bit, in their order.
 
         Args:
             found: of different trials.
-            folder: of the hunt, for the bundles; what it had before is gone.
+            folder: of the hunt, for the bundles; what it had before is gone, unless somebody wants to stop.
         """
-        directory, scratch = self.place.path, self.place.scratch / folder
-        shutil.rmtree(directory / folder, ignore_errors=True)
-        if not found or self.stops:
+        if self.is_stopped:
             return ()
-        scratch.mkdir(exist_ok=True)
-        again = settings_again(self.settings, self.snapshot, scratch)
-        executor = FreshProcessExecutor(again, parallel=self.settings.run.parallel or 1)
-        waiting = {one.spec.number: one for one in found}
-        order, bundles = list(waiting), {}
+        shutil.rmtree(self.again.place.path / folder, ignore_errors=True)
+        wanted = {one.spec.number: one for one in found}
+        bundles: dict[int, Bundle] = {}
         try:
-            for one in found:
-                executor.submit(one.spec)
-            while waiting and not self.stops:
-                for ended in executor.completed(_LOOK_EVERY_S):
-                    wanted = waiting.pop(ended.spec.number)
-                    if (str(ended.outcome), ended.steps) != (wanted.outcome, wanted.step):
-                        continue
-                    if self.disturber is not None:
-                        ended = replace(ended, log_likelihood=self.disturber.log_likelihood_of(ended))
-                    trial = scratch_of(scratch, ended.spec.number)
-                    bundles[ended.spec.number] = write_bundle(
-                        directory, ended, trial, hunt_seed=self.settings.seed, snapshot=self.snapshot.digest,
-                        lanes=read_map(scratch, trial), place=folder,
-                    )  # fmt: skip
-        finally:
-            executor.close()
-        confirmed = (self._confirmed(bundles[number]) for number in order if number in bundles)
+            for one in self.again.run([one.spec for one in found], folder):
+                result, copy = one.result, wanted[one.result.spec.number]
+                if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
+                    continue
+                if self.disturber is not None:
+                    result = replace(result, log_likelihood=self.disturber.log_likelihood_of(result))
+                bundles[result.spec.number] = one.write(result)
+        except CrashhuntError as error:
+            self.again.notes.append(f"what copies have found could not be run from the start: {error}")
+        with ThreadPoolExecutor(self.again.parallel) as threads:  # which only wait for their process
+            confirmed = list(threads.map(self._confirmed, (bundles[number] for number in wanted if number in bundles)))
         return tuple(bundle for bundle in confirmed if bundle is not None)
 
     def _confirmed(self, bundle: Bundle) -> Bundle | None:
-        found = confirm(bundle, lambda: bool(self.stops))
+        found = confirm(bundle, lambda: self.is_stopped)
         if found is None or not found.confirmed:
             shutil.rmtree(bundle.path, ignore_errors=True)
             return None

@@ -17,6 +17,7 @@ from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
+from crashhunt.hunts._again import RunsAgain
 from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._branched import look_at_branches
 from crashhunt.hunts._directory import HuntDirectory
@@ -173,9 +174,9 @@ class Hunt:
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
-        near = keep_near_misses(self._place, ledger, settings, progress.notes, self._parallel_here, self._stops)
-        again = FromTheStart(self._place, settings, snapshot, self._disturber, self._stops)
-        probes, branches = look_at_probes(ledger, settings, again), look_at_branches(ledger, settings, again)
+        again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
+        copies = FromTheStart(again, self._disturber)
+        near, probes, branches = keep_near_misses(again), look_at_probes(copies), look_at_branches(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         reason = ""
@@ -351,11 +352,9 @@ class Hunt:
         """Run every crash that nobody has confirmed yet once more, in a fresh process."""
 
         def confirmed(bundle: Bundle) -> Bundle:
-            if bundle.confirmed is None and not self._stops:
-                found = confirm(bundle, lambda: bool(self._stops))
-                if found is not None:
-                    bundle = found
-                    bundle.write()
+            if bundle.confirmed is None and not self._stops and (found := confirm(bundle, lambda: bool(self._stops))):
+                found.write()
+                return found
             return bundle
 
         with ThreadPoolExecutor(self._parallel_here) as threads:  # which only wait for their process

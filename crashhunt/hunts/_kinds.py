@@ -65,7 +65,10 @@ class Kinds:
         self._groups: tuple[Group, ...] | None = None
         self.newest = newest
         self.newest_trial: int | None = None
-        self.dropped = {words: list(numbers) for words, numbers in (dropped or {}).items()}
+        there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
+        self.dropped = {
+            words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
+        }
         for bundle in crashes:
             self._sign(bundle)
 
@@ -93,15 +96,20 @@ class Kinds:
         """
         found = []
         for group in groups_of(self._signed.values()):
-            lengths = sorted(group.bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-            for bundle in lengths[keep:]:
+            for bundle in sorted(group.bundles, key=self._worth)[keep:]:
                 number = bundle.result.spec.number
                 del self._signed[number]
+                self._at_fault.discard(number)
                 self.dropped.setdefault(str(group.signature), []).append(number)
                 found.append(bundle)
         if found:
             self._groups = None
         return found
+
+    def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
+        """What is kept first: what was hunted for, and of that the shortest."""
+        result = bundle.result
+        return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
 
     @property
     def until(self) -> int | None:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.hunts._from_the_start import Found
-from crashhunt.trial import TrialResult, in_turn
+from crashhunt.trial import Stress, in_turn
 
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._from_the_start import FromTheStart
-    from crashhunt.hunts._ledger import Ledger
-    from crashhunt.plans import HuntSettings
-    from crashhunt.trial import Stress, TrialSpec
+    from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["ProbeData", "ProbeReport", "look_at_probes"]
 
@@ -71,32 +70,37 @@ class ProbeReport:
         }
 
 
-def look_at_probes(ledger: Ledger, settings: HuntSettings, again: FromTheStart) -> ProbeReport | None:
+def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
     """Sum up what copies were asked, and run the mildest that made a trial crash from the start, in fresh processes.
 
     Args:
-        ledger: of the hunt.
-        settings: of the hunt.
-        again: runs trials from the start.
+        copies: runs from the start what they have found.
 
     Returns:
         None where nobody has asked.
     """
-    if not settings.probe:
+    ledger = copies.again.ledger
+    if not copies.again.settings.probe:
         return None
-    asked = [(result, result.stress) for result in map(TrialResult.from_json, ledger.plain_results()) if result.stress]
-    found = sorted((pair for pair in asked if pair[1].disturbance is not None), key=lambda pair: pair[1].margin)
+    margins: list[float] = []
+    sums = [0] * 3
+    found: list[tuple[float, int, Stress]] = []
+    for plain in ledger.plain_results():
+        if not (data := plain.get("stress")):
+            continue
+        stress = Stress.from_json(data)
+        margins.append(stress.margin)
+        sums = [sum(pair) for pair in zip(sums, (stress.probes, stress.steps, stress.left_out), strict=True)]
+        if stress.disturbance is not None:
+            found.append((stress.margin, plain["spec"]["number"], stress))
     mildest = [
-        Found(_specification(result, stress), stress.outcome, stress.step) for result, stress in found[:_MILDEST]
+        Found(_specification(result, stress), stress.outcome, stress.step)
+        for _, number, stress in sorted(found, key=itemgetter(0))[:_MILDEST]
+        if (result := ledger.result(number)) is not None
     ]
-    return ProbeReport(
-        tuple(stress.margin for _, stress in asked),
-        sum(stress.probes for _, stress in asked),
-        sum(stress.steps for _, stress in asked),
-        sum(stress.left_out for _, stress in asked),
-        len(mildest),
-        again.crashes(mildest, layout.PROBES),
-    )
+    crashes = copies.crashes(mildest, layout.PROBES)
+    probes, steps, left_out = sums
+    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(mildest), crashes)
 
 
 def _specification(result: TrialResult, stress: Stress) -> TrialSpec:

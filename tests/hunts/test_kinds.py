@@ -69,6 +69,24 @@ def test_of_each_kind_the_shortest_few_are_kept_and_all_count():
     assert RunSettings(keep=2, distinct=2).checked().keep == 2
 
 
+def test_who_is_killed_while_giving_bundles_up_counts_none_twice():
+    crashes = [crash(1, "KeyError", 4), crash(2, "KeyError", 9)]
+    kinds = Kinds(0, crashes)
+    assert [bundle.id for bundle in kinds.surplus(1)] == ["c2"]
+    again = Kinds(0, crashes, dropped=kinds.dropped)  # the ledger was told, and the bundle is there
+    assert again.groups()[0].count == 2
+    assert [bundle.id for bundle in again.surplus(1)] == ["c2"]
+    assert (again.dropped, again.groups()[0].count) == (kinds.dropped, 2)
+
+
+def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
+    monkeypatch.setattr(_kinds, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
+    kinds = Kinds(1, [crash(1, "KeyError", 4), crash(2, "KeyError", 9), crash(3, "KeyError", 6)], only_at_fault=True)
+    assert [bundle.id for bundle in kinds.surplus(1)] == ["c2", "c1"]
+    assert kinds.at_fault == (3,)  # of those that are kept
+    assert Kinds(1, [crash(3, "KeyError", 6)], only_at_fault=True, dropped=kinds.dropped).until == 3
+
+
 def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
     assert RunSettings(distinct=3).checked().keep_going
     assert not RunSettings().checked().keep_going

@@ -279,9 +279,9 @@ class Bridge:
             if ended.files:
                 self._keep(node, ended)
         self._missing += len(found)
-        self._control.sendall(b"".join(ended.line for ended in found))
-        for note in news.notes:
+        for note in news.notes:  # before results, too: after the last one nobody listens
             self._say(note=note)
+        self._control.sendall(b"".join(ended.line for ended in found))
         if news.where is not None:
             self._say(node=node.id, where=news.where)
         if news.error is not None:

@@ -1,0 +1,107 @@
+"""Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.crashes import write_bundle
+from crashhunt.episode import scratch_of
+from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.hunts._workers import settings_again
+from crashhunt.snapshots import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sized
+    from pathlib import Path
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.hunts._directory import HuntDirectory
+    from crashhunt.hunts._ledger import Ledger
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import TrialResult, TrialSpec
+
+__all__ = ["Again", "RunsAgain"]
+
+_LOOK_EVERY_S = 0.1  # how late Ctrl-C may be
+
+
+@dataclass(frozen=True, slots=True)
+class RunsAgain:
+    """Runs trials of a hunt again.
+
+    Args:
+        place: of the hunt.
+        ledger: of the hunt, which knows the code of each trial.
+        settings: of the hunt.
+        parallel: how many run at a time.
+        notes: gets a line for whatever went wrong.
+        stops: has something in it as soon as somebody wants to stop.
+    """
+
+    place: HuntDirectory
+    ledger: Ledger
+    settings: HuntSettings
+    parallel: int
+    notes: list[str]
+    stops: Sized
+
+    def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
+        """Yield each trial as it ends, until somebody wants to stop.
+
+        Args:
+            specs: of different trials of the hunt; what else they say may have been changed.
+            folder: of the hunt, into which bundles of them are written.
+
+        Raises:
+            CrashhuntError: they cannot be run.
+        """
+        by_snapshot: dict[str, list[TrialSpec]] = {}
+        for spec in specs:
+            by_snapshot.setdefault(self.ledger.snapshot_of(spec.number), []).append(spec)
+        scratch = self.place.scratch / folder
+        for digest, group in by_snapshot.items():
+            snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
+            scratch.mkdir(exist_ok=True)
+            try:
+                again = settings_again(self.settings, snapshot, scratch)
+                with closing(FreshProcessExecutor(again, parallel=self.parallel)) as executor:
+                    waiting = len(group)
+                    for spec in group:
+                        executor.submit(spec)
+                    while waiting and not len(self.stops):
+                        for result in executor.completed(_LOOK_EVERY_S):
+                            waiting -= 1
+                            yield Again(result, self, digest, scratch, folder)
+            finally:
+                shutil.rmtree(scratch, ignore_errors=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """A trial that has been run again.
+
+    Args:
+        result: what came of it.
+        runs: which ran it.
+        snapshot: the digest of its code.
+        scratch: the folder of the workers.
+        folder: of the hunt, for its bundle.
+    """
+
+    result: TrialResult
+    runs: RunsAgain
+    snapshot: str
+    scratch: Path
+    folder: str
+
+    def write(self, result: TrialResult, *, confirmed: bool | None = None) -> Bundle:
+        """Write the bundle: what it has left behind, with a result; return it."""
+        trial = scratch_of(self.scratch, result.spec.number)
+        return write_bundle(
+            self.runs.place.path, result, trial, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
+            lanes=read_map(self.scratch, trial), place=self.folder, confirmed=confirmed,
+        )  # fmt: skip
