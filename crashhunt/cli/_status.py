@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from crashhunt.cli._common import Commands
-    from crashhunt.hunts import HuntState
+    from crashhunt.hunts import BranchSums, HuntState, ProbeSums
 
 __all__ = ["add_status", "show_states", "states_console", "states_table"]
 
@@ -100,6 +100,8 @@ def states_table(states: list[HuntState]) -> Table:
             str(state.errors),
             Text(said),
         )
+        for told in copies_told(state):
+            table.add_row(*[""] * 7, Text(told))
         if state.core is not None:
             table.add_row(Text(one_line(f"  compiled core {state.core}")))
         for node in (state.nodes or [])[:_NODES]:
@@ -108,6 +110,27 @@ def states_table(states: list[HuntState]) -> Table:
         if len(state.nodes or []) > _NODES:
             table.add_row(f"  and {len(state.nodes or []) - _NODES} more")
     return table
+
+
+def copies_told(state: HuntState) -> list[str]:
+    """Return what came of the copies of a hunt's trials so far, a line each; nothing where it has none."""
+    told = []
+    if (probes := state.probes) is not None:
+        least = "no stress margin yet"
+        if probes["least"] is not None:
+            least = f"least stress margin {probes['least']:.2f}, trial {probes['trial']}"
+        crashed = f"{probes['crashed_trials']} of {probes['trials']} trials made to crash"
+        told.append(f"{least}; {probes['probes']} probes, {crashed}{_confirmed(probes)}")
+    if (branches := state.branches) is not None:
+        crashed = f"{branches['crashed']} crashed, {branches['crashed_trials']} of {branches['trials']} trials"
+        told.append(
+            f"{branches['branches']} branches from {branches['moments']} moments, {crashed}{_confirmed(branches)}"
+        )
+    return told
+
+
+def _confirmed(sums: ProbeSums | BranchSums) -> str:
+    return f"; from the start {sums['confirmed']} of {sums['run_again']} as well" if sums["run_again"] else ""
 
 
 def _crashes(state: HuntState) -> str:

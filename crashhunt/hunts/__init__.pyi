@@ -1,4 +1,5 @@
 from ._check import Checked as Checked, check as check
+from ._copies import BranchSums as BranchSums, ProbeSums as ProbeSums
 from ._directory import HuntDirectory as HuntDirectory
 from ._hunt import Hunt as Hunt
 from ._ledger import Ledger as Ledger, Turn as Turn, has_begun as has_begun

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.hunts._kinds import KindData
 
@@ -40,6 +40,8 @@ class Noted(TypedDict, total=False):
         origins: whether its sampler says where trials come from.
         core: whether the simulator's compiled core is used; None where it has none.
         disturb: how often what disturbs its trials; None where nothing does.
+        copies: of its trials, which there are to be, some of ``probes`` and ``branches``; None where there are none.
+        confirmed: of these, how many trials were run from the start of what they found, and how many crashed there.
         nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
         kinds: of crashes, the most frequent first, where it collects them all.
         dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
@@ -59,6 +61,8 @@ class Noted(TypedDict, total=False):
     origins: bool
     core: str | None
     disturb: list[str] | None
+    copies: list[str] | None
+    confirmed: Mapping[str, Sequence[int]] | None
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
     newest_kind: float | None

@@ -19,14 +19,14 @@ from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
 from crashhunt.hunts._audit import Audit
-from crashhunt.hunts._branched import look_at_branches
+from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._from_the_start import FromTheStart
 from crashhunt.hunts._ledger import Ledger
+from crashhunt.hunts._look_at_copies import look_at_copies
 from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
 from crashhunt.hunts._preflight import Heard, Preflight, why_invalid
-from crashhunt.hunts._probed import look_at_probes
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
@@ -164,6 +164,7 @@ class Hunt:
             plain_origin=sampler.plain_origin or None,
             core=core_of(self.scenario, settings.run),
             disturb=list(settings.disturb) or None,
+            copies=copies_to_come(settings),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         stopped: StoppedBecause
@@ -176,12 +177,11 @@ class Hunt:
         self._confirm(progress)
         again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
         copies = FromTheStart(again, self._disturber)
-        near, probes, branches = keep_near_misses(again), look_at_probes(copies), look_at_branches(copies)
+        near, (probes, branches) = keep_near_misses(again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
-        reason = ""
-        if stopped == "no_valid_trial" and progress.last_invalid is not None:
-            reason = why_invalid(progress.last_invalid, self.scenario)
+        invalid = progress.last_invalid if stopped == "no_valid_trial" else None
+        reason = why_invalid(invalid, self.scenario) if invalid is not None else ""
         ledger.enter(stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(

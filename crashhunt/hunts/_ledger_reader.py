@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import sqlite3
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
@@ -140,6 +141,17 @@ class LedgerReader:
             f"WHERE {WITH_EVENTS} GROUP BY event.key"
         )
         return {kind: (count, trials) for kind, count, trials in rows}
+
+    def summed(self, what: str, of: str) -> list[Row]:
+        """Return sums over all trials, rows whose data cannot be read left out.
+
+        Args:
+            what: is selected of them.
+            of: the query for each, in which ``{stress.margin}`` is a value of its plain data and ``data`` all of it.
+        """
+        each = re.sub(r"{([\w.]+)}", r"json_extract(data, '$.\1')", of)
+        trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
+        return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
     def steps_total(self) -> int:
         """Return how many steps were run in all."""

@@ -8,7 +8,7 @@ import os
 import socket
 import time
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,11 +16,13 @@ from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import read_object
 from crashhunt.base.names import near_path
+from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._ledger_file import damaged
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    from crashhunt.hunts._copies import BranchSums, ProbeSums
     from crashhunt.hunts._data import Facts, Owner
     from crashhunt.hunts._kinds import KindData
     from crashhunt.plans import HuntSettings
@@ -67,6 +69,8 @@ class HuntState:
         owner_alive: whether its process is there.
         damaged: whether its ledger cannot be read, so that the counts say nothing.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
+        probes: what came of them so far; None where it has none.
+        branches: likewise.
         core: whether the simulator's compiled core is used; None where it has none.
         nodes: the machines on which it runs, or ran last: fields of `NodeFigures`; None where it was this one only.
         kinds: of crashes, the most frequent first: fields of `KindData`; None where the first crash ends the hunt.
@@ -90,6 +94,8 @@ class HuntState:
     nodes: list[dict[str, Any]] | None = None
     kinds: list[KindData] | None = None
     newest_kind_s: float | None = None
+    probes: ProbeSums | None = None
+    branches: BranchSums | None = None
 
     @property
     def failed(self) -> bool:
@@ -99,12 +105,9 @@ class HuntState:
     def to_json(self) -> dict[str, object]:
         """Return the shape of one hunt in ``status --json``."""
         data = asdict(self)
-        if self.disturbed is None:
-            del data["disturbed"]
-        if self.core is None:
-            del data["core"]
-        if self.nodes is None:
-            del data["nodes"]
+        for name in ("disturbed", "core", "nodes", "probes", "branches"):
+            if data[name] is None:
+                del data[name]
         if self.kinds is None:
             del data["kinds"], data["newest_kind_s"]
         return data
@@ -157,7 +160,8 @@ def hunt_state(directory: Path) -> HuntState:
     try:
         with closing(Ledger(directory / layout.LEDGER)) as ledger:
             facts, outcomes, last = ledger.facts(), ledger.outcomes(), ledger.last_ended_at()
-            return _state(directory, facts, outcomes, last)
+            found = _state(directory, facts, outcomes, last)
+            return replace(found, probes=sums_of_probes(ledger, facts), branches=sums_of_branches(ledger, facts))
     except HuntDirectoryError as error:
         if not (directory / layout.LEDGER).exists():
             raise

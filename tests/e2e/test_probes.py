@@ -47,7 +47,17 @@ def test_a_hunt_tells_how_little_it_would_take_and_confirms_it_from_the_start(sh
     assert "reproduced" in shell.crashhunt("replay", crash["path"]).out
     shell.crashhunt("export", "h", "crash.zip", "--crash", "1")
     assert "ego drove into leader" in shell.crashhunt("show", "crash.zip").out
-    assert shell.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == 0
+    state = shell.crashhunt("status", "h", "--json").json["hunts"][0]
+    assert state["crashes"] == 0
+    least = min(rows, key=lambda row: float(row["stress_margin"]))
+    assert state["probes"] == {
+        **{name: found[name] for name in ("trials", "least", "probes", "steps", "left_out", "run_again", "confirmed")},
+        "trial": int(least["number"]), "crashed_trials": 3,
+    }  # fmt: skip
+    assert "branches" not in state
+    told = " ".join(shell.crashhunt("status", "h").out.split())
+    assert f"least stress margin {found['least']:.2f}, trial {least['number']}; {found['probes']} probes" in told
+    assert "3 of 3 trials made to crash; from the start 3 of 3 as well" in told
     assert shell.crashhunt("check", "h").code == 0
     (shell.folder / "h" / "probes" / "000001-collision" / "log.mcap").unlink()
     (damaged,) = shell.crashhunt("check", "h", "--json", expect=1).json["hunts"]
