@@ -72,6 +72,7 @@ class Runs:
 
     Attributes:
         count: how many have been run, or are known from the last time.
+        steps: of these, altogether.
         most_steps: what takes longer to crash does not count as the same.
     """
 
@@ -88,7 +89,7 @@ class Runs:
         stopped: Callable[[], bool],
         watch: Watch | None,
     ) -> None:
-        self.count = 0
+        self.count = self.steps = 0
         self.most_steps = max(1, rerun.bundle.result.steps_begun)
         self._rerun, self._signature, self._memory_file = rerun, signature, memory
         self._budget, self._stopped, self._watch = budget, stopped, watch
@@ -142,7 +143,9 @@ class Runs:
                 self._stop_if_asked()
         finally:
             self._give_up(numbers, -1)
-        self.count += sum(1 for place in found if place <= best)
+        counted = [ran for place, ran in found.items() if place <= best]
+        self.count += len(counted)
+        self.steps += sum(ran.steps for ran in counted)
         if self._watch is not None:
             self._watch(min(self.count, self._budget), self._budget)
         if best < len(candidates):
@@ -167,6 +170,7 @@ class Runs:
             self._stop_if_asked()
         folder = scratch_of(self._scratch, number)
         names: list[str] = []
+        self.steps += results[0].steps
         same = self._judged(results[0], keep=True).digest == self._rerun.bundle.result.digest
         with suppress(OSError, ValueError):
             names = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8")) if same else []

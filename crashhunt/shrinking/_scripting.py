@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base import layout
 from crashhunt.trial import OF_AGENT
 from crashhunt.world import paths_of
 
@@ -36,6 +35,11 @@ class Part:
     agents: tuple[str, ...]
     others: tuple[str, ...]
     begin: int = 0
+
+    @property
+    def count(self) -> int:
+        """How many take part."""
+        return len(self.agents) + len(self.others)
 
 
 class Scripting:
@@ -87,8 +91,11 @@ def can_be_scripted(rerun: Rerun) -> bool:
     """Whether simulator and the crashhunt that runs it can move others along recorded ways."""
     if not rerun.worker.scenario.backend.plays_paths:
         return False
+    scenario = rerun.worker.scenario
+    names = (scenario.simulator, *scenario.tables)
+    its = tuple(f"/scenario/backends/{name}{end}.py" for name in names for end in ("", "/_backend"))
     return not rerun.worker.code or any(
-        name.endswith(f"/{layout.PACKAGE.name}/scenario/_backend.py")
-        and "plays_paths" in (rerun.snapshot.path / name).read_text(encoding="utf-8", errors="replace")
+        name.endswith(its)
+        and "plays_paths=True" in (rerun.snapshot.path / name).read_text(encoding="utf-8", errors="replace")
         for name in rerun.snapshot.manifest["files"]
     )

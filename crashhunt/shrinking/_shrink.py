@@ -50,6 +50,7 @@ class ShrunkData(TypedDict):
     steps_before: int
     steps_after: int
     trials_run: int
+    steps_run: int
     removed: list[str]
     changed: dict[str, list[Value | None]]
     scripted: list[str] | None
@@ -69,6 +70,7 @@ class Shrunk:
         why: what is to be known about the end, in words.
         actors: how many were seen before and after, the agents with them.
         trials: how many were run.
+        steps: of these, altogether.
         removed: who and what was taken away.
         changed: arguments that have another value: name to what it was and what it is.
         steps_cut: how many steps of the beginning were cut off.
@@ -82,6 +84,7 @@ class Shrunk:
     why: str = ""
     actors: tuple[int, int] = (0, 0)
     trials: int = 0
+    steps: int = 0
     removed: tuple[str, ...] = ()
     changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
     steps_cut: int = 0
@@ -109,6 +112,7 @@ class Shrunk:
             "steps_before": self.bundle.result.steps,
             "steps_after": after.result.steps,
             "trials_run": self.trials,
+            "steps_run": self.steps,
             "removed": list(self.removed),
             "changed": {name: list(values) for name, values in self.changed.items()},
             "scripted": None if self.scripted is None else list(self.scripted),
@@ -183,13 +187,19 @@ def shrink(
             why = "what was left did not do the same in a fresh process"
     if not search.reproduced:
         verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
-        return Shrunk(bundle, verdict, ended, None, why, search.actors(None), runs.count, notes=rerun.warnings)
+        return Shrunk(
+            bundle, verdict, ended, None, why, search.actors(None), runs.count, runs.steps,
+            notes=rerun.warnings,
+        )  # fmt: skip
     if small is None:
-        return Shrunk(bundle, "unchanged", ended, None, why, search.actors(None), runs.count, notes=rerun.warnings)
+        return Shrunk(
+            bundle, "unchanged", ended, None, why, search.actors(None), runs.count, runs.steps,
+            notes=rerun.warnings,
+        )  # fmt: skip
     if ended == "done":
         memory.unlink(missing_ok=True)
     return Shrunk(
-        bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count,
+        bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count, runs.steps,
         search.removed(), search.changed(), search.steps_cut, rerun.warnings,
     )  # fmt: skip
 

@@ -28,6 +28,7 @@ _FLAKY_TRIES = 10  # of one of which that is known
 _NEAR = 6  # of the others, so many that are nearest in the end are tried together
 _SINGLE = 40  # and so many one by one
 _SINGLE_OR_SCRIPTED = 6  # where there is another way
+_PAIRED = 24  # so many that were near in the end are tried together with the other one
 _LONGER_S = 5.0  # simulation time by which it may become longer, besides twice as long, where fewer take part
 _FEW = 3  # actors; with no more of them, the traffic goes on driving by itself
 
@@ -168,7 +169,11 @@ class Search:
         try:
             part = self._fewest_moved(scripting)
             if part is not None:
-                self._try([scripting.spec(replace(part, begin=begin)) for begin in scripting.begins(part.agents)])
+                later = [replace(part, begin=begin) for begin in scripting.begins(part.agents)]
+                if (good := self._try([scripting.spec(one) for one in later])) is not None:
+                    part = later[good]
+                if part.count > _FEW:
+                    self._fewer_from_later_on(scripting, part)
         finally:  # also where it is interrupted: the first that came again may have everybody in it
             if self.best is not best and not self._is_smaller(best):
                 self.best = best
@@ -208,6 +213,43 @@ class Search:
             return self._try([scripting.spec(replace(found, others=one)) for one in some])
 
         return replace(found, others=fewest(found.others, tried))
+
+    def _fewer_from_later_on(self, scripting: Scripting, part: Part) -> None:
+        """Leave out more where it begins later: what an agent did for those around it is done with by then.
+
+        Any single one of the others is tried, and pairs with whom it crashed; then all, of which some are left out
+        again: for an agent that decides by all that it sees, others may do than those whom it took from the start on.
+        """
+        begins = list(dict.fromkeys((part.begin, *scripting.begins(part.agents), 0)))
+        whole = scripting.whole
+        everybody = tuple(name for name in (*whole.agents, *whole.others) if name not in part.agents)
+        near = _nearest(self._rerun.recorded, self._rerun.bundle.driver)
+        near = [name for name in near if name in everybody][:_PAIRED]
+        other = tuple(name for name in self._others_of_the_crash() if name not in part.agents)
+        groups = dict.fromkeys([(), other, *((*other, name) for name in near if name not in other)])
+        few = [replace(part, others=group, begin=begin) for begin in begins for group in groups]
+        few = [one for one in few if one.count <= _FEW]
+        if self._try([scripting.spec(one) for one in few]) is not None:
+            return
+        best = part
+        for begin in begins:
+            crowd = part if begin == part.begin else replace(part, others=everybody, begin=begin)
+            found = self._without_any(scripting, crowd)
+            if found is not None and found.count < best.count:
+                best = found
+                self._try([scripting.spec(best)])
+            if best.count <= _FEW:
+                break
+
+    def _without_any(self, scripting: Scripting, part: Part) -> Part | None:
+        """Leave out of some all that it does not take; None where it does not come again with them."""
+        if self._runs.first([scripting.spec(part)]) is None:
+            return None
+
+        def tried(some: Sequence[tuple[str, ...]]) -> int | None:
+            return self._runs.first([scripting.spec(replace(part, others=one)) for one in some])
+
+        return replace(part, others=fewest(part.others, tried))
 
     # What both have
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import zlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
@@ -62,6 +63,14 @@ class Path:
     def last(self) -> int:
         """The step after which it was last seen."""
         return self.first + len(self.states) - 1
+
+    def at(self, step: int, step_length_s: float) -> State:
+        """Return where it was after a step; after its last one, straight on at an unchanged speed."""
+        state = self.states[min(step, self.last) - self.first]
+        if step <= self.last:
+            return state
+        away = state.speed * (step - self.last) * step_length_s
+        return state._replace(x=state.x + away * math.cos(state.heading), y=state.y + away * math.sin(state.heading))
 
     def cut(self, begin: int, end: int) -> Path | None:
         """Return what there is of it after the steps ``begin`` to ``end``, counted from ``begin``; None for nothing."""

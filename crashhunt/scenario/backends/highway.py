@@ -95,5 +95,6 @@ BACKEND = Backend(
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,
+    plays_paths=True,
     watched=("highway_env",),  # in Python, with settings in classes
 )

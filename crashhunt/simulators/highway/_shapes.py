@@ -6,16 +6,19 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from highway_env.vehicle.objects import Obstacle
 
-from crashhunt.world import Lane, rectangle_gap
+from crashhunt.world import Contact, Lane, rectangle_gap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from highway_env.road.road import RoadNetwork
     from highway_env.vehicle.objects import RoadObject
 
-__all__ = ["gap", "lanes_of"]
+    from crashhunt.world import Actor
+
+__all__ = ["contact_of", "gap", "lanes_of"]
 
 _LANE_STEP_M = 2.0  # between the points of a bend
 
@@ -38,3 +41,32 @@ def gap(one: RoadObject, two: RoadObject) -> float:
     halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
     turn = np.array([two.heading - one.heading])
     return float(rectangle_gap(np.array([[x * c + y * s, y * c - x * s]]), turn, *halves)[0])
+
+
+def contact_of(
+    agent: str,
+    vehicle: RoadObject,
+    things: Iterable[RoadObject],
+    actor_of: Callable[[RoadObject], Actor],
+    lane: str,
+) -> Contact:
+    """Return whom a controlled vehicle touches that has just crashed.
+
+    Args:
+        agent: its name.
+        vehicle: itself.
+        things: all that there are.
+        actor_of: returns what does not change about one of them.
+        lane: on which it is.
+    """
+    # An obstacle that something is pushed away from does not itself say so.
+    others = [other for other in things if other is not vehicle and (other.crashed or isinstance(other, Obstacle))]
+    hit = min(others, key=lambda other: gap(vehicle, other), default=None)
+    if hit is None:
+        return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
+    x, y = (hit.position - vehicle.position).tolist()
+    first, second = (agent, vehicle), (actor_of(hit).id, hit)
+    ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
+    if not ahead and not isinstance(hit, Obstacle):
+        first, second = second, first
+    return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))

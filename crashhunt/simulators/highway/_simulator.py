@@ -30,15 +30,16 @@ from crashhunt.simulators._actions import MetaAction
 from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, native
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators._standstill import Standstill
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.accelerator import switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._hidden import Hidden
-from crashhunt.simulators.highway._shapes import gap, lanes_of
+from crashhunt.simulators.highway._scripted import Puppet, Puppets
+from crashhunt.simulators.highway._shapes import contact_of, lanes_of
 from crashhunt.simulators.highway._taking_part import TakingPart
-from crashhunt.world import Actor, Contact, Event, Lane, Roster, Scene
+from crashhunt.simulators.highway._traffic_events import HighwayEvents
+from crashhunt.world import Actor, Lane, Roster, Scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
+    from crashhunt.world import Contact, Event, Paths
 
 __all__ = ["HighwaySimulator"]
 
@@ -112,7 +114,12 @@ class HighwaySimulator:
         self._contacts: list[Contact] = []
         self._steps = 0
         self._taking_part: TakingPart | None = None
-        if (only := (options or {}).get("only")) is not None:
+        self._puppets: Puppets | None = None
+        self._begins_s = 0.0
+        if (script := (options or {}).get("script")) is not None:
+            self._play(script)
+            shown = env.observation_type.observe()
+        elif (only := (options or {}).get("only")) is not None:
             self._taking_part = TakingPart(env.road, only, self.agents, self._objects, self._actor)
             if self._taking_part.remove():
                 shown = env.observation_type.observe()
@@ -121,8 +128,7 @@ class HighwaySimulator:
         self._on_road = {agent: bool(vehicle.on_road) for agent, vehicle in self._controlled.items()}
         self._disturbances = HighwayDisturbances(env.road, self._controlled.values())
         self._watch()
-        self._standstill = Standstill(self.step_length_s, self._scenario.events)
-        self._wrong: set[str] = set()
+        self._events = HighwayEvents(self.step_length_s, self._scenario.events, lanes_are_road=self._lanes_are_road)
         self._look(())
         return self._show(self.agents, shown), {}
 
@@ -137,6 +143,8 @@ class HighwaySimulator:
         self._steps += 1
         if self._taking_part is not None:
             self._taking_part.remove()
+        if self._puppets is not None:
+            self._puppets.enter(self._steps)
         off_road: list[str] = []
         arrived: list[str] = []
         for agent, vehicle in self._controlled.items():
@@ -147,7 +155,7 @@ class HighwaySimulator:
             if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
                 (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
         self._look(tuple(off_road))
-        self._scene.events = tuple([event for agent in actions for event in self._events(agent)])
+        self._scene.events = tuple([event for agent in actions for event in self._told(agent)])
         ended = bool(terminated or truncated)
         rewards = info.get("agents_rewards", (reward,) * len(self._possible))
         arrived += [
@@ -202,6 +210,11 @@ class HighwaySimulator:
     def entered(self) -> list[str]:
         """Who has come, where somebody may be left out."""
         return [] if self._taking_part is None else self._taking_part.entered
+
+    @property
+    def scripted(self) -> bool:
+        """Whether the others of this episode are moved along recorded ways."""
+        return self._puppets is not None
 
     def tidy(self) -> None:
         """Undo what the environment has changed in classes."""
@@ -258,6 +271,17 @@ class HighwaySimulator:
             kind = env.observation_type.agents_observation_types[0] if self._many_see else env.observation_type
             self.observation_names = tuple(getattr(kind, "features", ())) if len(seen[0].shape or ()) == 2 else ()
 
+    def _play(self, script: Paths) -> None:
+        """Have the others moved; an agent that is one of them drives no more."""
+        driven = {path.actor.id for path in script.agents}
+        self._controlled = {agent: vehicle for agent, vehicle in self._controlled.items() if agent in driven}
+        self.agents = list(self._controlled)
+        config = self._env.config
+        sub_steps = int(config["simulation_frequency"] // config["policy_frequency"])
+        self._puppets = Puppets(self._env.road, script, self._controlled, sub_steps, self.step_length_s)
+        self._begins_s = script.time_s
+        self._known |= {id(thing): (thing, actor) for thing, actor in self._puppets.actors}
+
     def _is_at_an_end(self, vehicle: RoadObject) -> bool:
         """Whether it has driven straight off the end of a lane that nothing follows."""
         along, lateral = vehicle.lane.local_coordinates(vehicle.position)
@@ -306,27 +330,10 @@ class HighwaySimulator:
             for agent, vehicle in self._controlled.items():
                 if vehicle.crashed and agent not in self._crashed:
                     self._crashed.add(agent)
-                    self._contacts.append(self._contact(agent, vehicle))
+                    lane = self._lane_name(vehicle.lane_index)
+                    self._contacts.append(contact_of(agent, vehicle, self._objects(), self._actor, lane))
 
         road.step = step
-
-    def _contact(self, agent: str, vehicle: RoadObject) -> Contact:
-        # An obstacle that something is pushed away from does not itself say so.
-        others = [
-            other
-            for other in self._objects()
-            if other is not vehicle and (other.crashed or isinstance(other, Obstacle))
-        ]
-        hit = min(others, key=lambda other: gap(vehicle, other), default=None)
-        lane = self._lane_name(vehicle.lane_index)
-        if hit is None:
-            return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
-        x, y = (hit.position - vehicle.position).tolist()
-        first, second = (agent, vehicle), (self._actor(hit).id, hit)
-        ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
-        if not ahead and not isinstance(hit, Obstacle):
-            first, second = second, first
-        return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))
 
     def _objects(self) -> list[RoadObject]:
         """Everybody and everything that can be hit."""
@@ -354,6 +361,11 @@ class HighwaySimulator:
             self._roster = Roster(tuple(map(self._actor, things)))
         points, headings, speeds = [], [], []
         for thing, actor in zip(things, self._roster.actors, strict=True):
+            if isinstance(thing, Puppet):
+                points.append((thing.shown.x, thing.shown.y))
+                headings.append(thing.shown.heading)
+                speeds.append(thing.shown.speed)
+                continue
             (x, y), heading, half = thing.position.tolist(), float(thing.heading), actor.length / 2
             points.append((x + half * math.cos(heading), 0.0 - (y + half * math.sin(heading))))  # no minus zero
             headings.append(0.0 - heading)
@@ -362,28 +374,15 @@ class HighwaySimulator:
         lanes: tuple[str, ...] = ()
         if self._steps % _LANES_EVERY == 0 or contacts or off_road:
             lanes = tuple([self._lane_name(thing.lane_index) for thing in things])
-        time_s = self._steps * self.step_length_s
+        time_s = self._begins_s + self._steps * self.step_length_s
         self._scene = Scene(time_s, self._roster, points, headings, speeds, contacts, off_road, lanes)
         for agent, vehicle in self._controlled.items():
             self._scene.agent_lanes[agent] = self._lane_name(vehicle.lane_index)
 
-    def _events(self, agent: str) -> Iterator[Event]:
-        """What is told of a controlled vehicle: that it stands, or drives against its lane."""
+    def _told(self, agent: str) -> Iterator[Event]:
         vehicle = self._controlled[agent]
-        speed = float(vehicle.speed)
         point = self._scene.points[self._scene.roster.index[agent]]
-        lane = self._lane_name(vehicle.lane_index)
-        if stood := self._standstill.look(agent, speed):
-            yield Event("not_moving", agent, f"{agent} had stood still for {stood:g} s", (), lane, *point, speed)
-        along, _ = vehicle.lane.local_coordinates(vehicle.position)
-        turn = float(vehicle.heading) - float(vehicle.lane.heading_at(along))
-        # Of lanes above each other, highway-env takes the one that runs as the vehicle does.
-        if not self._lanes_are_road or abs(speed) < Standstill.SPEED or math.cos(turn) * speed >= -0.5 * abs(speed):
-            self._wrong.discard(agent)
-        elif agent not in self._wrong:
-            self._wrong.add(agent)
-            how = "backwards" if speed < 0 else "the wrong way"
-            yield Event("wrong_way", agent, f"{agent} drove {how} on lane {lane}", (), lane, *point, speed)
+        return self._events.look(agent, vehicle, point, self._lane_name(vehicle.lane_index))
 
     def _lane_name(self, index: tuple[str, str, int]) -> str:
         found = self._lane_names.get(index)

@@ -81,17 +81,10 @@ class ScriptedSight:
         return path.first <= steps and (steps <= path.last or path.last >= self._script.steps)
 
     def _row(self, path: Path, steps: int) -> Row:
-        state = path.states[min(steps, path.last) - path.first]
+        state = path.at(steps, sumo.simulation_getDeltaT())
         lane = next((lane for step, lane in reversed(path.lanes) if step <= steps), "")
-        spine = next((spine for step, spine in path.spines if step == min(steps, path.last)), None)
-        if steps > path.last:
-            state, spine = self._gone_on(path, state, steps), None
+        spine = next((spine for step, spine in path.spines if step == steps), None)
         return path.actor, state, lane, spine
-
-    def _gone_on(self, path: Path, state: State, steps: int) -> State:
-        """Where somebody is after the end of what was recorded, at an unchanged speed."""
-        away = state.speed * (steps - path.last) * sumo.simulation_getDeltaT()
-        return state._replace(x=state.x + away * math.cos(state.heading), y=state.y + away * math.sin(state.heading))
 
 
 def place_agents(script: Paths) -> None:

@@ -1,0 +1,173 @@
+"""Others who are moved along recorded ways: puppets on highway-env's road, which heed nobody."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import Obstacle
+
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.world import State
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from highway_env.road.road import Road
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
+
+    from crashhunt.world import Actor, Path, Paths
+
+__all__ = ["Puppet", "Puppets"]
+
+
+class Puppet(Vehicle):  # type: ignore[misc]
+    """A vehicle that is where one was recorded, after each step to the bit, and on a straight line in between.
+
+    Args:
+        road: of the environment.
+        path: the recorded way; past its end it goes straight on.
+        sub_steps: of the simulation in each step.
+        step_length_s: of a step.
+    """
+
+    impact: NDArray[np.float64] | None
+
+    def __init__(self, road: Road, path: Path, sub_steps: int, step_length_s: float) -> None:
+        self.LENGTH, self.WIDTH = path.actor.length, path.actor.width
+        self.path = path
+        self.shown = path.states[0]
+        self._sub_steps, self._step_length_s = sub_steps, step_length_s
+        self._done = path.first * sub_steps
+        self.route = None  # as of who has none, which environments ask for
+        super().__init__(road, *place_of(path.states[0], path.actor.length))
+
+    def begin(self, steps: int) -> None:
+        """Be where it was after so many steps."""
+        self._done = steps * self._sub_steps
+        self._move()
+
+    def act(self, action: dict[str, float] | str | None = None) -> None:
+        """Decide nothing."""
+
+    def step(self, dt: float) -> None:
+        """Go on by a sub-step, wherever anybody is."""
+        self._done += 1
+        self._move()
+
+    def predict_trajectory_constant_speed(
+        self, times: NDArray[np.float64]
+    ) -> tuple[list[NDArray[np.float64]], list[float]]:
+        """Where it would be if it went straight on, for whoever has right of way to look at."""
+        return [self.position + time * self.velocity for time in times], [self.heading] * len(times)
+
+    def _move(self) -> None:
+        steps, rest = divmod(self._done, self._sub_steps)
+        self.shown = self.path.at(steps, self._step_length_s)
+        if rest:
+            self.shown = _between(self.shown, self.path.at(steps + 1, self._step_length_s), rest / self._sub_steps)
+        self.position, self.heading, self.speed = place_of(self.shown, self.path.actor.length)
+        if self.impact is not None:  # it is not pushed aside, but the one that it has touched asks whether it was hit
+            self.crashed, self.impact = True, None
+        self.on_state_update()
+
+
+class Puppets:
+    """Has the others of an episode moved.
+
+    Args:
+        road: of the environment; whoever is on it goes.
+        script: who was where.
+        agents: the controlled vehicles that drive, by their names. They are put where they begin.
+        sub_steps: of the simulation in each step.
+        step_length_s: of a step.
+
+    Raises:
+        InvalidEpisodeError: where an agent begins is not known.
+    """
+
+    def __init__(
+        self, road: Road, script: Paths, agents: Mapping[str, Vehicle], sub_steps: int, step_length_s: float
+    ) -> None:
+        self._road, self._agents = road, list(agents.values())
+        self._end = script.steps
+        begins = {path.actor.id: path.states[0] for path in script.agents if path.first == 0}
+        for agent, vehicle in agents.items():
+            if agent not in begins:
+                raise InvalidEpisodeError(f"where {agent!r} is to begin is not known")
+            _place(vehicle, begins[agent], late=script.time_s > 0)
+        self.things: list[tuple[Path, RoadObject]] = [
+            (path, _thing(road, path, sub_steps, step_length_s)) for path in script.others
+        ]
+        self.enter(0)
+
+    @property
+    def actors(self) -> list[tuple[RoadObject, Actor]]:
+        """The others, and as whom they were recorded."""
+        return [(thing, path.actor) for path, thing in self.things]
+
+    def enter(self, steps: int) -> None:
+        """Have exactly those on the road who were there after so many steps, and those that nobody can hit."""
+        road = self._road
+        there = [thing for path, thing in self.things if self._is_there(path, steps)]
+        known = {id(thing) for thing in road.vehicles}
+        for thing in there:
+            if isinstance(thing, Puppet) and id(thing) not in known:
+                thing.begin(steps)
+        road.vehicles = [*self._agents, *(thing for thing in there if isinstance(thing, Vehicle))]
+        marks = [thing for thing in road.objects if not (thing.solid and thing.collidable)]
+        road.objects = [*marks, *(thing for thing in there if not isinstance(thing, Vehicle))]
+
+    def _is_there(self, path: Path, steps: int) -> bool:
+        return path.first <= steps and (steps <= path.last or path.last >= self._end)
+
+
+def place_of(state: State, length: float) -> tuple[NDArray[np.float64], float, float]:
+    """Position of the centre, heading and speed as highway-env has them, of what a scene says."""
+    x = state.x - length / 2 * math.cos(state.heading)
+    y = state.y - length / 2 * math.sin(state.heading)
+    return np.array([x, -y]), -state.heading, state.speed
+
+
+def _thing(road: Road, path: Path, sub_steps: int, step_length_s: float) -> RoadObject:
+    if not path.actor.id.startswith("obstacle."):
+        return Puppet(road, path, sub_steps, step_length_s)
+    thing = Obstacle(road, *place_of(path.states[0], path.actor.length))
+    thing.LENGTH, thing.WIDTH = path.actor.length, path.actor.width
+    thing.diagonal = math.hypot(thing.LENGTH, thing.WIDTH)
+    return thing
+
+
+def _place(vehicle: Any, state: State, *, late: bool) -> None:
+    """Put a controlled vehicle where it was; what it was about to do is not known, so that it keeps lane and speed."""
+    vehicle.position, vehicle.heading, vehicle.speed = place_of(state, vehicle.LENGTH)
+    vehicle.on_state_update()
+    if not late or not isinstance(vehicle, ControlledVehicle):
+        return
+    vehicle.target_lane_index, vehicle.target_speed = vehicle.lane_index, vehicle.speed
+    if isinstance(vehicle, MDPVehicle):
+        vehicle.speed_index = vehicle.speed_to_index(vehicle.target_speed)
+        vehicle.target_speed = vehicle.index_to_speed(vehicle.speed_index)
+    vehicle.route = _rest(vehicle.route, vehicle.lane_index)
+
+
+def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
+    """What is left of a route for somebody on a lane."""
+    if not route:
+        return None
+    here = [number for number, part in enumerate(route) if tuple(part[:2]) == tuple(lane[:2])]
+    return list(route[here[0] :]) if here else list(route)
+
+
+def _between(state: State, after: State, share: float) -> State:
+    turn = math.remainder(after.heading - state.heading, math.tau)
+    return State(
+        state.x + share * (after.x - state.x),
+        state.y + share * (after.y - state.y),
+        state.heading + share * turn,
+        state.speed + share * (after.speed - state.speed),
+    )
