@@ -93,6 +93,11 @@ class Shell:
         self.folder = folder
         self.environment = _usual_environment()
 
+    @property
+    def unmeasured(self) -> dict[str, str]:
+        """The environment without what measures coverage, where that would be in the way of what is tested."""
+        return {name: value for name, value in self.environment.items() if not name.startswith("COVERAGE")}
+
     def crashhunt(self, *words: str, expect: int | None = 0, terminal: int | None = None) -> Done:
         """Run a command to its end: in a fork of a process that has imported what it needs, where that is the same.
 

@@ -20,7 +20,7 @@ def crash(shell, made_once):
 
 def typed(shell, text: str, *words: str) -> str:
     done = subprocess.run(
-        [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.environment, input=text,
+        [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.unmeasured, input=text,
         capture_output=True, text=True, timeout=150, check=False,
     )  # fmt: skip
     assert "Traceback" not in done.stderr, done.stderr
@@ -53,7 +53,7 @@ def test_backwards_and_on_from_there_to_the_same_bits(crash):
 
 def test_quitting_the_debugger_is_no_crash_of_ours(crash):
     done = subprocess.run(
-        [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.environment, input="q\n",
+        [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.unmeasured, input="q\n",
         capture_output=True, text=True, timeout=150, check=False,
     )  # fmt: skip
     assert done.returncode == 130

@@ -133,6 +133,7 @@ def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, 
 
 @pytest.mark.parametrize("after_s", mostly_nightly([0.15, 0.2, 0.25, 0.3, 0.4], always=(0.2, 0.3)))
 def test_an_interrupt_while_it_starts_is_not_lost(toy, after_s):
+    toy.environment = toy.unmeasured  # which takes longer to start, and loses it
     process = toy.start("run", "h", "2", "100000", "300", *FINE, start_new_session=True)
     time.sleep(after_s)
     process.send_signal(signal.SIGINT)
