@@ -166,7 +166,7 @@ class Paths:
             text = unpacking.decompress(base64.b64decode(data["packed"], validate=True), _MOST_BYTES)
             agents, others = ([_path(*plain) for plain in some] for some in json.loads(text))
             return cls(float(data["time_s"]), int(data["steps"]), tuple(agents), tuple(others))
-        except (ValueError, TypeError, KeyError, AttributeError, zlib.error, RecursionError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, zlib.error, RecursionError) as error:
             raise ValueError(f"recorded paths are damaged: {error}") from None
 
 
@@ -236,4 +236,7 @@ def _path(
     actor = Actor(str(name), str(kind), *map(float, size))
     centre_lines = tuple((int(step), tuple(tuple(map(float, point)) for point in line)) for step, line in spines)
     where = tuple((int(step), str(lane)) for step, lane in lanes)
-    return Path(actor, int(first), tuple(State(*map(float, state)) for state in states), where, centre_lines)  # type: ignore[arg-type]
+    seen = tuple(State(*map(float, state)) for state in states)
+    if not seen:
+        raise ValueError(f"{name} is nowhere")
+    return Path(actor, int(first), seen, where, centre_lines)  # type: ignore[arg-type]

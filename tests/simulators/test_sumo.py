@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import libsumo
 import numpy as np
 import pytest
 
+from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.recording import read_log
 from crashhunt.scenario import ObservationSetup, load_scenario, shipped_folder
 from crashhunt.simulators import Kinematics
@@ -101,6 +103,39 @@ def test_who_takes_the_place_of_another_drives_on_from_there(town, tmp_path):
                 assert scene.time_s == pytest.approx(was.time_s + scenario.step_length_s)
                 assert scene.points[row] == pytest.approx(was.points[before], abs=3.0)
                 assert scene.speeds[row] == pytest.approx(was.speeds[before], abs=1.0)
+
+
+def entered(town, tmp_path, vehicle, **changed):
+    """The agent in the place of somebody, or in that of each of two; where it is, and its route."""
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="any")
+    (setup,) = scenario.agents.values()
+    with closing(SumoSimulator(replace(scenario, **{"agents": {"ego": setup}, **changed}), tmp_path)) as simulator:
+        simulator.reset(seed=4, options={"arguments": {"scale": 1.0, "vehicle": vehicle}})
+        return libsumo.vehicle.getRoadID("ego"), libsumo.vehicle.getRoute("ego")
+
+
+def test_who_departs_further_on_is_replaced_there(town, tmp_path):
+    (town.folder / "r.rou.xml").write_text(
+        '<routes><route id="way" edges="south east north west"/>'
+        '<vehicle id="first" route="way" depart="0"/>'
+        '<vehicle id="here" route="way" depart="3" departEdge="2" departPos="20"/>'
+        '<vehicle id="late" route="way" depart="9"/></routes>'
+    )
+    assert entered(town, tmp_path, "here") == ("north", ("north", "west"))
+
+
+def test_who_has_departed_in_the_warm_up_is_told_of(town, tmp_path):
+    with pytest.raises(
+        InvalidEpisodeError, match=r"'odd.name#1.0' had departed in the warm-up already; lower warmup_s"
+    ):
+        entered(town, tmp_path, "odd.name#1.0", warmup_s=20.0)
+    assert entered(town, tmp_path, "odd.name#1.4", warmup_s=20.0)[0] == "south"
+
+
+def test_two_agents_cannot_take_one_place(town, tmp_path):
+    (setup,) = load_scenario(town.folder / "town.sumocfg", ego="any").agents.values()
+    with pytest.raises(InvalidEpisodeError, match=r"a and b both take the place of the vehicle 'odd.name#1.2'"):
+        entered(town, tmp_path, "odd.name#1.2", agents={"a": setup, "b": setup})
 
 
 def test_a_vehicle_that_never_enters_is_invalid(town):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
+import zlib
 
 import pytest
 
@@ -45,7 +47,9 @@ def test_they_come_back_from_json_to_the_bit():
     assert Paths.from_json(json.loads(json.dumps(found.to_json()))) == found
     flat = paths_of([Scene(0.0, Roster((EGO,)), [(0.1, 0.2)], [0.3], [0.4])], ())
     assert Paths.from_json(flat.to_json()) == flat
-    for wrong in ({"packed": "?"}, {"packed": "QUJD"}, {"steps": "x"}, {}):
+    plain = json.dumps([[[["ego", "car", 4.0, 2.0], 0, [], [], []]], []])
+    nowhere = base64.b64encode(zlib.compress(plain.encode())).decode()
+    for wrong in ({"packed": "?"}, {"packed": "QUJD"}, {"steps": "x"}, {"steps": 1e999}, {"packed": nowhere}, {}):
         with pytest.raises(ValueError, match="damaged"):
             Paths.from_json({**found.to_json(), **wrong} if wrong else {})
 

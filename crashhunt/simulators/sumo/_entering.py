@@ -20,8 +20,23 @@ __all__ = ["enter", "replaced_by"]
 
 
 def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
-    """Return the vehicles of the traffic whose places are taken, each with the agent that takes it."""
-    return {str(arguments.get(setup.replaces, "")): agent for agent, setup in agents.items() if setup.replaces}
+    """Return the vehicles of the traffic whose places are taken, each with the agent that takes it.
+
+    Raises:
+        InvalidEpisodeError: two agents would take the same place.
+    """
+    found: dict[str, str] = {}
+    for agent, setup in agents.items():
+        if not setup.replaces:
+            continue
+        vehicle = str(arguments.get(setup.replaces, ""))
+        if vehicle in found:
+            raise InvalidEpisodeError(
+                f"{found[vehicle]} and {agent} both take the place of the vehicle {vehicle!r}",
+                fix="let them draw from different vehicles",
+            )
+        found[vehicle] = agent
+    return found
 
 
 def enter(
@@ -44,6 +59,11 @@ def enter(
             taking_part.warm_up(begin + scenario.warmup_s)
         else:
             libsumo.simulationStep(begin + scenario.warmup_s)
+        if early := replaced.keys() & set(sumo.vehicle_getIDList()):
+            raise InvalidEpisodeError(
+                f"the vehicle {min(early)!r} had departed in the warm-up already",
+                fix="lower warmup_s, or choose a vehicle that departs later",
+            )
     for agent, setup in setups.items():
         if not setup.existing and not setup.replaces:
             _add(agent, setup)
@@ -64,7 +84,7 @@ def enter(
             taking_part.remove()
         departed = set(libsumo.simulation.getDepartedIDList())
         waiting -= departed
-        for vehicle in departed & replaced.keys():
+        for vehicle in sorted(departed & replaced.keys()):
             _replace(vehicle, replaced[vehicle])
     gone = set(setups) - set(sumo.vehicle_getIDList())
     if gone:
@@ -104,7 +124,8 @@ def _replace(vehicle: str, agent: str) -> None:
     route, kind = f"crashhunt.{agent}", libsumo.vehicle.getTypeID(vehicle)
     lane, place = libsumo.vehicle.getLaneIndex(vehicle), libsumo.vehicle.getLanePosition(vehicle)
     speed = libsumo.vehicle.getSpeed(vehicle)
-    libsumo.route.add(route, libsumo.vehicle.getRoute(vehicle))
+    # One with a departEdge begins somewhere on its route.
+    libsumo.route.add(route, libsumo.vehicle.getRoute(vehicle)[libsumo.vehicle.getRouteIndex(vehicle) :])
     libsumo.vehicle.remove(vehicle)
     libsumo.vehicle.add(
         agent, route, kind, departLane=str(lane), departPos=repr(place), departSpeed=repr(speed), depart="now"
