@@ -152,7 +152,8 @@ def _commands() -> Commands:
 gc.disable()
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> None:  # which pytest-xdist's own process has as well
     """From here on, there is garbage."""
     gc.freeze()
     gc.enable()

@@ -17,6 +17,7 @@ __all__ = [
     "by_likelihood",
     "describe_disturbances",
     "likeliest",
+    "may_be_disturbed",
     "told_disturbances",
     "traffic_of",
 ]
@@ -45,7 +46,7 @@ def about_disturbances(recording: Recording, result: TrialResult, first_step: in
 
 def told_disturbances(result: TrialResult) -> list[str]:
     """Return a line for each disturbance of a trial, and one for how likely all of it was."""
-    if not _may_be_disturbed(result):
+    if not may_be_disturbed(result):
         return []
     lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
     lines = lines or ["in undisturbed traffic: nothing that was planned had begun"]
@@ -56,7 +57,7 @@ def told_disturbances(result: TrialResult) -> list[str]:
 
 def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
     """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
-    if not any(_may_be_disturbed(bundle.result) for bundle in crashes):
+    if not any(may_be_disturbed(bundle.result) for bundle in crashes):
         return []
     disturbed = [bundle for bundle in crashes if bundle.result.disturbed]
     lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
@@ -79,7 +80,7 @@ def traffic_of(bundle: Bundle, crashes: Sequence[Bundle]) -> str:
         bundle: the crash.
         crashes: all of the hunt.
     """
-    if not _may_be_disturbed(bundle.result):
+    if not may_be_disturbed(bundle.result):
         return ""
     if not bundle.result.disturbed:
         return "in undisturbed traffic"
@@ -92,7 +93,7 @@ def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
     return sorted(crashes, key=lambda bundle: (1, -_likely(bundle)) if bundle.result.disturbed else (0, 0.0))
 
 
-def _may_be_disturbed(result: TrialResult) -> bool:
+def may_be_disturbed(result: TrialResult) -> bool:
     """Whether its hunt has disturbances, whatever of them took place."""
     return result.log_likelihood is not None or bool(result.spec.disturbances)
 

@@ -18,7 +18,7 @@ from crashhunt.base.watching import watched
 from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
-from crashhunt.report._disturbances import by_likelihood, traffic_of
+from crashhunt.report._disturbances import by_likelihood, may_be_disturbed, traffic_of
 from crashhunt.report._search import UNCHOSEN, importance_of, lineage_of, values_of
 from crashhunt.report._show import Story
 from crashhunt.report._status_screen import format_arguments
@@ -163,7 +163,7 @@ def _trials(directory: Path) -> dict[str, object]:
                 stress = {"margin": margin, "trial": row.number}
             crashed = outcome.category != "no crash"
             danger = 1.0 if crashed else row.danger
-            if row.origin in UNCHOSEN and danger is not None and number % every == 0:
+            if row.origin in UNCHOSEN and row.parent is None and danger is not None and number % every == 0:
                 unchosen.append((values_of(row), danger))
             if number % every == 0 or crashed:
                 time_s = row.time_to_collision_s
@@ -238,7 +238,7 @@ def _danger(story: Story) -> dict[str, object]:
 
 def _disturbances(result: TrialResult) -> dict[str, str]:
     """What the page says of disturbances, which the words tell one by one."""
-    if result.log_likelihood is None and not result.spec.disturbances:
+    if not may_be_disturbed(result):
         return {}
     said = f"{len(result.disturbances)} took place" if result.disturbed else "none: in undisturbed traffic"
     likely = {} if result.log_likelihood is None else {"log-likelihood": f"{result.log_likelihood:.2f}"}

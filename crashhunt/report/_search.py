@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["UNCHOSEN", "Importance", "importance_of", "lineage_of", "values_of"]
 
-UNCHOSEN = ("", "random", "start", "halton", "anywhere")
+UNCHOSEN = ("", "random", "start", "halton")
 """Origins of trials that nobody chose by what was learned, so that they are everywhere."""
 
 _LEAST, _MOST = 40, 4000  # trials

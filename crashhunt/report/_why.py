@@ -24,7 +24,9 @@ def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
         when: says when a step was, such as ``61.3 s``.
     """
     defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
-    drawn = {factor.name for factor in why.factors if (factor.kind, factor.what) == ("argument", "drawn")}
+    drawn = {
+        factor.name for factor in why.factors if (factor.kind, factor.what) == ("argument", "drawn") and factor.clear
+    }
     sentences, alike = [], []
     for factor in why.factors:
         default = defaults.get(factor.name) if factor.kind == "argument" else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -157,11 +156,9 @@ class _Study:
 
     def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
         """Return what the study suggests."""
-        seed = int(rng.integers(2**31))
         if self._kind == "QMCSampler":
-            seed = self._seed
             self._storage.count_from(number % _LONGEST)
-        with self._seeded(seed), self._storage.asking():
+        with self._seeded(int(rng.integers(2**31))), self._storage.asking():
             params = self._study.ask(self._distributions).params
         shares = [
             (params[name] + 0.5) / count if count else params[name]
@@ -179,6 +176,14 @@ class _Study:
                 _ = trial.relative_params  # notes in which generation it is, and the like
             self._study.tell(trial, score)
 
+    def _sampler(self, seed: int) -> Any:
+        if self._kind != "QMCSampler":
+            return self._make(seed=seed)
+        # The sequence is one and the same; what it has no place for, as categories in Optuna 4.0, is not.
+        return self._make(
+            seed=self._seed, scramble=True, independent_sampler=self._optuna.samplers.RandomSampler(seed=seed)
+        )
+
     @contextmanager
     def _seeded(self, seed: int) -> Iterator[None]:
         """Have a new sampler with a seed, and say nothing of what is experimental or logged."""
@@ -187,9 +192,8 @@ class _Study:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                more = {"scramble": True} if self._kind == "QMCSampler" else {}
                 if self._study is not None:
-                    self._study.sampler = self._make(seed=seed, **more)
+                    self._study.sampler = self._sampler(seed)
                 yield
         finally:
             logging.set_verbosity(known)

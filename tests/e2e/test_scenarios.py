@@ -1,6 +1,6 @@
 """Every shipped scenario has a crash, which is replayed and filmed; on some, all else is done with it too.
 
-By day it is one of highway-env's, and one of several agents on each. With one of SUMO's, loop, the README's commands do
+By day it is one of highway-env's, by night all are. With one of SUMO's, loop, the README's commands do
 the same by day; by night, pages of the guide hunt in merge, highway-policy and motorway. The contracts drive in
 loop-two-agents, intersection and all of highway-env's.
 """

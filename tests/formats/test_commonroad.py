@@ -164,6 +164,7 @@ def test_commonroad_io_reads_what_was_recorded(tmp_path):
     assert found["problems"] == [numbers[agent][-1] for agent in AGENTS]
     assert found["successors"] == {"1": [2, 3], "2": [], "3": [], "4": []}
     # The schema has everybody there from the start, the library has not.
+    assert found["against"]
     assert all("allowed ('0')" in message for message in found["against"])
     assert not read_against(tmp_path / "all", steps=6)
 

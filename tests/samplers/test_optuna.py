@@ -13,6 +13,7 @@ from spaces import are_inside, ask, spaces, spec_of
 
 from crashhunt.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.samplers import HuntFacts, NamedSampler, RandomSampler, varies_only_asked
+from crashhunt.samplers._optuna import OptunaMaker, optuna_maker
 from crashhunt.space import Choice, Constant, Range
 from crashhunt.trial import Outcome, TrialResult
 
@@ -84,7 +85,7 @@ def test_whatever_the_arguments_proposals_are_inside(kind, space, seed, luck):
 
 @pytest.mark.parametrize(
     ("kind", "trials"),
-    [("optuna:tpe", 70), ("optuna:cma-es", 70), pytest.param("optuna:nsgaii", 160, marks=pytest.mark.nightly)],
+    [("optuna:tpe", 71), ("optuna:cma-es", 71), pytest.param("optuna:nsgaii", 161, marks=pytest.mark.nightly)],
 )
 def test_danger_leads_it_and_one_that_is_made_anew_goes_on_exactly(kind, trials):
     """Later than the contract looks: CMA-ES and NSGA-II have generations, of which the study keeps the state."""
@@ -95,10 +96,18 @@ def test_danger_leads_it_and_one_that_is_made_anew_goes_on_exactly(kind, trials)
     again, some = made(kind), trials - 8
     for result in results[:some]:
         again.tell(result)
+    assert asked[some + 3].origin == "optuna"
     assert ask(again, some + 3) == ask(again, some + 3) == asked[some + 3]
     for number in range(some, some + 4):  # what was told between was told before the proposals of these
         again.tell(results[number])
         assert ask(again, number + 4) == asked[number + 4]
+
+
+def test_a_sequence_has_all_words():
+    words = Choice(("a", "b", "c"))
+    sampler = made("optuna:qmc", {("", "mode"): words, ("", "x"): Range(0.0, 1.0)})
+    asked = [ask(sampler, number) for number in range(40)]
+    assert {one.arguments["", "mode"] for one in asked if one.origin == "optuna"} == {*words.options}
 
 
 def test_a_sequence_is_even_whatever_was_asked_before():
@@ -114,7 +123,7 @@ def test_a_sequence_is_even_whatever_was_asked_before():
 
 @pytest.mark.parametrize("name", ["optuna:TPESampler", "optuna:tpe", "optuna:TPE", "optuna:tpesampler"])
 def test_names_may_be_written_short(name):
-    assert ask(made(name), 7) == ask(made("optuna:TPESampler"), 7)
+    assert optuna_maker(name) == OptunaMaker("TPESampler")
     assert not varies_only_asked(name)
 
 
