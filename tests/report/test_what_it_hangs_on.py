@@ -12,6 +12,4 @@ from crashhunt.report._why import about_why
 def test_a_default_is_told_where_other_values_say_nothing(drawn):
     default = Factor("argument", "ego.speed", "default", was=9.0, runs=(LeftOut(5.0, "none"),))
     others = Factor("argument", "ego.speed", "drawn", was=9.0, runs=tuple(LeftOut(6.0, one) for one in drawn))
-    (_, line) = about_why(Why((default, others), 100), str)
-    assert "ego.speed" in line
-    assert "5.0" in line
+    assert about_why(Why((default, others), 100), str)[1:] == ["- ego.speed at its default 5: no crash."]
