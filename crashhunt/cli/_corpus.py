@@ -12,6 +12,7 @@ from crashhunt.base.text import in_lines
 from crashhunt.cli._common import add_json, integer, is_trusted, opened_crash, say
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._progress import shown_progress
+from crashhunt.cli._told import add_told, tell
 
 if TYPE_CHECKING:
     import argparse
@@ -73,6 +74,7 @@ def _add_run(commands: Commands) -> None:
         help="keep what crashes there, each as the directory of a hunt, for crashhunt show, replay and report",
     )  # fmt: skip
     run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
+    add_told(run)
     add_json(run)
     run.set_defaults(command=_run)
 
@@ -112,6 +114,7 @@ def _added(path: str, size: int, *, log: bool, new: bool) -> str:
 def _run(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.corpus import find_cases, run_cases
+    from crashhunt.report import corpus_annotations, corpus_summary
 
     if options.parallel < 0:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 1, or 0 for one per core")
@@ -121,6 +124,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
             cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked)
         )
     say(_told(reports, len(cases)), as_json=options.json)
+    tell(options, corpus_summary(reports), corpus_annotations(reports))
     if options.json:
         print(json.dumps({"cases": [report.to_json() for report in reports]}))
     if len(reports) < len(cases):
@@ -144,7 +148,8 @@ def _told(reports: list[CaseReport], count: int) -> str:
     wrong = sum(not report.ok for report in reports)
     ended = "" if len(reports) == count else f"; interrupted after {len(reports)}"
     lines.append(
-        f"{count} cases: {counts or 'none has ended'}{ended}" + (f"; {wrong} not as expected" if wrong else "")
+        f"{count} {'case' if count == 1 else 'cases'}: {counts or 'none has ended'}{ended}"
+        + (f"; {wrong} not as expected" if wrong else "")
     )
     return "\n".join(lines)
 

@@ -6,12 +6,17 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.cli._common import add_json, say
+from crashhunt.cli._told import add_told, tell
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from crashhunt.cli._common import Commands
+    from crashhunt.corpus import Case
+    from crashhunt.triage import Group, Signature
 
 __all__ = ["add_crashes"]
 
@@ -25,6 +30,14 @@ def add_crashes(commands: Commands) -> None:
         "in the same role, or in the same function. A line a kind, the most frequent first.",
     )
     crashes.add_argument("directories", metavar="DIR", type=Path, nargs="+", help="of hunts or suites")
+    crashes.add_argument(
+        "--known", metavar="CORPUS", type=Path,
+        help="say which kinds a corpus has already, as cases that are expected to crash still",
+    )  # fmt: skip
+    crashes.add_argument(
+        "--sarif", metavar="FILE", type=Path, help="write the kinds as SARIF 2.1.0, for code scanning and editors"
+    )
+    add_told(crashes)
     add_json(crashes)
     crashes.set_defaults(command=_crashes)
 
@@ -35,12 +48,50 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.report import describe_groups
     from crashhunt.triage import group_crashes
 
+    cases = _cases(options.known)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
     bundles = (bundle for hunt in hunts for bundle in list_bundles(hunt))
     found = group_crashes(bundles, dropped_crashes(hunts))
-    say(describe_groups(found.groups), as_json=options.json)
+    known = _known(found.groups, cases)
+    say(describe_groups(found.groups, known), as_json=options.json)
     for why in found.left_out:
         say(f"left out: {why}", as_json=True)
+    _tell(options, found.groups, known)
     if options.json:
-        print(json.dumps({"groups": [group.to_json() for group in found.groups], "left_out": list(found.left_out)}))
+        told = [dict(group.to_json()) for group in found.groups]
+        if known is not None:
+            told = [{**one, "known": known.get(of.signature)} for one, of in zip(told, found.groups, strict=True)]
+        print(json.dumps({"groups": told, "left_out": list(found.left_out)}))
     return 0
+
+
+def _cases(corpus: Path | None) -> list[Case] | None:
+    """The cases of a corpus; of a folder that has none yet, none."""
+    from crashhunt.corpus import find_cases, read_case
+
+    if corpus is None:
+        return None
+    if corpus.is_dir() and not any(corpus.rglob(layout.CASE)):
+        return []
+    return [read_case(path) for path in find_cases([corpus])]
+
+
+def _known(groups: Sequence[Group], cases: list[Case] | None) -> dict[Signature, str] | None:
+    """The cases of a corpus by kind; None where no corpus was given."""
+    from crashhunt.corpus import known_kinds
+
+    if cases is None:
+        return None
+    found = known_kinds((group.signature for group in groups), cases)
+    return {signature: str(case.path) for signature, case in found.items()}
+
+
+def _tell(options: argparse.Namespace, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
+    from crashhunt.report import crash_annotations, crashes_summary, findings_of, write_sarif
+
+    if options.sarif is None and options.summary is None and not options.annotate:
+        return
+    findings = findings_of(groups, known)
+    if options.sarif is not None:
+        write_sarif(findings, options.sarif)
+    tell(options, crashes_summary(findings, compared=known is not None), crash_annotations(findings))

@@ -6,5 +6,6 @@ from ._case import (
     find_cases as find_cases,
     read_case as read_case,
 )
+from ._known import known_kinds as known_kinds
 from ._run import CaseReport as CaseReport, Got as Got, ReportData as ReportData, run_cases as run_cases
 from ._store import Added as Added, add_case as add_case

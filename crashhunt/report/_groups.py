@@ -5,20 +5,26 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from crashhunt.triage import Group
+    from crashhunt.triage import Group, Signature
 
 __all__ = ["describe_groups"]
 
 
-def describe_groups(groups: Sequence[Group]) -> str:
-    """Return a line a kind of crash, with the one to look at first."""
+def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
+    """Return a line a kind of crash, with the one to look at first.
+
+    Args:
+        groups: the kinds.
+        known: the cases of a corpus by kind; None where nobody has asked.
+    """
     if not groups:
         return "No crash was saved."
     hunts = {bundle.hunt for group in groups for bundle in group.bundles}
     faults = any(group.fault for group in groups)
-    rows = [["crashes", "kind", *(["at fault"] if faults else []), "shortest", "steps"]]
+    rows = [["crashes", "kind", *(["at fault"] if faults else []), "shortest"]]
+    rows[0] += [*(["known as"] if known is not None else []), "steps"]
     for group in groups:
         shortest = group.shortest
         name = shortest.id if len(hunts) == 1 else str(shortest.path)
@@ -28,6 +34,7 @@ def describe_groups(groups: Sequence[Group]) -> str:
                 str(group.signature),
                 *([group.fault] if faults else []),
                 name,
+                *([known.get(group.signature, "new")] if known is not None else []),
                 str(shortest.result.steps),
             ]
         )

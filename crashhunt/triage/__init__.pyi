@@ -1,4 +1,5 @@
 from ._fault import Fault as Fault, FaultData as FaultData, Verdict as Verdict, fault_of as fault_of
+from ._frames import Frame as Frame, own_frames as own_frames
 from ._groups import (
     Group as Group,
     GroupData as GroupData,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from pathlib import PurePath
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.crashes import Encounter
+from crashhunt.triage._frames import own_frames
 from crashhunt.triage._lanes import LaneMap
 from crashhunt.world import is_person
 
@@ -25,18 +25,12 @@ if TYPE_CHECKING:
 __all__ = ["Signature", "SignatureData", "signature_of"]
 
 _BEFORE_S = 3.0  # a lane change that began longer ago is over
-_CALLERS = (
-    ("crashhunt", "episode", "_episode.py"),
-    ("crashhunt", "episode.py"),
-)  # of agents, simulators and oracles; the second one in earlier versions
 _CHANGES = {
     "agent": "while the agent changes lanes",
     "other": "while the other changes lanes",
     "both": "while both change lanes",
 }
 _FRAMES = 3  # of a stack, the innermost ones
-_FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line \d+,? in (?P<function>\S+)', re.MULTILINE)
-_LIBRARIES = re.compile(r"(site|dist)-packages|python3\.\d+")
 _NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
 
 
@@ -176,24 +170,7 @@ def _kind(failure: Failure) -> str:
 
 def _where(failure: Failure) -> str:
     """The innermost functions that are the agent's own, or what was said, without its numbers."""
-    frames = _frames(failure.traceback) or _frames(failure.last_output)
-    ours = [
-        number for number, (file, _) in enumerate(frames) if any(file.parts[-len(one) :] == one for one in _CALLERS)
-    ]
-    inner = frames[: min(ours)] if ours else frames  # what the episode has called
-    own = [frame for frame in inner if not _is_of_a_library(frame[0])]
-    chosen = own or inner
+    chosen = own_frames(failure)
     if chosen:
-        return " < ".join(f"{file.name}:{function}" for file, function in chosen[:_FRAMES])
+        return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_FRAMES])
     return _NUMBERS.sub("#", failure.message)
-
-
-def _frames(text: str) -> list[tuple[PurePath, str]]:
-    """The file and function of each call, the innermost first."""
-    found = [(PurePath(match["file"]), match["function"]) for match in _FRAME.finditer(text)]
-    # A stuck or dead process has written its stack that way already, an exception the other way.
-    return found if "most recent call first" in text else found[::-1]
-
-
-def _is_of_a_library(file: PurePath) -> bool:
-    return any(_LIBRARIES.fullmatch(part) for part in file.parts)

@@ -75,6 +75,24 @@ def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
         assert str(kept.folder) not in file.read_text()
 
 
+def test_crashes_that_a_corpus_has_are_told_from_new_ones(kept):
+    words = ("crashes", "h", "--json", "--annotate", "--summary", "s.md", "--sarif", "x.sarif", "--known")
+    done = kept.crashhunt(*words, "kept crashes")
+    (group,) = done.json["groups"]
+    assert group["known"].startswith("kept crashes")
+    assert "::error" not in done.err
+    (kept.folder / "none yet").mkdir()
+    done = kept.crashhunt(*words, "none yet")
+    assert done.json["groups"][0]["known"] is None
+    assert "::error file=driver.py,line=2,title=rear end" in done.err
+    summary = (kept.folder / "s.md").read_text()
+    assert summary.count("### crashhunt: 2 crashes of 1 kind, ") == 2  # the second is added to the first
+    assert (kept.folder / "x.sarif").is_file()
+    assert "known" not in kept.crashhunt("crashes", "h", "--json").json["groups"][0]
+    assert "'nowhere' does not exist" in kept.crashhunt("crashes", "h", "--known", "nowhere", expect=2).err
+    assert "cannot be written" in kept.crashhunt("crashes", "h", "--summary", "no/s.md", expect=2).err
+
+
 def test_what_is_there_already_gets_another_expectation_only(kept):
     bundle = find_bundle(kept.folder / "h", "0")
     corpus = kept.folder / "kept crashes"
@@ -100,8 +118,9 @@ def test_todays_code_is_judged(kept):
     assert [(case["got"], case["may_be_tightened"]) for case in found] == [("fixed", False), ("fixed", True)]
 
     drive(kept, BROKEN)
-    done = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json", expect=1)
+    done = kept.crashhunt("corpus", "run", "kept crashes", "--keep", "out", "--json", "--annotate", expect=1)
     assert [case["got"] for case in done.json["cases"]] == ["changed"] * 2
+    assert done.err.count("::error file=kept crashes/") == 2
     assert "crashes in another way, and fixed was expected" in done.err
     assert "ValueError: no" in kept.crashhunt("show", done.json["cases"][0]["kept"]).out
     assert kept.crashhunt("replay", done.json["cases"][0]["kept"], "--json").json["verdict"] == "reproduced"
