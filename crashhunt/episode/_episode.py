@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
-from crashhunt.base.asleep import Asleep
 from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
-from crashhunt.base.forks import Copy, Held, held, shared_memory
+from crashhunt.base.forks import held, shared_memory
+from crashhunt.episode._ahead import goes_ahead
+from crashhunt.episode._copied import Copied
 from crashhunt.episode._disturbed import Disturbed
-from crashhunt.episode._failures import close_agent, failure_of, is_emptied
+from crashhunt.episode._ending import Ending
+from crashhunt.episode._failures import close_agent, is_emptied
+from crashhunt.episode._whereabouts import Whereabouts
 from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
+from crashhunt.native import ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
@@ -27,7 +30,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.base.plain import Plain
     from crashhunt.episode._observer import Observer
     from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Episode", "MakeAgent", "Reset"]
 
-C = TypeVar("C")
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
 Reset = Callable[..., "tuple[Observations, Info]"]
@@ -44,7 +45,7 @@ Reset = Callable[..., "tuple[Observations, Info]"]
 _ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # nobody writes to it
 
 
-class Episode:
+class Episode(Copied, Ending, Whereabouts):
     """One trial, a step at a time; between two steps, everything about it can be looked at.
 
     Whatever agent, simulator, oracles or observers raise ends the episode, and is in its result. Of a simulator that
@@ -65,11 +66,7 @@ class Episode:
         simulator: where.
         names: everybody who takes part, in the order of their numbers; empty before the start.
         agents: by name; one that is replaced between two steps is asked from the next one on.
-        observations: what the agents will be shown in the next step, by name.
-        rewards: of those that acted in the last step, by name.
-        terminations: whether these have arrived or crashed.
         acting: the numbers of those that act in the next step.
-        scene: after the last step; None before the start.
         steps: how many are complete.
         result: None while it goes on.
         error: the exception that ended it, where one did; until it is closed.
@@ -88,15 +85,12 @@ class Episode:
         forks: bool = False,
         reset: Reset | None = None,
     ) -> None:
+        super().__init__()
         self.spec = spec
         self.simulator = simulator
         self.names: tuple[str, ...] = ()
         self.agents: dict[str, Agent] = {}
-        self.observations: Observations = {}
-        self.rewards: Mapping[str, float] = {}
-        self.terminations: Mapping[str, bool] = {}
         self.acting: tuple[int, ...] = ()
-        self.scene: Scene | None = None
         self.steps = 0
         self.result: TrialResult | None = None
         self.error: BaseException | None = None
@@ -118,12 +112,12 @@ class Episode:
         self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = told(observers, "action")
         self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = told(observers, "scene")
         self._on_disturbance: list[Callable[[Disturbance], None]] = told(observers, "disturbance")
-        self._on_copied: list[Callable[[], None]] = told(observers, "copied")
+        self._on_copied = told(observers, "copied")
         self._on_end: list[Callable[[TrialResult], TrialResult]] = told(observers[::-1], "end")
         self._disturbed: Disturbed | None = None
         self._forks = forks
         self._reset = reset or simulator.reset
-        self._held = Held()
+        self._observers = tuple(observers)
 
     def start(self) -> TrialResult | None:
         """Reset the simulator and make the agents.
@@ -157,13 +151,39 @@ class Episode:
             RecorderError: the disk is full.
             RuntimeError: it is over, or has not been started.
         """
-        if self.result is not None or self.scene is None:
+        if self._take is None or given:
+            return self._step(given)
+        try:
+            come = self._take(self.agents)
+        except BaseException as error:
+            return self._fail_at_once(error)
+        if come:
+            return self._go_on_from(come)
+        self._is_behind = True
+        self.steps += 1
+        return None
+
+    def _step(
+        self,
+        given: Mapping[str, NDArray[np.generic]],
+        actions: dict[str, NDArray[np.generic]] | None = None,
+        advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] | None = None,
+    ) -> TrialResult | None:
+        """Take a step one thing after the other.
+
+        Args:
+            given: as of `step`.
+            actions: where agents have been asked already, what they answered.
+            advance: what is left for the simulator to do with that; None where it is all of it.
+        """
+        self._catch_up()
+        if self.result is not None or self._scene is None:
             raise RuntimeError("the episode is over" if self.result is not None else "the episode has not been started")
         # This runs a million times a hunt: it is one function, looks up little, and does nothing twice.
         try:
-            names, agents, observations, unflatten = self.names, self.agents, self.observations, self._unflatten
-            actions: dict[str, NDArray[np.generic]] = {}
-            for number in self.acting:
+            names, agents, observations, unflatten = self.names, self.agents, self._observations, self._unflatten
+            asked, actions = (self.acting, {}) if actions is None else ((), actions)
+            for number in asked:
                 name = names[number]
                 observation: Any = observations[name]
                 for show in self._on_observation:
@@ -182,15 +202,16 @@ class Episode:
                 actions[name] = action
             simulator = self.simulator
             try:
-                self.observations, rewards, self.terminations, truncations, _ = self._advance(actions)
+                taken = self._advance(actions) if advance is None else advance(actions)
+                self._observations, rewards, self._terminations, truncations, _ = taken
                 scene = simulator.scene()
-                scene.follow(self.scene)
-                self.scene = scene
+                scene.follow(self._scene)
+                self._scene = scene
             except RecorderError:
                 raise
             except BaseException as error:  # an environment of a user's may exit as well as an agent
                 return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, error)
-            self.rewards = rewards
+            self._rewards = rewards
             step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
             for show_scene in self._on_scene:
                 show_scene(step, scene, each)
@@ -210,6 +231,38 @@ class Episode:
         except BaseException as error:
             return self._break(error)
 
+    def _go_on_from(self, come: int) -> TrialResult | None:
+        """Do what the core has left of a step in which something has happened."""
+        ahead = self._ahead
+        assert ahead is not None
+        try:
+            come, actions = ahead.go_on_from(come, self.agents, self._on_action)
+        except RecorderError:
+            raise
+        except BaseException as error:
+            return self._fail_at_once(error)
+        if come not in (DONE, ASK):
+            return self._step(_ASK_ALL, actions, ahead.at_once.finish if come == SIMULATED else None)
+        self._is_behind = True
+        self.steps += 1
+        return self._look_into() if come == ASK else None
+
+    def _look_into(self) -> TrialResult | None:
+        """Tell and ask everybody about a step that the core has recorded."""
+        try:
+            scene = self.scene
+            assert scene is not None
+            for show in self._on_scene[1:]:
+                show(self.steps, scene, tuple(self._rewards.values()))
+            finding = self._find(scene)
+            if finding is None and self.steps < self._max_steps:
+                return None
+            return self._judge(finding, self._rewards, {})
+        except RecorderError:
+            raise
+        except BaseException as error:
+            return self._break(error)
+
     def close(self) -> None:
         """Close the agents; may be called twice. What `result` says stays."""
         # An exception holds the frames that it came through, and with them this episode and all that agents had open.
@@ -219,44 +272,6 @@ class Episode:
             close_agent(agent)
         self._disturbed = None
         self._look_away()  # observers may hold the episode
-
-    def fork(self, work: Callable[[Episode], Plain], *, observed: bool = True) -> Copy:
-        """Copy this process with the episode in it, between two steps; the copy goes on exactly as this one does.
-
-        Args:
-            work: what is done in the copy, which then is over; it may fork again. What it returns is its answer.
-            observed: whether its observers go on being told. What they record goes elsewhere.
-
-        Raises:
-            CannotForkError: the agents, or whoever has begun before them, have something that has no copy.
-        """
-        return self._copied(Copy, work, observed=observed)
-
-    def leave_asleep(self, work: Callable[..., Plain]) -> Asleep:
-        """Leave a copy asleep here; whenever it is asked, a copy of that one goes on from here, told of to nobody.
-
-        Args:
-            work: what is done with that copy, and with what is asked.
-
-        Raises:
-            CannotForkError: as of `fork`.
-        """
-        return self._copied(Asleep, work, observed=False)
-
-    def _copied(self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], **how: bool) -> C:
-        if self.scene is None or self.result is not None:
-            raise RuntimeError("an episode has copies only while it goes on")
-
-        def go_on(*asked: Plain) -> Plain:
-            for tell in self._on_copied if how["observed"] else ():
-                tell()
-            if not how["observed"]:
-                self._look_away()
-            return work(self, *asked)
-
-        copy = make(go_on, self._held)
-        self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
-        return copy
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Have one more disturbance take place than was planned, not before the step after the next.
@@ -279,8 +294,12 @@ class Episode:
         """Whether somebody was there for a disturbance that has begun."""
         return self._disturbed is not None and self._disturbed.took_place(disturbance)
 
+    def _goes_on(self) -> bool:
+        return self._scene is not None and self.result is None
+
     def _look_away(self) -> None:
         """Tell nobody of anything from now on."""
+        self._take = None
         tells = (self._on_begin, self._on_observation, self._on_action, self._on_scene, self._on_disturbance)
         for listening in (*tells, self._on_copied, self._on_end):
             listening.clear()
@@ -299,7 +318,7 @@ class Episode:
         spec, simulator = self.spec, self.simulator
         agent = ""
         try:
-            self.observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
+            self._observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:
@@ -312,7 +331,7 @@ class Episode:
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
                 self.agents[agent].reset(agent_seed(spec.seed, number))
             agent = ""
-            self.scene = scene = simulator.scene()
+            self._scene = scene = simulator.scene()
             for show in self._on_scene:
                 show(0, scene, self._nothing)
         except RecorderError:
@@ -333,11 +352,14 @@ class Episode:
         self._encoders = [simulator.actions[name].encode for name in self.names]
         if offers(simulator, FlattensObservations):
             self._unflatten = {name: unflattener(space) for name, space in simulator.shown_spaces.items()}
+        if self._disturbed is None:
+            self._ahead = goes_ahead(simulator, self._observers, self._oracles, self._max_steps, self._encoders)
+            self._take = None if self._ahead is None else self._ahead.at_once.core.take
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
     def _disturb(self, disturbed: Disturbed) -> None:
         self._disturbed = disturbed
-        self._advance, self.observations = disturbed.step, disturbed.first(self.observations)
+        self._advance, self._observations = disturbed.step, disturbed.first(self._observations)
         self._on_end.insert(0, disturbed.end)
 
     def _judge(
@@ -362,32 +384,3 @@ class Episode:
         if not findings:
             return None
         return merge_findings([finding for finding in findings if finding.outcome in self._crash_on])
-
-    def _fail(self, outcome: Outcome, error: BaseException, agent: str = "") -> TrialResult:
-        """End with an exception of an agent's, or of the simulator's."""
-        self.error = error
-        return self._end(outcome, failure=failure_of(error, agent))
-
-    def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
-        """End, and let everybody who has looked on add what they have found out."""
-        time_s = self.simulator.scene().time_s if self.scene is not None else 0.0
-        return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
-
-    def _add(self, result: TrialResult) -> TrialResult:
-        for tell in self._on_end:
-            result = tell(result)
-        self.result = result
-        return result
-
-    def _break(self, error: BaseException) -> TrialResult:
-        """End where it cannot go on, and neither agent nor simulator has said why.
-
-        An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
-        """
-        self.error = error
-        agents = isinstance(error, OSError | MemoryError) or is_emptied()
-        outcome = Outcome.AGENT_ERROR if agents else Outcome.SIMULATOR_ERROR
-        self.result = TrialResult(self.spec, outcome, steps=self.steps, failure=failure_of(error, ""))
-        with suppress(BaseException):
-            self._add(self.result)
-        return self.result

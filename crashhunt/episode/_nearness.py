@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from crashhunt.base.faculties import offers
 from crashhunt.episode._observer import Observer
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Nearness"]
 
-_EVERY = 256
-"""Steps; how near to a crash it was is measured over many at a time, which costs a tenth of one at a time."""
-
 
 class Nearness(Observer):
     """Measures the closest approach and the danger, and adds them to the result.
@@ -31,6 +28,9 @@ class Nearness(Observer):
         take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
             columns already.
     """
+
+    EVERY: ClassVar = 256
+    """Steps; how near to a crash it was is measured over many at a time, which costs a tenth of one at a time."""
 
     def __init__(self, take_frames: Callable[[], Sequence[Frame]]) -> None:
         self._take_frames = take_frames
@@ -52,7 +52,7 @@ class Nearness(Observer):
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Measure, now and then."""
-        if step and step % _EVERY == 0:
+        if step and step % self.EVERY == 0:
             self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:

@@ -62,6 +62,11 @@ class Recorder(Observer):
         self.observation = box.observation  # type: ignore[assignment, method-assign]
         self.action = box.action  # type: ignore[assignment, method-assign]
 
+    @property
+    def box(self) -> BlackBox:
+        """What it writes into."""
+        return self._box
+
     def begin(self, episode: Episode) -> None:
         """Record who takes part."""
         simulator = episode.simulator

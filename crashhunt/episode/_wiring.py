@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Options, Simulator
     from crashhunt.trial import TrialSpec
 
-__all__ = ["agent_seed", "options_of", "told", "unflattener"]
+__all__ = ["agent_seed", "options_of", "told", "unflattener", "wants"]
 
 
 def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
@@ -56,4 +56,9 @@ def unflattener(space: Space[object]) -> Callable[[NDArray[np.generic]], object]
 
 def told(observers: Sequence[Observer], name: str) -> Any:
     """Return what is called to tell observers of something; those that do not want to be told are left out."""
-    return [getattr(one, name) for one in observers if getattr(type(one), name) is not getattr(Observer, name)]
+    return [getattr(one, name) for one in observers if wants(one, name)]
+
+
+def wants(observer: Observer, name: str) -> bool:
+    """Whether an observer wants to be told of something."""
+    return getattr(type(observer), name) is not getattr(Observer, name)

@@ -15,6 +15,7 @@ _ROOT = Path(__file__).parents[1]
 _SAID = {
     ".py": re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL),
     ".cpp": re.compile(r"\A// (.+?)\n"),
+    ".hpp": re.compile(r"\A// (.+?)\n"),
     ".html": re.compile(r"\A<!DOCTYPE html>\n<!-- (.+?) -->"),
 }
 """What a file says first of itself; read as text, since importing everything would take seconds."""

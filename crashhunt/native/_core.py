@@ -7,16 +7,33 @@ from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-__all__ = ["Columns", "Core", "Part", "Vehicles", "core_for", "why_not"]
+__all__ = [
+    "ANSWERED",
+    "ASK",
+    "DONE",
+    "REFUSED",
+    "SIMULATED",
+    "Columns",
+    "Core",
+    "Part",
+    "UsualSteps",
+    "Vehicles",
+    "core_for",
+    "why_not",
+]
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 4
+_INTERFACE = 5
 """Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
+
+DONE, ASK, REFUSED, ANSWERED, SIMULATED = range(5)
+"""What `UsualSteps.take` comes to: the step is complete; it is, and somebody has to be asked about it; nothing was
+done; the agent was shown something and has answered; it was simulated as well, and all the rest is still to be done."""
 
 Points = list[tuple[float, float]]
 Part = tuple[object, int, list[float], list[float], list[int]]
@@ -52,7 +69,92 @@ class Vehicles(Protocol):
         """
 
 
+class UsualSteps(Protocol):
+    """Steps of an episode with one agent in which nothing happens, each in one call.
+
+    What it does is what `Episode.step` does with a recorder, SUMO and the oracles that come with crashhunt, in the same
+    order. As soon as anything happens it does no more.
+    """
+
+    answer: object
+    """What the agent answered last."""
+    step: int
+    """The number of the step that is complete."""
+    simulating: bool
+    """Whether the last call had come as far as the simulator; else the agent was asked."""
+
+    def take(self, agents: Mapping[str, object], /) -> int:
+        """Take a step; return what has come of it, such as `DONE`. Whatever agent and simulator raise is raised."""
+
+    def note(self, action: object, /) -> bool:
+        """Record an action after `ANSWERED`; return whether that could be done."""
+
+    def go_on(self, quiet: bool, /) -> int:
+        """Simulate after `ANSWERED`, and look where nothing has happened yet; return what has come of it."""
+
+    def heed(self, limits: dict[str, float], limit: float, stood: dict[str, int], standstill: int, /) -> None:
+        """Take what is counted besides: of hard braking (m/s², 0 for each vehicle's own), of standing (steps)."""
+
+    def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
+        """Take when somebody has to be asked about a step.
+
+        Args:
+            overlaps: where the oracle of this name may find something.
+            hardest: what nobody has braked with more, in m/s².
+            always: about each step.
+            last: and about all from this one on.
+            now_and_then: and about each so many.
+        """
+
+    def resume(
+        self,
+        who: tuple[_Vehicles, tuple[str, ...], int, dict[str, object]],
+        observation: object,
+        columns: Columns,
+        time_s: float,
+        lanes: str,
+        where: tuple[str, int, str, float],
+        follower: str,
+        step: int,
+        /,
+    ) -> None:
+        """Go on from a step that is complete.
+
+        Args:
+            who: the vehicles of its scene, their ids, the row of the agent, who is controlled.
+            observation: what the agent is shown next.
+            columns: of the scene.
+            time_s: of the scene.
+            lanes: of everybody in it, a line each, or nothing.
+            where: the agent's edge, the number of its lane, the name of that, how far from the left this is (m).
+            follower: who is behind the agent.
+            step: its number.
+        """
+
+    def borrow(self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int], /) -> None:
+        """Record into a buffer, with the tags of observation, action, step and lanes."""
+
+    def give_back(self) -> tuple[int, int, list[int]]:
+        """Record no more; return where the records end, which step is complete, where the numbers of each begin."""
+
+    def pause(self) -> None:
+        """Take no steps until `resume`, and tell nothing: somebody else takes one."""
+
+    def stop(self) -> None:
+        """Take no further steps; what has been done is still told."""
+
+    def told(self) -> tuple[int, object, float, str, tuple[float, str], tuple[float, str]] | None:
+        """Return step, observation, reward, follower, and of this scene and the one before time (s) and lanes."""
+
+    def columns(self, back: bool, /) -> Columns | None:
+        """Return the numbers of the scene, or of the one before."""
+
+    def reads(self, vehicles: _Vehicles, /) -> tuple[object, ...] | None:
+        """Return what is read here and nowhere else, to be compared with libsumo's getters."""
+
+
 _Vehicles = Vehicles  # the core has something of the same name
+_UsualSteps = UsualSteps
 
 
 class Core(Protocol):
@@ -71,6 +173,33 @@ class Core(Protocol):
         self, ids: tuple[str, ...], lengths: list[float], widths: list[float], reaches: list[float], /
     ) -> _Vehicles:
         """Return vehicles by their ids, with the sizes of all actors of a scene, as `Roster` has them."""
+
+    def UsualSteps(  # noqa: N802 - a class
+        self,
+        agent: str,
+        libsumo: object,
+        array: tuple[object, object, object],
+        others: int,
+        step_s: float,
+        lateral: bool,
+        takes_speed: bool,
+        sight: tuple[_Vehicles, int, float],
+        start_m: float,
+        /,
+    ) -> _UsualSteps:
+        """Return the usual steps of an episode.
+
+        Args:
+            agent: who acts.
+            libsumo: the module, whose ``simulationStep`` is called.
+            array: what makes an observation, its shape and type.
+            others: how many are in it.
+            step_s: how long a step is, in s.
+            lateral: whether vehicles may be elsewhere than in the middle of a lane.
+            takes_speed: whether actions are a speed and a change of lane.
+            sight: of which vehicles the surroundings are looked at, every how many steps, how far (m, squared).
+            start_m: how far the agent had driven at the start, in m.
+        """
 
     def columns(
         self, vehicles: _Vehicles, points: Sequence[object], headings: Sequence[float], speeds: Sequence[float], /

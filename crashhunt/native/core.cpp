@@ -36,6 +36,12 @@ static_assert(sizeof(Position) == 32, "a pointer and three numbers");
 
 typedef Position (*PositionOf)(const std::string &, bool);
 typedef double (*NumberOf)(const std::string &);
+typedef int (*WholeOf)(const std::string &);
+typedef std::string (*NameOf)(const std::string &);
+typedef double (*NumberAt)(const std::string &, double);
+typedef void (*Command)(const std::string &, double);
+typedef std::pair<std::string, double> (*NeighborOf)(const std::string &, double);
+typedef double (*Number)();
 typedef int (*Count)();
 typedef std::vector<std::string> (*Names)();
 
@@ -51,7 +57,14 @@ typedef std::vector<Collision> (*Collisions)();
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
-    Count departed, arrived, vanishing, appearing, on_foot;
+    NumberOf driven, aside, aside_speed, along, decel;
+    WholeOf lane_index, stop_state;
+    NameOf road, lane;
+    NumberAt lane_angle;
+    NeighborOf follower;
+    Command set_speed;
+    Number time;
+    Count departed, arrived, vanishing, appearing, on_foot, emergencies;
     Collisions collisions;
     Names everybody;
     bool bound;
@@ -89,7 +102,21 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo10Simulation25getStartingTeleportNumberEv", found.vanishing) &&
                  find(library, "_ZN7libsumo6Person10getIDCountEv", found.on_foot) &&
                  find(library, "_ZN7libsumo10Simulation13getCollisionsEv", found.collisions) &&
-                 find(library, "_ZN7libsumo10Simulation23getEndingTeleportNumberEv", found.appearing);
+                 find(library, "_ZN7libsumo10Simulation23getEndingTeleportNumberEv", found.appearing) &&
+                 find(library, "_ZN7libsumo10Simulation34getEmergencyStoppingVehiclesNumberEv", found.emergencies) &&
+                 find(library, "_ZN7libsumo10Simulation7getTimeEv", found.time) &&
+                 find(library, "_ZN7libsumo7Vehicle11getDistanceE" STRING, found.driven) &&
+                 find(library, "_ZN7libsumo7Vehicle22getLateralLanePositionE" STRING, found.aside) &&
+                 find(library, "_ZN7libsumo7Vehicle15getLateralSpeedE" STRING, found.aside_speed) &&
+                 find(library, "_ZN7libsumo7Vehicle15getLanePositionE" STRING, found.along) &&
+                 find(library, "_ZN7libsumo7Vehicle8getDecelE" STRING, found.decel) &&
+                 find(library, "_ZN7libsumo7Vehicle12getLaneIndexE" STRING, found.lane_index) &&
+                 find(library, "_ZN7libsumo7Vehicle12getStopStateE" STRING, found.stop_state) &&
+                 find(library, "_ZN7libsumo7Vehicle9getRoadIDE" STRING, found.road) &&
+                 find(library, "_ZN7libsumo7Vehicle9getLaneIDE" STRING, found.lane) &&
+                 find(library, "_ZN7libsumo7Vehicle11getFollowerE" STRING "d", found.follower) &&
+                 find(library, "_ZN7libsumo7Vehicle8setSpeedE" STRING "d", found.set_speed) &&
+                 find(library, "_ZN7libsumo4Lane8getAngleE" STRING "d", found.lane_angle);
     dlclose(library); // Python keeps it loaded
     if (!whole) {
         return nullptr;
@@ -181,9 +208,10 @@ struct Scene {
     const double *points, *headings, *speeds;
     const Roster *roster;
 
-    explicit Scene(const Columns *columns)
-        : size(columns->values->size() / 4), points(columns->values->data()), headings(points + 2 * size),
-          speeds(headings + size), roster(columns->vehicles->roster) {}
+    Scene(const std::vector<double> &values, const Roster *who)
+        : size(values.size() / 4), points(values.data()), headings(points + 2 * size), speeds(headings + size),
+          roster(who) {}
+    explicit Scene(const Columns *columns) : Scene(*columns->values, columns->vehicles->roster) {}
     double x(size_t row) const { return points[2 * row]; }
     double y(size_t row) const { return points[2 * row + 1]; }
     bool sized() const { return roster->lengths.size() == size; }
@@ -345,9 +373,9 @@ double fastest(const Scene &scene) {
 }
 
 // What libsumo says about vehicles now; throws what its getters throw.
-std::vector<double> read_now(const Roster &roster) {
+void read_into(const Roster &roster, std::vector<double> &values) {
     const size_t count = roster.ids.size();
-    std::vector<double> values(4 * count);
+    values.resize(4 * count);
     for (size_t row = 0; row < count; row++) {
         const std::string &id = roster.ids[row];
         const Position place = sumo.position(id, false);
@@ -357,6 +385,11 @@ std::vector<double> read_now(const Roster &roster) {
         values[2 * count + row] = (90.0 - sumo.angle(id)) * (3.141592653589793 / 180.0);
         values[3 * count + row] = sumo.speed(id);
     }
+}
+
+std::vector<double> read_now(const Roster &roster) {
+    std::vector<double> values;
+    read_into(roster, values);
     return values;
 }
 
@@ -521,25 +554,12 @@ bool find_nearest(const Scene &scene, size_t row, double below, size_t wanted) {
 
 // --------------------------------------------------------------------------------------------------- the observation
 
-// observe(columns, row, others, distance, from_left, lateral_speed) -> bytes | None
-PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
-    if (!columns) {
-        PyErr_SetString(PyExc_TypeError, "observe takes columns and five numbers");
-        return nullptr;
-    }
-    const Py_ssize_t asked = PyLong_AsSsize_t(given[1]), others = PyLong_AsSsize_t(given[2]);
-    const double distance = PyFloat_AsDouble(given[3]), from_left = PyFloat_AsDouble(given[4]);
-    const double lateral_speed = PyFloat_AsDouble(given[5]);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    const Scene present(columns);
+// As Kinematics.observe in its usual form; null without an exception where that is Python's to do.
+PyObject *observed(const Scene &present, size_t row, size_t shown, double distance, double from_left,
+                   double lateral_speed) {
     const std::vector<double> &lengths = present.roster->lengths;
-    const size_t row = static_cast<size_t>(asked), shown = static_cast<size_t>(others);
-    if (!present.sized() || asked < 0 || others < 0 || row >= present.size ||
-        !find_nearest(present, row, HUGE_VAL, shown)) {
-        Py_RETURN_NONE;
+    if (!find_nearest(present, row, HUGE_VAL, shown)) {
+        return nullptr;
     }
     const double heading = present.headings[row], speed = present.speeds[row];
     const double own_cos = cos(heading), own_sin = sin(heading), half = lengths[row] / 2;
@@ -573,10 +593,31 @@ PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
     }
     memset(place, 0, (shown - seen) * 7 * sizeof(float));
     if (!small) {
-        Py_DECREF(bytes);
-        Py_RETURN_NONE;
+        Py_CLEAR(bytes);
     }
     return bytes;
+}
+
+// observe(columns, row, others, distance, from_left, lateral_speed) -> bytes | None
+PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
+    if (!columns) {
+        PyErr_SetString(PyExc_TypeError, "observe takes columns and five numbers");
+        return nullptr;
+    }
+    const Py_ssize_t row = PyLong_AsSsize_t(given[1]), others = PyLong_AsSsize_t(given[2]);
+    const double distance = PyFloat_AsDouble(given[3]), from_left = PyFloat_AsDouble(given[4]);
+    const double lateral_speed = PyFloat_AsDouble(given[5]);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    const Scene present(columns);
+    if (!present.sized() || row < 0 || others < 0 || static_cast<size_t>(row) >= present.size) {
+        Py_RETURN_NONE;
+    }
+    PyObject *bytes = observed(present, static_cast<size_t>(row), static_cast<size_t>(others), distance, from_left,
+                               lateral_speed);
+    return bytes || PyErr_Occurred() ? bytes : Py_NewRef(Py_None);
 }
 
 // --------------------------------------------------------------------------------------------------- who may touch whom
@@ -628,34 +669,18 @@ Moved moved(const Scene &previous, const Scene &present, size_t row) {
     return {dx, dy, aside};
 }
 
-// within_reach(columns, earlier columns, row, step_s, hardest) -> list of rows | None
-// As _within_reach of crashhunt/oracles/_crashes.py.
-PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *columns = count == 5 ? columns_of(given[0]) : nullptr;
-    Columns *earlier = columns ? columns_of(given[1]) : nullptr;
-    if (!earlier) {
-        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice and three numbers");
-        return nullptr;
-    }
-    const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
-    const double step_s = PyFloat_AsDouble(given[3]), hardest = PyFloat_AsDouble(given[4]);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    const Scene present(columns), previous(earlier);
+// As _within_reach of crashhunt/oracles/_crashes.py, of two scenes of the same actors; false where that is Python's to do.
+bool reach(const Scene &present, const Scene &previous, size_t row, double step_s, double hardest,
+           std::vector<size_t> &found) {
     const std::vector<double> &reaches = present.roster->reaches;
-    const size_t size = present.size, row = static_cast<size_t>(asked);
-    if (previous.size != size || !present.sized() || !previous.sized() || asked < 0 || row >= size) {
-        Py_RETURN_NONE;
-    }
     const double further = 2 * (1.5 * (fastest(present) + hardest * step_s) * step_s + 1.0); // as reachable_m has it
     const double most = 2 * *std::max_element(reaches.begin(), reaches.end()) + further;
-    if (!find_nearest(present, row, most * most, size)) {
-        Py_RETURN_NONE;
+    found.clear();
+    if (!find_nearest(present, row, most * most, present.size)) {
+        return false;
     }
-    PyObject *found = PyList_New(0);
-    if (!found || nearest.empty()) {
-        return found;
+    if (nearest.empty()) {
+        return true;
     }
     const Moved mine = moved(previous, present, row);
     const Rectangle own = outline(present, row), own_before = outline(previous, row);
@@ -672,19 +697,58 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
             continue;
         }
         const Rectangle two = outline(present, other);
-        if (!overlap(own, two, margin) ||
-            !(overlap(own, two, margin / 2) || overlap(own_before, outline(previous, other), margin / 2))) {
-            continue;
+        if (overlap(own, two, margin) &&
+            (overlap(own, two, margin / 2) || overlap(own_before, outline(previous, other), margin / 2))) {
+            found.push_back(other);
         }
-        PyObject *number = PyLong_FromSize_t(other);
-        if (!number || PyList_Append(found, number) < 0) {
-            Py_XDECREF(number);
-            Py_DECREF(found);
-            return nullptr;
+    }
+    return true;
+}
+
+std::vector<size_t> reached; // used again
+
+// within_reach(columns, earlier columns, row, step_s, hardest) -> list of rows | None
+PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
+    Columns *columns = count == 5 ? columns_of(given[0]) : nullptr;
+    Columns *earlier = columns ? columns_of(given[1]) : nullptr;
+    if (!earlier) {
+        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice and three numbers");
+        return nullptr;
+    }
+    const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
+    const double step_s = PyFloat_AsDouble(given[3]), hardest = PyFloat_AsDouble(given[4]);
+    if (PyErr_Occurred()) {
+        return nullptr;
+    }
+    const Scene present(columns), previous(earlier);
+    const size_t row = static_cast<size_t>(asked);
+    if (previous.size != present.size || !present.sized() || !previous.sized() || asked < 0 || row >= present.size ||
+        !reach(present, previous, row, step_s, hardest, reached)) {
+        Py_RETURN_NONE;
+    }
+    PyObject *found = PyList_New(static_cast<Py_ssize_t>(reached.size()));
+    for (size_t number = 0; found && number < reached.size(); number++) {
+        PyObject *other = PyLong_FromSize_t(reached[number]);
+        if (!other) {
+            Py_CLEAR(found);
+        } else {
+            PyList_SET_ITEM(found, static_cast<Py_ssize_t>(number), other);
         }
-        Py_DECREF(number);
     }
     return found;
+}
+
+// The least of the changes of speed; 0 where nobody is, and not a number where that is Python's to say.
+double least_of(const Scene &earlier, const Scene &later) {
+    double least = later.size ? HUGE_VAL : 0.0;
+    for (size_t row = 0; row < later.size; row++) {
+        const double change = later.speeds[row] - earlier.speeds[row];
+        if (std::isnan(change)) {
+            return change;
+        }
+        least = std::min(least, change);
+    }
+    return least;
 }
 
 // least_change(earlier, later) -> float | None: the least of the changes of speed; 0 where nobody is
@@ -698,15 +762,8 @@ PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (earlier.size != later.size) {
         Py_RETURN_NONE;
     }
-    double least = later.size ? HUGE_VAL : 0.0;
-    for (size_t row = 0; row < later.size; row++) {
-        const double change = later.speeds[row] - earlier.speeds[row];
-        if (std::isnan(change)) {
-            Py_RETURN_NONE;
-        }
-        least = std::min(least, change);
-    }
-    return PyFloat_FromDouble(least);
+    const double least = least_of(earlier, later);
+    return std::isnan(least) ? Py_NewRef(Py_None) : PyFloat_FromDouble(least);
 }
 
 // ------------------------------------------------------------------------------------------------ the closest approach
@@ -949,6 +1006,38 @@ void say_where(char *start, size_t committed, long long step, int phase, uint32_
     memcpy(start + 52, &agent, 4);
 }
 
+// A record of bytes, padded; returns where it ends.
+size_t put_record(char *start, size_t offset, long tag, long agent, const void *data, size_t length) {
+    char *place = start + offset;
+    const size_t padding = -length & 7;
+    const unsigned char head[2] = {static_cast<unsigned char>(tag), 0};
+    const uint16_t whose = static_cast<uint16_t>(agent);
+    const uint32_t size = static_cast<uint32_t>(length);
+    memcpy(place, head, 2);
+    memcpy(place + 2, &whose, 2);
+    memcpy(place + 4, &size, 4);
+    memcpy(place + 8, data, length);
+    memset(place + 8 + length, 0, padding);
+    return offset + 8 + length + padding;
+}
+
+// A record of a step but for the rewards, for which room is left; returns where these go.
+char *put_step(char *place, long tag, long long step, double time_s, size_t agents, const std::vector<double> &values) {
+    const auto put = [&](const void *value, size_t size) {
+        memcpy(place, value, size);
+        place += size;
+    };
+    const unsigned char head[4] = {static_cast<unsigned char>(tag), 0, 0, 0};
+    const uint32_t length = static_cast<uint32_t>(8 * (2 + agents + values.size()));
+    const int64_t number = step;
+    put(head, 4);
+    put(&length, 4);
+    put(&number, 8);
+    put(&time_s, 8);
+    memcpy(place + 8 * agents, values.data(), 8 * values.size());
+    return place;
+}
+
 // write_array(buffer, offset, tag, agent, array, step, phase) -> end | None
 // A record of an array as BlackBox._raw packs it.
 PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
@@ -976,17 +1065,9 @@ PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
                       length + padding + 8 <= static_cast<size_t>(buffer.len - offset) && length <= UINT32_MAX &&
                       tag >= 0 && tag <= 255 && agent >= 0 && agent <= 65535;
     if (fits) {
-        char *start = static_cast<char *>(buffer.buf), *place = start + offset;
-        const unsigned char head[2] = {static_cast<unsigned char>(tag), 0};
-        const uint16_t whose = static_cast<uint16_t>(agent);
-        const uint32_t size = static_cast<uint32_t>(length);
-        memcpy(place, head, 2);
-        memcpy(place + 2, &whose, 2);
-        memcpy(place + 4, &size, 4);
-        memcpy(place + 8, array.buf, length);
-        memset(place + 8 + length, 0, padding);
-        say_where(start, static_cast<size_t>(offset) + 8 + length + padding, step, static_cast<int>(phase),
-                  static_cast<uint32_t>(agent));
+        char *start = static_cast<char *>(buffer.buf);
+        const size_t end = put_record(start, static_cast<size_t>(offset), tag, agent, array.buf, length);
+        say_where(start, end, step, static_cast<int>(phase), static_cast<uint32_t>(agent));
     }
     PyBuffer_Release(&array);
     PyBuffer_Release(&buffer);
@@ -1029,32 +1110,22 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
         PyErr_SetString(PyExc_ValueError, "a step is written beyond the end");
         return nullptr;
     }
-    char *place = static_cast<char *>(buffer.buf) + offset;
-    const auto put = [&](const void *value, size_t size) {
-        memcpy(place, value, size);
-        place += size;
-    };
-    const unsigned char head[4] = {static_cast<unsigned char>(tag), 0, 0, 0};
-    const uint32_t length = static_cast<uint32_t>(payload);
-    const int64_t number = step;
-    put(head, 4);
-    put(&length, 4);
-    put(&number, 8);
-    put(&time_s, 8);
+    char *place = put_step(static_cast<char *>(buffer.buf) + offset, tag, step, time_s, agents, values);
     for (size_t agent = 0; agent < agents; agent++) {
         const double reward = PyFloat_AsDouble(PyTuple_GET_ITEM(rewards, static_cast<Py_ssize_t>(agent)));
         if (reward == -1.0 && PyErr_Occurred()) {
             PyBuffer_Release(&buffer);
             return nullptr;
         }
-        put(&reward, 8);
+        memcpy(place + 8 * agent, &reward, 8);
     }
-    put(values.data(), 8 * values.size());
     say_where(static_cast<char *>(buffer.buf), static_cast<size_t>(offset) + 8 + payload, step,
               static_cast<int>(phase), 0);
     PyBuffer_Release(&buffer);
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + payload);
 }
+
+#include "usual.hpp"
 
 // ---------------------------------------------------------------------------------------------------------- the module
 
@@ -1109,14 +1180,18 @@ PyMethodDef functions[] = {
 };
 
 int fill(PyObject *module) {
-    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec}) {
+    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec}) {
         PyObject *type = PyType_FromSpec(spec);
         if (!type || PyModule_AddObjectRef(module, strrchr(spec->name, '.') + 1, type) < 0) {
             Py_XDECREF(type);
             return -1;
         }
         // Never given back: columns may outlive the module.
-        (spec == &vehicles_spec ? vehicles_type : columns_type) = reinterpret_cast<PyTypeObject *>(type);
+        if (spec == &vehicles_spec) {
+            vehicles_type = reinterpret_cast<PyTypeObject *>(type);
+        } else if (spec == &columns_spec) {
+            columns_type = reinterpret_cast<PyTypeObject *>(type);
+        }
     }
     return PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE);
 }

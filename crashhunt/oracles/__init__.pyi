@@ -7,7 +7,12 @@ from ._choice import (
     outcomes_brought as outcomes_brought,
     parse_oracle as parse_oracle,
 )
-from ._crashes import OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
+from ._crashes import (
+    HARDEST as HARDEST,
+    OffRoad as OffRoad,
+    Overlap as Overlap,
+    ReportedCollision as ReportedCollision,
+)
 from ._protocol import (
     BringsOutcomes as BringsOutcomes,
     Finding as Finding,

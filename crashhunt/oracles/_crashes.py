@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 
     from crashhunt.world import Contact, Rectangle, Scene, Touch
 
-__all__ = ["OffRoad", "Overlap", "ReportedCollision"]
+__all__ = ["HARDEST", "OffRoad", "Overlap", "ReportedCollision"]
 
-_HARDEST = 10.0  # m/s²; nobody has been faster in the previous scene than this explains
+HARDEST = 10.0
+"""In m/s²; nobody has been faster in the previous scene than this explains."""
 
 
 class ReportedCollision:
@@ -121,10 +122,10 @@ def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
         step_s = scene.time_s - previous.time_s
         same = previous.roster is roster and not (scene.spines or previous.spines)
         if same and scene.core is not None and scene.columns is not None and previous.columns is not None:
-            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, _HARDEST)
+            rows = scene.core.within_reach(scene.columns, previous.columns, row, step_s, HARDEST)
             if rows is not None:
                 return rows
-        further = 2 * reachable_m(max(scene.speeds) + _HARDEST * step_s, step_s)
+        further = 2 * reachable_m(max(scene.speeds) + HARDEST * step_s, step_s)
     limit = (roster.touch_distance + further) ** 2
     moved, found = None, []
     reaches = roster.reaches

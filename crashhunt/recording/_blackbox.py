@@ -22,7 +22,7 @@ import numpy as np
 from crashhunt.base.errors import DISK, BundleError, RecorderError
 from crashhunt.base.forks import MEMORY
 from crashhunt.recording._digest import is_evidence
-from crashhunt.recording.records import action, notes, observation, prologue, step as steps
+from crashhunt.recording.records import action, lanes, notes, observation, prologue, step as steps
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Core
+    from crashhunt.native import Core, UsualSteps
     from crashhunt.world import Frame, Roster, Scene
 
 __all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
@@ -57,6 +57,7 @@ class Phase(IntEnum):
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
 _STEP, _OBSERVATION, _ACTION = steps.TYPE.tag, observation.TYPE.tag, action.TYPE.tag
+_LENT = _OBSERVATION, _ACTION, _STEP, lanes.TYPE.tag  # what somebody else records
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -106,11 +107,12 @@ class BlackBox:
         self._offset = _FIRST
         self._step = 0
         self._agents = 0
-        self._roster: object = None
+        self._roster: Roster | None = None
         self._core: Core | None = None
         self._steps: dict[int, struct.Struct] = {}
-        self._trail: list[tuple[Roster, int, Scene | None]] = []
+        self._trail: list[tuple[Roster | None, int, Scene | None]] = []
         self._aside: list[tuple[int, int]] = []
+        self._lent: UsualSteps | None = None
         try:
             self._reserve(_FIRST)
         except RecorderError:
@@ -124,6 +126,7 @@ class BlackBox:
 
     def begin(self, *, pid: int, trial: int, started: float) -> None:
         """Forget the previous trial and open the next."""
+        self._take_back()
         _HEADER.pack_into(self._map, 0, _MAGIC, pid, 0, trial, started, _FIRST, 0, Phase.SETUP, 0)
         self._offset = _FIRST
         self._step = 0
@@ -139,6 +142,7 @@ class BlackBox:
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
         """Record something rare, of any type."""
+        self._take_back()
         offset, length = self._offset, len(payload)
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
@@ -162,7 +166,30 @@ class BlackBox:
         """Record what an agent answered."""
         self._raw(_ACTION, agent, array, _SIMULATE)
 
+    def lend(self, steps: UsualSteps, roster: Roster) -> bool:
+        """Have the core record steps of a roster by itself, until anything else is asked of this black box.
+
+        Returns:
+            False where the last step was of others, or none has been recorded.
+        """
+        self._take_back()
+        if self._roster is not roster or self._agents != 1:
+            return False
+        steps.borrow(self._map, self._offset, self._reserved, _LENT)
+        self._lent = steps
+        return True
+
+    def _take_back(self) -> None:
+        if self._lent is not None:
+            self._offset, step, places = self._lent.give_back()
+            self._lent = None
+            if places:
+                self._step = step
+                self._trail += [(self._roster, place, None) for place in places]
+
     def _raw(self, tag: int, agent: int, array: NDArray[np.generic], phase: int) -> None:
+        if self._lent is not None:
+            self._take_back()
         offset, length = self._offset, array.nbytes
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
@@ -184,6 +211,8 @@ class BlackBox:
 
     def step(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Record that a step is complete; the scene's roster must have been recorded."""
+        if self._lent is not None:
+            self._take_back()
         offset, count = self._offset, len(scene.roster)
         packer = self._steps.get(count)
         if packer is None:
@@ -217,10 +246,12 @@ class BlackBox:
 
     def mark(self, phase: int, agent: int = 0) -> None:
         """Say where the process is, and commit."""
+        self._take_back()
         _WHERE.pack_into(self._map, _WHERE_OFFSET, self._offset, self._step, phase, agent)
 
     def take_frames(self) -> list[Frame]:
         """Return the scenes recorded since the last call, as bare columns."""
+        self._take_back()
         frames: list[Frame] = []
         for roster, group in groupby(self._trail, key=itemgetter(0)):
             run = list(group)
@@ -233,16 +264,19 @@ class BlackBox:
 
     def committed(self) -> memoryview:
         """The bytes of all records so far."""
+        self._take_back()
         return memoryview(self._map)[_FIRST : self._offset]
 
     def evidence(self) -> list[memoryview]:
         """The bytes of all records so far over which the digest runs."""
+        self._take_back()
         whole = memoryview(self._map)
         edges = [_FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
         """Write to nowhere from now on: this process is a copy of the one that records."""
+        self._take_back()
         self._map = mmap.mmap(-1, self._mapped)
         self._file = os.open(os.devnull, os.O_RDWR)
 
@@ -253,6 +287,7 @@ class BlackBox:
 
     def copy(self) -> None:
         """Go on in memory of this process's own: it is a copy of the one that records, and goes on recording."""
+        self._take_back()
         data = bytes(memoryview(self._map)[: self._offset])
         self._file = os.memfd_create(MEMORY)
         self._reserved = self._mapped = 0
@@ -261,6 +296,7 @@ class BlackBox:
 
     def close(self) -> None:
         """Unmap and close the file."""
+        self._take_back()
         self._map.close()
         os.close(self._file)
 

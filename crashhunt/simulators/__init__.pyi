@@ -9,6 +9,7 @@ from ._kinematics import Kinematics as Kinematics
 from ._protocol import (
     FACULTIES as FACULTIES,
     ActionForm as ActionForm,
+    AtOnce as AtOnce,
     BrakesFully as BrakesFully,
     Disturbing as Disturbing,
     Disturbs as Disturbs,
@@ -27,6 +28,7 @@ from ._protocol import (
     PlaysPaths as PlaysPaths,
     Simulator as Simulator,
     StepResult as StepResult,
+    StepsAtOnce as StepsAtOnce,
     TellsEvents as TellsEvents,
     TellsNotices as TellsNotices,
     Tidies as Tidies,

@@ -76,6 +76,11 @@ class Kinematics:
         self._blank = (0.0,) * len(self.features)
 
     @property
+    def usual(self) -> bool:
+        """Whether it has the columns that the core knows, as they are."""
+        return self._usual
+
+    @property
     def space(self) -> Space[object]:
         """The Gymnasium space: highway-env's, with bounds that no simulation reaches instead of infinite ones."""
         from gymnasium import spaces

@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
+    from crashhunt.native import UsualSteps
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Lane, Paths, Scene
 
 __all__ = [
     "FACULTIES",
     "ActionForm",
+    "AtOnce",
     "BrakesFully",
     "Disturbing",
     "Disturbs",
@@ -38,6 +40,7 @@ __all__ = [
     "PlaysPaths",
     "Simulator",
     "StepResult",
+    "StepsAtOnce",
     "TellsEvents",
     "TellsNotices",
     "Tidies",
@@ -324,6 +327,39 @@ class HasMeanings(Protocol):
         """A word for each number, from 0, such as ``SLOWER``."""
 
 
+class AtOnce(Protocol):
+    """Takes steps of one episode with one agent in which nothing happens, with all that an episode does about them.
+
+    While it goes ahead, the simulator stays where it was, until somebody asks.
+    """
+
+    core: UsualSteps
+    """What takes a step, and says what has come of it."""
+
+    def resume(self) -> Scene | None:
+        """Have `core` go on from where the simulator is; return its scene, None where that has to wait."""
+
+    def catch_up(self) -> StepResult:
+        """Bring the simulator to where `core` is; return what its last step would have returned."""
+
+    def apply(self, agent: str, action: NDArray[np.generic], /) -> bool:
+        """Apply an encoded action; return whether there is nothing about it to look into."""
+
+    def finish(self, actions: Mapping[str, NDArray[np.generic]], /) -> StepResult:
+        """Do what is left of a step that has been simulated."""
+
+    def explained(self, error: BaseException, /) -> BaseException:
+        """Return what a step raises in place of an exception of the simulation."""
+
+
+class StepsAtOnce(Protocol):
+    """A simulator of which most steps may be taken in one call, by the compiled core."""
+
+    @property
+    def at_once(self) -> AtOnce | None:
+        """What takes them, in this episode; None where nothing can."""
+
+
 FACULTIES: tuple[type, ...] = (
     TellsNotices,
     FlattensObservations,
@@ -337,6 +373,7 @@ FACULTIES: tuple[type, ...] = (
     HoldsBack,
     LeavesOut,
     PlaysPaths,
+    StepsAtOnce,
     Tidies,
 )
 """Everything that a simulator may offer."""

@@ -32,6 +32,11 @@ class Standstill:
         """Forget the last episode."""
         self._stood.clear()
 
+    @property
+    def counted(self) -> tuple[dict[str, int], int]:
+        """For the core: for how many steps who has stood still, and how many are too many."""
+        return self._stood, self._steps
+
     def move(self, vehicle: str) -> None:
         """Say that a vehicle moves, or that its standing does not count."""
         self._stood.pop(vehicle, None)

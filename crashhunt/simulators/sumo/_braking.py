@@ -50,6 +50,25 @@ class HardBraking:
         self._told: set[str] = set()  # those of them that have been told
         self.lately: dict[str, tuple[str, float]] = {}  # who has braked hard for whom, and when last, in s
 
+    @property
+    def followers(self) -> dict[str, str]:
+        """Who is behind each controlled vehicle after the last step; empty where nobody is."""
+        return self._followers
+
+    @property
+    def counted(self) -> tuple[dict[str, float], float]:
+        """For the core: what counts as hard, by vehicle, and for all of them or 0, in m/s²."""
+        return self._limits, self._limit or 0.0
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nobody braked hard in the last step."""
+        return not self._wary
+
+    def go_on(self, followers: dict[str, str]) -> None:
+        """Go on from a step since which nobody has braked hard."""
+        self._followers = followers
+
     def look(
         self, last: Scene, scene: Scene, agents: Sequence[str], lanes: Mapping[str, str]
     ) -> list[tuple[str, str, str]]:

@@ -141,6 +141,19 @@ class Sight:
             columns=columns,
         )  # fmt: skip
 
+    @property
+    def around(self) -> tuple[Vehicles, int, float]:
+        """For the core: around which vehicles it looks, every how many steps, how far (m, squared)."""
+        assert self._eyes is not None
+        return self._eyes, self._every, _SIGHT_SQUARED
+
+    @property
+    def plain(self) -> tuple[Vehicles, tuple[str, ...]] | None:
+        """Who is in sight, for the core and by their ids; None where there is more about them than it knows."""
+        if self._plain is None or self._high or self._all_persons:
+            return None
+        return self._plain, self._ids
+
     def reads_right(self) -> bool:
         """Whether the core reads what libsumo's getters return, to the bit."""
         if self.core is None or self._vehicles is None:

@@ -21,12 +21,14 @@ from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
+from crashhunt.simulators.sumo._driving import Driving
 from crashhunt.simulators.sumo._entering import enter, replaced_by
 from crashhunt.simulators.sumo._holding import held_back
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._taking_part import TakingPart
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
+from crashhunt.simulators.sumo._usual import Present, UsualSteps
 from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.scenario import Scenario
     from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Paths, Scene
@@ -88,8 +90,7 @@ class SumoSimulator:
             core=core,
         )
         self.notices: list[str] = []
-        self._edges: dict[str, tuple[int, float]] = {}
-        self._closed_lanes: dict[tuple[str, str], bool] = {}
+        self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
@@ -97,6 +98,8 @@ class SumoSimulator:
         self.scripted = False
         self._setups = scenario.agents
         self._look_with: Sight | ScriptedSight = self._sight
+        self._scene: Scene
+        self.at_once: UsualSteps | None = None
 
     told_events = BACKEND.told_events
     disturbing_kinds = BACKEND.disturbances or ()
@@ -127,6 +130,7 @@ class SumoSimulator:
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Load the scenario, let the traffic warm up, and put the controlled vehicles on the road."""
         global _current
+        self._stop_going_ahead()
         options = options or {}
         arguments = options.get("arguments", {})
         self._begin(options.get("only"), options.get("script"), arguments)
@@ -144,23 +148,29 @@ class SumoSimulator:
         except _TRACI_ERRORS as error:
             raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
         self.agents = list(self._setups)
-        self._targets = dict.fromkeys(self.agents, -1)
+        self._driving.begin(self.agents)
         self._start = {agent: sumo.vehicle_getDistance(agent) for agent in self.agents}
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
         self._look()
         observations = self._observe_all()
-        if self._sight.core is not None and self._is_core_wrong(observations):
+        usual = self._usual_steps()
+        if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
             self.notices.append(_DISTRUSTED)
             self._look()
-            observations = self._observe_all()
+            observations, usual = self._observe_all(), None
         self._events.begin(self._scene, self.agents, self._moved)
+        self._shown, self.at_once = observations, usual
+        if usual is not None:
+            usual.begin()
         return observations, {}
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
+        if self.at_once is not None and self.at_once.core.step > self._steps:
+            self.at_once.catch_up()
         self._off_road = []
         if _current is None or _current() is not self:
             raise SimulatorError(
@@ -169,8 +179,18 @@ class SumoSimulator:
             )
         try:
             for agent, action in actions.items():
-                self._apply(agent, action)
+                if not self._driving.apply(agent, action):
+                    self._off_road.append(agent)
             libsumo.simulationStep()
+        except _TRACI_ERRORS as error:
+            raise _gave_up(error) from error
+        return self._finish(actions)
+
+    def _finish(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
+        """See what has come of a step that has been simulated."""
+        if self.at_once is not None:
+            self.at_once.core.pause()
+        try:
             if self._taking_part is not None:
                 self._taking_part.remove()
             self._steps += 1
@@ -186,7 +206,8 @@ class SumoSimulator:
                 terminations[agent] = row is None
             scene.events = self._events.look(scene, tuple(actions))
         except _TRACI_ERRORS as error:
-            raise SimulatorError(f"SUMO gave up: {_one_line(error)}") from error
+            raise _gave_up(error) from error
+        self._shown = observations
         if scene.contacts or self._off_road:
             hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}
             terminations |= dict.fromkeys(hit.union(self._off_road).intersection(actions), True)
@@ -196,6 +217,8 @@ class SumoSimulator:
 
     def scene(self) -> Scene:
         """Return the state of the vehicles in sight."""
+        if self.at_once is not None and self.at_once.core.step > self._steps:
+            self.at_once.catch_up()
         return self._scene
 
     def lanes(self) -> list[Lane]:
@@ -218,7 +241,7 @@ class SumoSimulator:
 
     def whom(self, disturbance: Disturbance) -> str:
         """Return who is at a place around an agent, along the lanes."""
-        return self._disturbances.whom(disturbance, self._scene)
+        return self._disturbances.whom(disturbance, self.scene())
 
     def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
         """Command a vehicle until its disturbance ends."""
@@ -263,63 +286,53 @@ class SumoSimulator:
         stay = (*(only or ()), *setups, *self._replaced)
         self._taking_part = None if only is None else TakingPart(stay, self._sight.leaving)
 
-    def _apply(self, agent: str, action: NDArray[np.generic]) -> None:
-        setup = self._scenario.agents[agent]
-        if setup.action == "meta":
-            self._apply_meta(agent, setup, META_ACTIONS[int(action[0])])
-            return
-        speed, change = action.tolist()
-        sumo.vehicle_setSpeed(agent, speed)
-        if change and not self._change_lane(agent, int(change)):
-            self._off_road.append(agent)
+    def _stop_going_ahead(self) -> None:
+        """Another episode begins in this process, whoever's the last one was."""
+        last = _current() if _current is not None else None
+        if last is not None and last.at_once is not None:
+            last.at_once.core.stop()
+        self.at_once = None
 
-    def _apply_meta(self, agent: str, setup: AgentSetup, action: str) -> None:
-        """As highway-env does it: FASTER and SLOWER step from the nearest of the target speeds."""
-        targets = setup.target_speeds
-        if self._targets[agent] < 0:
-            speed = sumo.vehicle_getSpeed(agent)
-            self._targets[agent] = min(range(len(targets)), key=lambda index: abs(targets[index] - speed))
-        shift = {"FASTER": 1, "SLOWER": -1}.get(action, 0)
-        self._targets[agent] = max(0, min(len(targets) - 1, self._targets[agent] + shift))
-        sumo.vehicle_setSpeed(agent, targets[self._targets[agent]])
-        change = {"LANE_LEFT": 1, "LANE_RIGHT": -1}.get(action, 0)
-        if change:
-            self._change_lane(agent, change)  # into nothing is ignored, as in highway-env
+    def _usual_steps(self) -> UsualSteps | None:
+        """What lets the core take steps by itself, where it knows everything that belongs to one."""
+        core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
+        if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual:
+            return None
+        (agent,) = self.agents
+        return UsualSteps(
+            core,
+            agent,
+            self._sight,
+            self._events,
+            self._kinematics,
+            present=lambda: Present(self._scene, self._shown, self._steps),
+            arrive=self._arrive,
+            apply=self._apply_alone,
+            finish=self._finish,
+            explained=_explained,
+            edge=self._driving.edge,
+            start_m=self._start[agent],
+            step_length_s=self.step_length_s,
+            lateral=self._lateral,
+            takes_speed=self._scenario.agents[agent].action != "meta",
+        )
 
-    def _change_lane(self, agent: str, change: int) -> bool:
-        """Change to a neighbouring lane at once; False where there is none that the vehicle may use."""
-        edge = sumo.vehicle_getRoadID(agent)
-        if edge.startswith(":"):
-            return True  # inside a junction there is nothing to change to, and nothing to leave either
-        lanes, _ = self._edge(edge)
-        target = sumo.vehicle_getLaneIndex(agent) + change
-        if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
-            return False
-        sumo.vehicle_changeLane(agent, target, self.step_length_s)
-        return True
+    def _arrive(self, present: Present) -> None:
+        """Be where the core has come to."""
+        self._scene, self._shown, self._steps = present
 
-    def _edge(self, edge: str) -> tuple[int, float]:
-        """The number of lanes of an edge, and the width of its first."""
-        found = self._edges.get(edge)
-        if found is None:
-            found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
-        return found
+    def _apply_alone(self, agent: str, action: NDArray[np.generic]) -> bool:
+        """Apply an action; return whether there is nothing about it to look into."""
+        self._off_road = [] if self._driving.apply(agent, action) else [agent]
+        return not self._off_road
 
-    def _is_closed(self, lane: str, vehicle_class: str) -> bool:
-        found = self._closed_lanes.get((lane, vehicle_class))
-        if found is None:
-            allowed = sumo.lane_getAllowed(lane)
-            found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
-            self._closed_lanes[lane, vehicle_class] = found
-        return found
-
-    def _is_core_wrong(self, observations: Observations) -> bool:
+    def _is_core_wrong(self, observations: Observations, usual: UsualSteps | None) -> bool:
         """Whether the compiled core says anything else than the Python that it stands for."""
         core, self._scene.core = self._scene.core, None
         plain = self._observe_all()
         self._scene.core = core
         same = all(plain[agent].tobytes() == observations[agent].tobytes() for agent in plain)
-        return not (same and self._sight.reads_right())
+        return not (same and self._sight.reads_right() and (usual is None or usual.reads_right()))
 
     def _observe_all(self) -> Observations:
         return {agent: self._observe(agent, self._scene.roster.index[agent]) for agent in self.agents}
@@ -330,7 +343,7 @@ class SumoSimulator:
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
         edge = sumo.vehicle_getRoadID(agent)
-        lanes, width = self._edge(edge)
+        lanes, width = self._driving.edge(edge)
         # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
         lane = sumo.vehicle_getLaneIndex(agent)
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
@@ -347,6 +360,19 @@ class SumoSimulator:
             lateral_speed=lateral_speed,
             lanes=lanes,
         )
+
+
+def _explained(error: BaseException) -> BaseException:
+    """What a step raises in place of an exception of SUMO's."""
+    if not isinstance(error, _TRACI_ERRORS):
+        return error
+    found = _gave_up(error)
+    found.__cause__ = error
+    return found
+
+
+def _gave_up(error: BaseException) -> SimulatorError:
+    return SimulatorError(f"SUMO gave up: {_one_line(error)}")
 
 
 def _one_line(error: BaseException) -> str:

@@ -61,6 +61,30 @@ class SumoEvents:
         self._stuck: set[tuple[str, str]] = set()
         self._standstill.begin()
 
+    @property
+    def controlled(self) -> dict[str, object]:
+        """All vehicles that are driven from outside."""
+        return dict(self._controlled)
+
+    @property
+    def followers(self) -> dict[str, str]:
+        """Who is behind each agent; empty where nobody is."""
+        return self._braking.followers
+
+    @property
+    def counted(self) -> tuple[dict[str, float], float, dict[str, int], int]:
+        """For the core: what `HardBraking` and `Standstill` count."""
+        return *self._braking.counted, *self._standstill.counted
+
+    def is_quiet(self, agent: str) -> bool:
+        """Whether nothing goes on that the next step has to be looked at for."""
+        return self._braking.is_quiet and agent not in self._wrong
+
+    def go_on(self, scene: Scene, steps: int, followers: dict[str, str]) -> None:
+        """Go on from a scene, after so many steps, since which there has been no event."""
+        self._last, self._steps = scene, steps
+        self._braking.go_on(followers)
+
     def look(self, scene: Scene, agents: Sequence[str]) -> tuple[Event, ...]:
         """Return what happened in the step to this scene.
 

@@ -1,0 +1,117 @@
+"""Whether most steps of an episode can be taken in one call, by the compiled core."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crashhunt.base.faculties import offers
+from crashhunt.episode._nearness import Nearness
+from crashhunt.episode._recorder import Recorder
+from crashhunt.episode._wiring import wants
+from crashhunt.native import ANSWERED, ASK, DONE, REFUSED
+from crashhunt.oracles import (
+    HARDEST,
+    OffRoad,
+    OffRoute,
+    Overlap,
+    RedLight,
+    ReportedCollision,
+    Teleport,
+    TrafficEvents,
+    WrongWay,
+)
+from crashhunt.simulators import FlattensObservations, StepsAtOnce
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.agents import Agent
+    from crashhunt.episode._observer import Observer
+    from crashhunt.oracles import Oracle
+    from crashhunt.recording import BlackBox
+    from crashhunt.simulators import AtOnce, Simulator
+
+__all__ = ["Ahead", "goes_ahead"]
+
+_FIND_NOTHING = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
+"""Oracles that find nothing where the simulator tells of nothing; whoever inherits from one is none of them."""
+
+
+class Ahead:
+    """Goes on where the core has left something of a step, as long as nothing has happened that Python looks into.
+
+    Args:
+        at_once: the simulator's.
+        box: the recorder's.
+        agent: the only one of the episode.
+        encode: encodes its actions.
+    """
+
+    def __init__(
+        self, at_once: AtOnce, box: BlackBox, agent: str, encode: Callable[[object], NDArray[np.generic]]
+    ) -> None:
+        self.at_once = at_once
+        self._box, self._agent, self._encode = box, agent, encode
+
+    def go_on_from(
+        self, come: int, agents: dict[str, Agent], tells: Sequence[Callable[[int, NDArray[np.generic]], None]]
+    ) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
+        """Return what a step has come to in the end, and what the agent answered; None where it was not asked.
+
+        Args:
+            come: what it has come to so far.
+            agents: by name.
+            tells: who is told of an action, where the core does not record it.
+        """
+        core = self.at_once.core
+        if come == REFUSED and self._resume():
+            come = core.take(agents)
+        if come in (DONE, ASK, REFUSED):
+            return come, None
+        action = self._encode(core.answer)
+        if come == ANSWERED:
+            if core.note(action):
+                come = core.go_on(self.at_once.apply(self._agent, action))
+            else:
+                for tell in tells:
+                    tell(0, action)
+        return come, {self._agent: action}
+
+    def _resume(self) -> bool:
+        """Have the core go on from where simulator and black box are; False where that has to wait."""
+        scene = self.at_once.resume()
+        return scene is not None and self._box.lend(self.at_once.core, scene.roster)
+
+
+def goes_ahead(
+    simulator: Simulator,
+    observers: Sequence[Observer],
+    oracles: Sequence[Oracle],
+    max_steps: int,
+    encoders: Sequence[Callable[[object], NDArray[np.generic]]],
+) -> Ahead | None:
+    """Return what takes steps at once; None where somebody has to be told of each part of each step.
+
+    Args:
+        simulator: which has been reset.
+        observers: of the episode.
+        oracles: of the episode.
+        max_steps: of the episode.
+        encoders: of the actions of each agent.
+    """
+    first = observers[0] if observers else None
+    if not isinstance(first, Recorder) or type(first) is not Recorder or not offers(simulator, StepsAtOnce):
+        return None
+    if simulator.at_once is None or offers(simulator, FlattensObservations):
+        return None
+    rest = [one for one in observers[1:] if type(one) is not Nearness]
+    if any(wants(one, "observation") or wants(one, "action") for one in rest):
+        return None
+    always = any(wants(one, "scene") for one in rest)
+    always = always or any(type(one) is not Overlap and type(one) not in _FIND_NOTHING for one in oracles)
+    overlaps = any(type(one) is Overlap for one in oracles)
+    simulator.at_once.core.judge(overlaps, HARDEST, always, max_steps, Nearness.EVERY)
+    return Ahead(simulator.at_once, first.box, simulator.agents[0], encoders[0])

@@ -1,0 +1,633 @@
+// Steps of SUMO in which nothing happens, each in one call. A part of core.cpp.
+//
+// An episode with one agent comes to this in most of its steps: it is shown what it was going to be shown, it answers a
+// speed, SUMO simulates, and nobody has come, gone, collided, changed roads, braked hard, stood for long or come within
+// reach. What Episode.step, BlackBox, SumoSimulator.step, Sight.look, SumoEvents.look and the oracles do about such a
+// step is done here, with the same records. Whatever else it turns out to be is handed back as soon as that is seen, and
+// nothing has been done by then that Python would do again.
+
+enum Come { DONE, ASK, REFUSED, ANSWERED, SIMULATED };
+enum Phase { ACTING = 1, SIMULATING = 2 }; // as BlackBoxHeader has them
+
+const int LANES_EVERY = 10, DIRECTION_EVERY = 10; // steps
+const double STANDING = 0.1;                      // m/s, as Standstill.SPEED
+const double LOOKED_INTO = 2.0, TOLERANCE = 0.01; // m/s², as of HardBraking
+const double ALONG = -0.4; // a cosine; what comes nearer to the -0.5 of SumoEvents is Python's to judge
+const double MOST_SPEED = 100.0;
+const double RADIANS = 3.141592653589793 / 180.0;
+
+struct Moment {
+    double time_s = 0;
+    std::vector<double> values;
+    std::string lanes; // a line each; empty where the step does not look
+};
+
+PyObject *text_of(const std::string &text) {
+    return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
+}
+
+struct Steps {
+    // of the episode
+    std::string agent;
+    PyObject *name = nullptr, *libsumo = nullptr, *array = nullptr, *shape = nullptr, *dtype = nullptr;
+    PyObject *act = nullptr, *simulate = nullptr; // what these methods are called
+    Vehicles *eyes = nullptr;
+    size_t others = 0;
+    double step_s = 0, start_m = 0, hardest = 0, within = 0;
+    int lateral = 0, takes_speed = 0;
+    long every = 1;
+    PyObject *limits = nullptr, *stood = nullptr; // of HardBraking, and of Standstill
+    double limit = 0;
+    long standstill = 0;
+    int always_ask = 0, overlaps = 0;
+    long long last = 0, now_and_then = 0;
+    // of the present roster, and of the step that is complete
+    bool ready = false, stopped = false;
+    Vehicles *vehicles = nullptr;
+    PyObject *ids = nullptr;
+    std::vector<char> controlled;
+    size_t row = 0;
+    long long step = 0;
+    Moment now, before, next;
+    std::string road, lane, follower, next_follower;
+    int lane_index = 0;
+    double from_left = 0, reward = 0;
+    PyObject *observation = nullptr, *answer = nullptr;
+    bool simulating = false;
+    // of the black box
+    PyObject *tape = nullptr;
+    size_t offset = 0, reserved = 0;
+    long tags[4] = {}; // of an observation, an action, a step, lanes
+    std::vector<size_t> trail;
+
+    Steps() = default;
+    Steps(const Steps &) = delete;
+    ~Steps() {
+        for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, reinterpret_cast<PyObject *>(eyes),
+                              limits, stood, reinterpret_cast<PyObject *>(vehicles), ids, observation, answer, tape}) {
+            Py_XDECREF(one);
+        }
+    }
+
+    bool able() const { return ready && !stopped && tape; }
+
+    // Writes a record and where the process is; false where that is Python's to do.
+    bool record(int kind, const void *data, size_t length, Phase phase) {
+        Py_buffer buffer;
+        if (offset + length + 16 > reserved || length > UINT32_MAX) {
+            return false;
+        }
+        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+            PyErr_Clear();
+            return false;
+        }
+        char *start = static_cast<char *>(buffer.buf);
+        offset = put_record(start, offset, tags[kind], 0, data, length);
+        say_where(start, offset, step, phase, 0);
+        PyBuffer_Release(&buffer);
+        return true;
+    }
+
+    bool record_array(int kind, PyObject *given, Phase phase) {
+        Py_buffer array;
+        if (PyObject_GetBuffer(given, &array, PyBUF_C_CONTIGUOUS) < 0) {
+            PyErr_Clear();
+            return false;
+        }
+        const bool done = record(kind, array.buf, static_cast<size_t>(array.len), phase);
+        PyBuffer_Release(&array);
+        return done;
+    }
+
+    // Takes the last record back, which nobody has read.
+    void forget(size_t end) {
+        Py_buffer buffer;
+        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+            PyErr_Clear();
+            return;
+        }
+        offset = end;
+        say_where(static_cast<char *>(buffer.buf), offset, step, ACTING, 0);
+        PyBuffer_Release(&buffer);
+    }
+
+    // Which way it drives, where it is asked; false where that may be an event.
+    bool is_going_along(const Scene &present, const Scene &last) const {
+        if (lane.empty() || lane[0] == ':') {
+            return true;
+        }
+        const double dx = present.x(row) - last.x(row), dy = present.y(row) - last.y(row);
+        const double driven = std::hypot(dx, dy);
+        if (driven < STANDING * step_s) {
+            return true;
+        }
+        const double angle = sumo.lane_angle(lane, sumo.along(agent)) * RADIANS;
+        return (dx * sin(angle) + dy * cos(angle)) / driven >= ALONG;
+    }
+
+    // Whether somebody braked harder than its limit; -1 where Python has to say.
+    int is_braking_hard(const Scene &present, const Scene &last) {
+        const double least = least_of(last, present);
+        if (std::isnan(least)) {
+            return -1;
+        }
+        if (least > -LOOKED_INTO * step_s) {
+            return 0;
+        }
+        for (size_t actor = 0; actor < present.size; actor++) {
+            const double deceleration = (last.speeds[actor] - present.speeds[actor]) / step_s;
+            if (deceleration < LOOKED_INTO || controlled[actor]) {
+                continue;
+            }
+            PyObject *id = PyTuple_GET_ITEM(ids, static_cast<Py_ssize_t>(actor));
+            PyObject *known = PyDict_GetItemWithError(limits, id); // borrowed
+            double most = known ? PyFloat_AsDouble(known) : limit;
+            if (!known && !PyErr_Occurred()) {
+                most = limit ? limit : sumo.decel(vehicles->roster->ids[actor]);
+                PyObject *value = PyFloat_FromDouble(most);
+                if (value) {
+                    PyDict_SetItem(limits, id, value);
+                    Py_DECREF(value);
+                }
+            }
+            if (PyErr_Occurred()) {
+                PyErr_Clear();
+                return -1;
+            }
+            if (deceleration > most + TOLERANCE) {
+                return 1;
+            }
+        }
+        return 0;
+    }
+
+    // Counts a step in which it stands; false where that is an event, or Python's to say. The last thing that is asked.
+    bool stands_on(double speed) {
+        if (fabs(speed) >= STANDING) {
+            return speed > 0 && PyDict_GET_SIZE(stood) == 0;
+        }
+        if (sumo.stop_state(agent) & 1) {
+            return PyDict_GET_SIZE(stood) == 0;
+        }
+        PyObject *before = PyDict_GetItemWithError(stood, name); // borrowed
+        const long count = (before ? PyLong_AsLong(before) : 0) + 1;
+        PyObject *value = count >= standstill || PyErr_Occurred() ? nullptr : PyLong_FromLong(count);
+        const bool counted = value && PyDict_SetItem(stood, name, value) == 0;
+        Py_XDECREF(value);
+        if (!counted) {
+            PyErr_Clear();
+        }
+        return counted;
+    }
+
+    // The lanes of everybody, as a record has them; false where they are not plain text.
+    bool note_lanes(std::string &text) const {
+        text.clear();
+        for (const std::string &id : vehicles->roster->ids) {
+            const std::string where = sumo.lane(id);
+            for (unsigned char letter : where) {
+                if (letter >= 128 || letter == '\n') {
+                    return false;
+                }
+            }
+            if (!text.empty()) {
+                text += '\n';
+            }
+            text += where;
+        }
+        return true;
+    }
+
+    // What the agent will be shown; null with or without an exception.
+    PyObject *shown(const Scene &present) const {
+        double right = from_left, drift = 0.0;
+        const double distance = sumo.driven(agent) - start_m;
+        if (lateral) {
+            right -= sumo.aside(agent);
+            drift = -sumo.aside_speed(agent);
+        }
+        PyObject *bytes = observed(present, row, others, distance, right, drift);
+        PyObject *given[] = {shape, dtype, bytes};
+        PyObject *found = bytes ? PyObject_Vectorcall(array, given, 3, nullptr) : nullptr;
+        Py_XDECREF(bytes);
+        return found;
+    }
+
+    // What has come of a step that has been simulated. Everything is read before anything is noted.
+    Come look() {
+        const long long number = step + 1;
+        PyObject *seen = nullptr;
+        bool near = false;
+        try {
+            if (sumo.vanishing() || sumo.on_foot() || sumo.emergencies() || !sumo.collisions().empty()) {
+                return SIMULATED;
+            }
+            if (number % every == 0 || sumo.departed() || sumo.arrived() || sumo.appearing()) {
+                around.look(*eyes->roster, within);
+                if (!around.same(*vehicles->roster)) {
+                    return SIMULATED;
+                }
+            }
+            if (sumo.lane_index(agent) != lane_index || sumo.road(agent) != road) {
+                return SIMULATED;
+            }
+            read_into(*vehicles->roster, next.values);
+            next.time_s = sumo.time();
+            next.lanes.clear();
+            const Scene present(next.values, vehicles->roster), last(now.values, vehicles->roster);
+            if ((number % LANES_EVERY == 0 && !note_lanes(next.lanes)) ||
+                (number % DIRECTION_EVERY == 0 && !is_going_along(present, last)) || is_braking_hard(present, last)) {
+                return SIMULATED;
+            }
+            next_follower = sumo.follower(agent, 0.0).first;
+            if (overlaps) {
+                near = !reach(present, last, row, next.time_s - now.time_s, hardest, reached) || !reached.empty();
+            }
+            const size_t records = 8 * (2 + 1 + next.values.size()) + next.lanes.size() + 64;
+            if (offset + records > reserved) {
+                return SIMULATED;
+            }
+            seen = shown(present);
+            if (!seen) {
+                PyErr_Clear(); // Python says it again
+                return SIMULATED;
+            }
+            if (!stands_on(present.speeds[row])) {
+                Py_DECREF(seen);
+                return SIMULATED;
+            }
+        } catch (...) { // libsumo's own exceptions: its getters raise the same, as Python's
+            Py_XDECREF(seen);
+            return SIMULATED;
+        }
+        Py_XSETREF(observation, seen);
+        reward = next.values[3 * (next.values.size() / 4) + row] * step_s;
+        std::swap(before, now);
+        std::swap(now, next);
+        std::swap(follower, next_follower);
+        write();
+        return near || always_ask || step >= last || step % now_and_then == 0 ? ASK : DONE;
+    }
+
+    void write() {
+        if (!now.lanes.empty()) {
+            record(3, now.lanes.data(), now.lanes.size(), SIMULATING);
+        }
+        step++;
+        Py_buffer buffer;
+        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+            PyErr_Clear(); // it had one a moment ago
+            return;
+        }
+        char *start = static_cast<char *>(buffer.buf);
+        char *rewards = put_step(start + offset, tags[2], step, now.time_s, 1, now.values);
+        memcpy(rewards, &reward, 8);
+        trail.push_back(offset + 32);
+        offset += 32 + 8 * now.values.size();
+        say_where(start, offset, step, SIMULATING, 0);
+        PyBuffer_Release(&buffer);
+    }
+
+    PyObject *go_on(bool quiet) {
+        simulating = true;
+        PyObject *done = PyObject_CallMethodNoArgs(libsumo, simulate);
+        if (!done) {
+            return nullptr;
+        }
+        Py_DECREF(done);
+        return PyLong_FromLong(quiet && able() ? look() : SIMULATED);
+    }
+};
+
+struct UsualSteps {
+    PyObject_HEAD Steps *steps;
+};
+
+Steps &steps_of(PyObject *object) { return *reinterpret_cast<UsualSteps *>(object)->steps; }
+
+void keep(PyObject *&place, PyObject *value) {
+    Py_INCREF(value);
+    Py_XSETREF(place, value);
+}
+
+// UsualSteps(agent, libsumo, (array, shape, dtype), others, step_s, lateral, takes_speed, (eyes, every, within), start_m)
+PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
+    PyObject *name, *libsumo, *array, *shape, *dtype, *eyes;
+    Py_ssize_t others;
+    double step_s, within, start_m;
+    int lateral, takes_speed;
+    long every;
+    if (!PyArg_ParseTuple(arguments, "UO(OOO)ndpp(Old)d", &name, &libsumo, &array, &shape, &dtype, &others, &step_s,
+                          &lateral, &takes_speed, &eyes, &every, &within, &start_m) ||
+        !vehicles_of(eyes)) {
+        return nullptr;
+    }
+    PyObject *text = PyUnicode_AsEncodedString(name, "utf-8", "surrogateescape");
+    UsualSteps *self = text ? reinterpret_cast<UsualSteps *>(type->tp_alloc(type, 0)) : nullptr;
+    if (!self || others < 0 || every < 1) {
+        if (text && self) {
+            PyErr_SetString(PyExc_ValueError, "it looks around every so many steps, and sees so many others");
+        }
+        Py_XDECREF(text);
+        Py_XDECREF(self);
+        return nullptr;
+    }
+    Steps &steps = *(self->steps = new Steps());
+    steps.agent.assign(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
+    Py_DECREF(text);
+    keep(steps.name, name);
+    keep(steps.libsumo, libsumo);
+    keep(steps.array, array);
+    keep(steps.shape, shape);
+    keep(steps.dtype, dtype);
+    keep(reinterpret_cast<PyObject *&>(steps.eyes), eyes);
+    steps.others = static_cast<size_t>(others);
+    steps.step_s = step_s;
+    steps.lateral = lateral;
+    steps.takes_speed = takes_speed;
+    steps.every = every;
+    steps.within = within;
+    steps.start_m = start_m;
+    steps.act = PyUnicode_InternFromString("act");
+    steps.simulate = PyUnicode_InternFromString("simulationStep");
+    if (!steps.act || !steps.simulate) {
+        Py_DECREF(self);
+        return nullptr;
+    }
+    return reinterpret_cast<PyObject *>(self);
+}
+
+void usual_free(PyObject *object) {
+    PyTypeObject *type = Py_TYPE(object);
+    delete reinterpret_cast<UsualSteps *>(object)->steps;
+    type->tp_free(object);
+    Py_DECREF(type);
+}
+
+// heed(limits, limit, stood, standstill): what SumoEvents counts
+PyObject *usual_heed(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *limits, *stood;
+    if (!PyArg_ParseTuple(arguments, "O!dO!l", &PyDict_Type, &limits, &steps.limit, &PyDict_Type, &stood,
+                          &steps.standstill)) {
+        return nullptr;
+    }
+    keep(steps.limits, limits);
+    keep(steps.stood, stood);
+    Py_RETURN_NONE;
+}
+
+// judge(overlaps, hardest, always_ask, last, now_and_then): when somebody has to be asked about a step
+PyObject *usual_judge(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    if (!PyArg_ParseTuple(arguments, "pdpLL", &steps.overlaps, &steps.hardest, &steps.always_ask, &steps.last,
+                          &steps.now_and_then)) {
+        return nullptr;
+    }
+    steps.now_and_then = std::max(steps.now_and_then, 1LL);
+    Py_RETURN_NONE;
+}
+
+// resume((vehicles, ids, row, controlled), observation, columns, time_s, lanes, (road, lane_index, lane, from_left),
+//        follower, step)
+PyObject *usual_resume(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *vehicles, *ids, *controlled, *observation, *columns;
+    Py_ssize_t row;
+    const char *lanes, *road, *lane, *follower;
+    double time_s, from_left;
+    int lane_index;
+    long long step;
+    steps.ready = false;
+    if (!PyArg_ParseTuple(arguments, "(OO!nO!)OOds(sisd)sL", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
+                          &controlled, &observation, &columns, &time_s, &lanes, &road, &lane_index, &lane, &from_left,
+                          &follower, &step) ||
+        !vehicles_of(vehicles) || !columns_of(columns)) {
+        return nullptr;
+    }
+    const Scene scene(reinterpret_cast<Columns *>(columns));
+    const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
+    if (!steps.limits || !steps.stood || roster.ids.size() != scene.size || roster.lengths.size() != scene.size ||
+        PyTuple_GET_SIZE(ids) != static_cast<Py_ssize_t>(scene.size) || row < 0 ||
+        static_cast<size_t>(row) >= scene.size) {
+        PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
+        return nullptr;
+    }
+    keep(reinterpret_cast<PyObject *&>(steps.vehicles), vehicles);
+    keep(steps.ids, ids);
+    keep(steps.observation, observation);
+    steps.controlled.clear();
+    for (Py_ssize_t actor = 0; actor < PyTuple_GET_SIZE(ids); actor++) {
+        const int known = PyDict_Contains(controlled, PyTuple_GET_ITEM(ids, actor));
+        if (known < 0) {
+            return nullptr;
+        }
+        steps.controlled.push_back(known != 0);
+    }
+    steps.row = static_cast<size_t>(row);
+    steps.now.values = *reinterpret_cast<Columns *>(columns)->values;
+    steps.now.time_s = time_s;
+    steps.now.lanes = lanes;
+    steps.road = road;
+    steps.lane = lane;
+    steps.lane_index = lane_index;
+    steps.from_left = from_left;
+    steps.follower = follower;
+    steps.step = step;
+    steps.ready = true;
+    Py_RETURN_NONE;
+}
+
+// borrow(map, offset, reserved, (tags of an observation, an action, a step, lanes))
+PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
+    Steps &steps = steps_of(object);
+    PyObject *tape;
+    Py_ssize_t offset, reserved;
+    if (!PyArg_ParseTuple(arguments, "Onn(llll)", &tape, &offset, &reserved, &steps.tags[0], &steps.tags[1],
+                          &steps.tags[2], &steps.tags[3])) {
+        return nullptr;
+    }
+    Py_buffer buffer;
+    if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+        return nullptr;
+    }
+    const bool fits = offset >= 64 && offset <= buffer.len && reserved >= 0;
+    steps.reserved = static_cast<size_t>(std::min(reserved, buffer.len));
+    PyBuffer_Release(&buffer);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "nothing can be written there");
+        return nullptr;
+    }
+    keep(steps.tape, tape);
+    steps.offset = static_cast<size_t>(offset);
+    steps.trail.clear();
+    Py_RETURN_NONE;
+}
+
+// give_back() -> (offset, step, where the numbers of each step begin)
+PyObject *usual_give_back(PyObject *object, PyObject *) {
+    Steps &steps = steps_of(object);
+    PyObject *places = PyList_New(static_cast<Py_ssize_t>(steps.trail.size()));
+    for (size_t number = 0; places && number < steps.trail.size(); number++) {
+        PyObject *place = PyLong_FromSize_t(steps.trail[number]);
+        if (!place) {
+            Py_CLEAR(places);
+        } else {
+            PyList_SET_ITEM(places, static_cast<Py_ssize_t>(number), place);
+        }
+    }
+    if (!places) {
+        return nullptr;
+    }
+    Py_CLEAR(steps.tape);
+    steps.trail.clear();
+    return Py_BuildValue("(nLN)", static_cast<Py_ssize_t>(steps.offset), steps.step, places);
+}
+
+// take(agents) -> what has come of it
+PyObject *usual_take(PyObject *object, PyObject *agents) {
+    Steps &steps = steps_of(object);
+    steps.simulating = false;
+    if (!steps.able() || !PyDict_CheckExact(agents)) {
+        return PyLong_FromLong(REFUSED);
+    }
+    PyObject *agent = PyDict_GetItemWithError(agents, steps.name); // borrowed
+    if (!agent || !steps.record_array(0, steps.observation, ACTING)) {
+        return PyErr_Occurred() ? nullptr : PyLong_FromLong(REFUSED);
+    }
+    // Whatever the agent does, both stay what they are for as long as it does it.
+    PyObject *observation = Py_NewRef(steps.observation);
+    Py_INCREF(agent);
+    PyObject *answer = PyObject_CallMethodOneArg(agent, steps.act, observation);
+    Py_DECREF(agent);
+    Py_DECREF(observation);
+    if (!answer) {
+        return nullptr;
+    }
+    Py_XSETREF(steps.answer, answer);
+    if (!steps.able() || !steps.takes_speed || !PyTuple_CheckExact(answer) || PyTuple_GET_SIZE(answer) != 2) {
+        return PyLong_FromLong(ANSWERED);
+    }
+    PyObject *speed = PyTuple_GET_ITEM(answer, 0), *change = PyTuple_GET_ITEM(answer, 1);
+    int overflow = 0;
+    if (!PyFloat_CheckExact(speed) || !PyLong_CheckExact(change) ||
+        PyLong_AsLongAndOverflow(change, &overflow) != 0 || overflow) {
+        return PyLong_FromLong(ANSWERED);
+    }
+    const double action[2] = {PyFloat_AS_DOUBLE(speed), 0.0};
+    const size_t end = steps.offset;
+    if (!(action[0] >= 0.0 && action[0] <= MOST_SPEED) || !steps.record(1, action, sizeof action, SIMULATING)) {
+        return PyLong_FromLong(ANSWERED);
+    }
+    try {
+        sumo.set_speed(steps.agent, action[0]);
+    } catch (...) { // Python's own way of saying it
+        steps.forget(end);
+        return PyLong_FromLong(ANSWERED);
+    }
+    return steps.go_on(true);
+}
+
+// note(action) -> whether it is recorded; next comes the simulator
+PyObject *usual_note(PyObject *object, PyObject *action) {
+    Steps &steps = steps_of(object);
+    steps.simulating = true;
+    return PyBool_FromLong(steps.able() && steps.record_array(1, action, SIMULATING));
+}
+
+PyObject *usual_go_on(PyObject *object, PyObject *quiet) { return steps_of(object).go_on(quiet == Py_True); }
+
+PyObject *usual_pause(PyObject *object, PyObject *) {
+    steps_of(object).ready = false;
+    Py_RETURN_NONE;
+}
+
+PyObject *usual_stop(PyObject *object, PyObject *) {
+    steps_of(object).stopped = true;
+    Py_RETURN_NONE;
+}
+
+// told() -> (step, observation, reward, follower, (time_s, lanes), the same of the step before)
+PyObject *usual_told(PyObject *object, PyObject *) {
+    const Steps &steps = steps_of(object);
+    if (!steps.ready) {
+        Py_RETURN_NONE;
+    }
+    return Py_BuildValue("(LOdN(dN)(dN))", steps.step, steps.observation, steps.reward, text_of(steps.follower),
+                         steps.now.time_s, text_of(steps.now.lanes), steps.before.time_s, text_of(steps.before.lanes));
+}
+
+// columns(back) -> Columns, of the step that is complete or, where it is true, of the one before
+PyObject *usual_columns(PyObject *object, PyObject *back) {
+    const Steps &steps = steps_of(object);
+    const Moment &moment = back == Py_True ? steps.before : steps.now;
+    if (!steps.ready || moment.values.size() != 4 * steps.vehicles->roster->ids.size()) {
+        Py_RETURN_NONE;
+    }
+    return reinterpret_cast<PyObject *>(new_columns(steps.vehicles, std::vector<double>(moment.values)));
+}
+
+// reads(vehicles) -> what libsumo says of them and of the agent, by the functions that are used here alone
+PyObject *usual_reads(PyObject *object, PyObject *given) {
+    const Steps &steps = steps_of(object);
+    Vehicles *vehicles = vehicles_of(given);
+    if (!vehicles || unbound()) {
+        return nullptr;
+    }
+    try {
+        const std::string lane = sumo.lane(steps.agent);
+        const double along = sumo.along(steps.agent), angle = sumo.lane_angle(lane, along);
+        std::string lanes;
+        for (const std::string &id : vehicles->roster->ids) {
+            lanes += sumo.lane(id) + '\n';
+        }
+        return Py_BuildValue("(NiddddddNNidi)", text_of(sumo.road(steps.agent)), sumo.lane_index(steps.agent),
+                             sumo.driven(steps.agent), sumo.aside(steps.agent), sumo.aside_speed(steps.agent), along,
+                             angle, sumo.decel(steps.agent), text_of(lanes),
+                             text_of(sumo.follower(steps.agent, 0.0).first), sumo.stop_state(steps.agent), sumo.time(),
+                             sumo.emergencies());
+    } catch (...) {
+        Py_RETURN_NONE;
+    }
+}
+
+PyObject *usual_answer(PyObject *object, void *) {
+    PyObject *answer = steps_of(object).answer;
+    return Py_NewRef(answer ? answer : Py_None);
+}
+
+PyObject *usual_step(PyObject *object, void *) { return PyLong_FromLongLong(steps_of(object).step); }
+
+PyObject *usual_simulating(PyObject *object, void *) { return PyBool_FromLong(steps_of(object).simulating); }
+
+PyMethodDef usual_methods[] = {
+    {"take", usual_take, METH_O, "Take a step; return what has come of it."},
+    {"note", usual_note, METH_O, "Record an action; return whether that could be done."},
+    {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
+    {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
+    {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
+    {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
+    {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},
+    {"give_back", usual_give_back, METH_NOARGS, "Record no more; return what has been recorded."},
+    {"pause", usual_pause, METH_NOARGS, "Take no steps until it is resumed."},
+    {"stop", usual_stop, METH_NOARGS, "Take no further steps."},
+    {"told", usual_told, METH_NOARGS, "Return what is known about the step that is complete."},
+    {"columns", usual_columns, METH_O, "Return where everybody is, or was a step before."},
+    {"reads", usual_reads, METH_O, "Return what is read here alone, to be compared."},
+    {nullptr, nullptr, 0, nullptr},
+};
+PyGetSetDef usual_getters[] = {
+    {"answer", usual_answer, nullptr, "What the agent answered last.", nullptr},
+    {"step", usual_step, nullptr, "The number of the step that is complete.", nullptr},
+    {"simulating", usual_simulating, nullptr, "Whether the last step had come to the simulator.", nullptr},
+    {nullptr, nullptr, nullptr, nullptr, nullptr},
+};
+PyType_Slot usual_slots[] = {
+    {Py_tp_new, reinterpret_cast<void *>(usual_new)},
+    {Py_tp_dealloc, reinterpret_cast<void *>(usual_free)},
+    {Py_tp_methods, usual_methods},
+    {Py_tp_getset, usual_getters},
+    {Py_tp_doc, const_cast<char *>("Steps of an episode in which nothing happens, each in one call.")},
+    {0, nullptr},
+};
+PyType_Spec usual_spec = {"_crashhunt_core.UsualSteps", sizeof(UsualSteps), 0, Py_TPFLAGS_DEFAULT, usual_slots};

@@ -1,0 +1,167 @@
+"""Steps on SUMO in which nothing happens, which the compiled core takes by itself, each in one call."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import libsumo
+import numpy as np
+from libsumo import _libsumo as sumo
+
+from crashhunt.world import Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from crashhunt.native import Core
+    from crashhunt.simulators._kinematics import Kinematics
+    from crashhunt.simulators._protocol import Observations, StepResult
+    from crashhunt.simulators.sumo._sight import Sight
+    from crashhunt.simulators.sumo._traffic_events import SumoEvents
+
+__all__ = ["Present", "UsualSteps"]
+
+_OBSERVED = np.dtype("<f4")
+
+
+class Present(NamedTuple):
+    """Where a simulator is.
+
+    Args:
+        scene: after the last step.
+        observations: what the agents are shown next.
+        steps: how many are complete.
+    """
+
+    scene: Scene
+    observations: Observations
+    steps: int
+
+
+class UsualSteps:
+    """Takes the steps of one episode in which nothing happens; as `AtOnce` says.
+
+    While the core goes ahead, everybody else stays where they were: the simulator, its sight and its events. `catch_up`
+    brings them to where the core is, `resume` brings the core to where they are.
+
+    Args:
+        core: the compiled part.
+        agent: the only one of the episode.
+        sight: what scenes are read by.
+        events: what looks for events.
+        kinematics: what observations are made by.
+        present: returns where the simulator is.
+        arrive: called with where the core has come to.
+        apply: applies an action; returns whether there is nothing about it to look into.
+        finish: does what is left of a step that has been simulated.
+        explained: returns what the simulator raises in place of an exception of SUMO's.
+        edge: returns the number of lanes of an edge, and the width of its first.
+        start_m: how far the agent had driven at the start, in m.
+        step_length_s: in s.
+        lateral: whether vehicles may be elsewhere than in the middle of a lane.
+        takes_speed: whether actions are a speed and a change of lane.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        agent: str,
+        sight: Sight,
+        events: SumoEvents,
+        kinematics: Kinematics,
+        *,
+        present: Callable[[], Present],
+        arrive: Callable[[Present], None],
+        apply: Callable[[str, NDArray[np.generic]], bool],
+        finish: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
+        explained: Callable[[BaseException], BaseException],
+        edge: Callable[[str], tuple[int, float]],
+        start_m: float,
+        step_length_s: float,
+        lateral: bool,
+        takes_speed: bool,
+    ) -> None:
+        self._core, self._agent = core, agent
+        self._sight, self._events, self._kinematics = sight, events, kinematics
+        self._present, self._arrive = present, arrive
+        self.apply, self.finish, self.explained = apply, finish, explained
+        shape = kinematics.shape
+        self.core = core.UsualSteps(
+            agent, libsumo, (np.ndarray, shape, _OBSERVED), shape[0] - 1, step_length_s, lateral, takes_speed,
+            sight.around, start_m,
+        )  # fmt: skip
+        self._edge = edge
+        self._last: StepResult = ({}, {}, {}, {}, {})
+
+    def begin(self) -> None:
+        """Take what is counted in this episode, which is about to begin."""
+        self.core.heed(*self._events.counted)
+
+    def resume(self) -> Scene | None:
+        """Have the core go on from here; return the scene, None where that has to wait."""
+        self.catch_up()
+        (scene, observations, steps), seen = self._present(), self._sight.plain
+        lane, columns, agent = scene.agent_lanes.get(self._agent, ""), scene.columns, self._agent
+        if seen is None or columns is None or not lane or not self._events.is_quiet(agent) or self._kinematics.hidden:
+            return None
+        vehicles, ids = seen
+        edge, _, number = lane.rpartition("_")
+        lanes, width = self._edge(edge)
+        from_left = (lanes - 1 - int(number)) * width
+        where = edge, int(number), lane, from_left
+        row, others = scene.roster.index[agent], self._events.controlled
+        self.core.resume(
+            (vehicles, ids, row, others), observations[agent], columns, scene.time_s, "\n".join(scene.lanes), where,
+            self._events.followers[agent], steps,
+        )  # fmt: skip
+        return scene
+
+    def catch_up(self) -> StepResult:
+        """Bring everybody else to where the core is; return what the last step would have returned."""
+        told = self.core.told()
+        before, agent = self._present(), self._agent
+        if told is None or told[0] <= before.steps:
+            return self._last
+        step, observation, reward, follower, now, last = told
+        previous = before.scene if step == before.steps + 1 else self._scene(before.scene, True, *last)
+        scene = self._scene(before.scene, False, *now)
+        scene.follow(previous)
+        observations: Observations = {agent: observation}  # type: ignore[dict-item]
+        self._events.go_on(scene, step, {agent: follower})
+        self._arrive(Present(scene, observations, step))
+        self._last = observations, {agent: reward}, {agent: False}, {agent: False}, {agent: {}}
+        return self._last
+
+    def reads_right(self) -> bool:
+        """Whether the core reads what libsumo's getters return, to the bit."""
+        if self._sight.plain is None:
+            return True
+        vehicles, ids = self._sight.plain
+        agent, lane = self._agent, sumo.vehicle_getLaneID(self._agent)
+        along = sumo.vehicle_getLanePosition(agent)
+        read = (
+            sumo.vehicle_getRoadID(agent),
+            sumo.vehicle_getLaneIndex(agent),
+            sumo.vehicle_getDistance(agent),
+            sumo.vehicle_getLateralLanePosition(agent),
+            sumo.vehicle_getLateralSpeed(agent),
+            along,
+            sumo.lane_getAngle(lane, along),
+            sumo.vehicle_getDecel(agent),
+            "".join(f"{sumo.vehicle_getLaneID(one)}\n" for one in ids),
+            sumo.vehicle_getFollower(agent)[0],
+            sumo.vehicle_getStopState(agent),
+            sumo.simulation_getTime(),
+            sumo.simulation_getEmergencyStoppingVehiclesNumber(),
+        )
+        return repr(self.core.reads(vehicles)) == repr(read)
+
+    def _scene(self, like: Scene, back: bool, time_s: float, lanes: str) -> Scene:
+        scene = Scene(
+            time_s, like.roster, lanes=tuple(lanes.split("\n")) if lanes else (), swept=True, core=self._core,
+            columns=self.core.columns(back),
+        )  # fmt: skip
+        scene.agent_lanes = dict(like.agent_lanes)
+        return scene

@@ -1,0 +1,381 @@
+"""Steps that the core takes by itself: the same records, results and scenes as one thing after the other."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crashhunt.episode import Episode, Nearness, Observer, Recorder
+from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
+from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose
+from crashhunt.recording import BlackBox
+from crashhunt.scenario import load_scenario
+from crashhunt.trial import CRASHES, Outcome, TrialSpec
+
+core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
+
+NET = Path(__file__).parents[1] / "simulators" / "signal.net.xml"
+# Somebody follows the agent, somebody comes and somebody goes in its sight, and somebody else out of it.
+TRAFFIC = (
+    '<vType id="car" sigma="0"/>'
+    '<vehicle id="ego" type="car" depart="0" departPos="60" departSpeed="8"><route edges="west east"/></vehicle>'
+    '<vehicle id="behind" type="car" depart="0" departPos="40" departSpeed="8"><route edges="west east"/></vehicle>'
+    '<vehicle id="far" type="car" depart="1.3" departPos="0"><route edges="south north"/></vehicle>'
+    '<vehicle id="late" type="car" depart="2.5" departPos="20"><route edges="west north"/></vehicle>'
+)
+
+
+class Says:
+    """An agent that answers what a function of the step and of what it is shown says."""
+
+    def __init__(self, answer):
+        self._answer, self._step = answer, 0
+
+    def reset(self, seed):
+        self._step = 0
+
+    def act(self, observation):
+        assert not observation.flags.writeable
+        self._step += 1
+        return self._answer(self._step, observation)
+
+
+class Street:
+    """A small scenario, whose episodes run with the core's own steps or without."""
+
+    def __init__(self, folder, agent=""):
+        from crashhunt.simulators.sumo import SumoSimulator
+
+        shutil.copy(NET, folder)
+        (folder / "r.rou.xml").write_text(f"<routes>{TRAFFIC}</routes>")
+        (folder / "scenario.toml").write_text(
+            'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = 0.1\nwarmup_s = 0.0\n'
+            '[sumo]\nnet = "signal.net.xml"\nroutes = ["r.rou.xml"]\n'
+            f"[events]\nnot_moving = 2.0\n[agents.ego]\nexisting = true\n{agent}\n"
+        )
+        self.simulator = SumoSimulator(load_scenario(folder), folder)
+        self.box = BlackBox(folder / "box")
+        self.comes = Counter()
+
+    def episode(self, answer, *, at_once=True, steps=90, oracles=(), crash_on=CRASHES, observers=(), seed=1):
+        self.box.begin(pid=1, trial=0, started=0.0)
+        episode = Episode(
+            TrialSpec(0, seed, {}, {}, steps), simulator=self.simulator, make_agent=lambda *_: Says(answer),
+            oracles=[ReportedCollision(), Overlap(), OffRoad(), *oracles], crash_on=crash_on,
+            observers=[Recorder(self.box, self.simulator), Nearness(self.box.take_frames), *observers],
+        )  # fmt: skip
+        assert episode.start() is None, episode.result
+        take = episode._take if at_once else None
+        episode._take = take and self._counted(take)
+        return episode
+
+    def _counted(self, take):
+        def taken(agents):
+            come = take(agents)
+            self.comes[come] += 1
+            return come
+
+        return taken
+
+    def run(self, answer, **options):
+        """How an episode ends, and everything that is recorded of it."""
+        with self.episode(answer, **options) as episode:
+            while episode.result is None:
+                episode.step()
+            failure = episode.result.failure
+            result = replace(episode.result, failure=failure and replace(failure, traceback=""))
+        return repr(result), bytes(self.box.committed()), bytes(self.box._map[32:56])
+
+    def both(self, answer, **options):
+        """The same with the core's own steps, without them, and without the core."""
+        ours, theirs = self.run(answer, **options), self.run(answer, **options, at_once=False)
+        assert ours == theirs
+        return ours
+
+
+@pytest.fixture
+def street(tmp_path):
+    made = Street(tmp_path)
+    yield made
+    made.box.close()
+    made.simulator.close()
+
+
+ANSWERS = {
+    "steady": lambda step, _: (8.0, 0),
+    "whole numbers": lambda step, _: (8, 0),
+    "of NumPy's": lambda step, _: np.array([8.0, 0.0]),
+    "as a list now and then": lambda step, _: [6.0, 0] if step % 3 else (6.0, 0),
+    "what it sees": lambda step, seen: (min(12.0, 4.0 + abs(float(seen[1, 1])) / 10), 0),
+    "changes lanes into nothing": lambda step, _: (8.0, 1 if step == 40 else 0),
+    "brakes hard": lambda step, _: (8.0 if step < 25 else 0.0, 0),
+    "stands and goes on": lambda step, _: (0.0 if 10 < step < 60 else 9.0, 0),
+    "crawls": lambda step, _: (0.05, 0),
+    "too fast": lambda step, _: (8.0 if step < 30 else 1e9, 0),
+    "nonsense": lambda step, _: (8.0, 0) if step < 30 else (8.0, 2**70),
+    "not a number": lambda step, _: (8.0, 0) if step < 30 else (float("nan"), 0),
+    "true": lambda step, _: (8.0, 0) if step < 30 else (8.0, True),
+    "raises": lambda step, _: (8.0, 0) if step < 30 else 1 / 0,
+}
+
+
+@pytest.mark.parametrize("how", ANSWERS)
+def test_an_episode_is_the_same_to_the_bit(street, how):
+    street.both(ANSWERS[how])
+    street.both(ANSWERS[how], crash_on=[*CRASHES, Outcome("not_moving"), Outcome("hard_braking")], oracles=[RedLight()])
+    assert street.comes[DONE] + street.comes[ANSWERED] > 20
+
+
+def test_most_steps_are_taken_at_once(street):
+    result, *_ = street.both(ANSWERS["steady"])
+    assert "survived" in result
+    assert street.comes[DONE] > 60
+    assert street.comes[SIMULATED] == 2  # somebody has come, and the agent has changed lanes
+    assert street.comes[ASK] == 1  # the last one
+
+
+@pytest.mark.parametrize("every", [1, 7, 10, 11])
+def test_whoever_looks_sees_the_same(street, every):
+    def seen(*, at_once):
+        with street.episode(ANSWERS["what it sees"], at_once=at_once) as episode:
+            while episode.result is None:
+                episode.step()
+                if episode.steps % every == 0:
+                    scene, last = episode.scene, episode.scene.previous
+                    assert scene is episode.scene is street.simulator.scene()
+                    assert last.previous is None
+                    yield [
+                        [
+                            one.time_s,
+                            one.lanes,
+                            one.points,
+                            one.headings,
+                            one.speeds,
+                            one.agent_lanes,
+                            one.swept,
+                            one.events,
+                        ]
+                        for one in (scene, last)
+                    ]
+                    yield episode.steps, episode.observations["ego"].tobytes(), episode.rewards, episode.terminations
+                    yield street.simulator.at_once is None, episode.acting
+
+    assert [*seen(at_once=True)] == [*seen(at_once=False)]
+
+
+def test_what_is_recorded_can_be_read_after_each_step(street):
+    def read(*, at_once):
+        with street.episode(ANSWERS["steady"], at_once=at_once, steps=30) as episode:
+            while episode.step() is None:
+                yield bytes(street.box._map[32:56])
+                if episode.steps % 2:
+                    yield len(street.box.committed()), len(street.box.take_frames())
+
+    assert [*read(at_once=True)] == [*read(at_once=False)]
+
+
+def test_where_there_is_no_room_python_makes_some(street, monkeypatch, tmp_path):
+    monkeypatch.setattr("crashhunt.recording._blackbox._CHUNK", 4096)
+    street.box.close()
+    street.box = BlackBox(tmp_path / "small")
+    street.both(ANSWERS["steady"])
+
+
+class _Scenes(Observer):
+    def __init__(self):
+        self.told = []
+
+    def scene(self, step, scene, rewards):
+        self.told.append((step, scene.time_s, scene.speeds, rewards))
+
+
+class _Answers(Observer):
+    def __init__(self):
+        self.told = []
+
+    def observation(self, number, observation):
+        self.told.append((number, observation.tobytes()))
+
+    def action(self, number, action):
+        self.told.append((number, action.tobytes()))
+
+
+@pytest.mark.parametrize("kind", [_Scenes, _Answers])
+def test_observers_are_told_of_everything(street, kind):
+    ours, theirs = kind(), kind()
+    street.run(ANSWERS["stands and goes on"], observers=[ours])
+    street.run(ANSWERS["stands and goes on"], observers=[theirs], at_once=False)
+    assert ours.told == theirs.told
+    assert len(ours.told) > 90
+
+
+class _Counts:
+    name = "counts"
+
+    def __init__(self):
+        self.asked = []
+
+    def check(self, scene, agents):
+        self.asked.append((scene.time_s, scene.previous and scene.previous.time_s, agents))
+        return []
+
+
+def test_oracles_of_others_are_asked_about_every_step(street):
+    ours, theirs = _Counts(), _Counts()
+    street.run(ANSWERS["steady"], oracles=[ours])
+    street.run(ANSWERS["steady"], oracles=[theirs], at_once=False)
+    assert ours.asked == theirs.asked
+    assert len(ours.asked) == 91
+    near = street.both(
+        lambda step, _: (8.0 if step < 30 else 0.0, 0), oracles=[TooClose(10.0, 0.0)], crash_on=[Outcome("too_close")]
+    )
+    assert "too_close" in near[0]
+
+
+def test_an_oracle_that_inherits_from_one_of_ours_is_asked(street):
+    class Sees(OffRoad):
+        def check(self, scene, agents):
+            return 1 / 0 if scene.time_s > 4 else []
+
+    result, *_ = street.both(ANSWERS["steady"], oracles=[Sees()])
+    assert "ZeroDivisionError" in result
+
+
+def test_an_agent_that_is_replaced_is_asked_from_then_on(street):
+    with street.episode(ANSWERS["steady"], steps=30) as episode:
+        while episode.result is None:
+            episode.step()
+            if episode.steps == 10:
+                episode.agents["ego"] = Says(lambda step, _: (1.0, 0))
+    assert street.comes[DONE] > 15
+    assert street.simulator.scene().speeds[street.simulator.scene().roster.index["ego"]] < 3
+
+
+def test_given_actions_are_not_asked_for(street):
+    actions = {"ego": np.array([3.0, 0.0])}
+    with street.episode(lambda *_: 1 / 0, steps=20) as episode:
+        while episode.step(actions) is None:
+            pass
+        assert episode.result.outcome == "survived", episode.result
+    assert not street.comes
+
+
+def test_a_simulator_of_somebody_elses_takes_its_own_steps(street, tmp_path):
+    class Slower(type(street.simulator)):
+        def step(self, actions):
+            return super().step({agent: action / 2 for agent, action in actions.items()})
+
+    before = street.run(ANSWERS["steady"])
+    street.simulator.__class__ = Slower
+    assert street.both(ANSWERS["steady"]) != before
+    assert street.simulator.at_once is None
+
+
+def test_another_simulator_is_told_of(street, tmp_path):
+    (tmp_path / "other").mkdir()
+    other = Street(tmp_path / "other")
+
+    def meddle(step, _):
+        if step == 20:
+            other.simulator.reset(seed=1)
+        return 8.0, 0
+
+    result, *_ = street.both(meddle)
+    assert "another simulator of this process has been reset" in result
+    other.box.close()
+    other.simulator.close()
+
+
+def test_what_sumo_raises_is_told(street, monkeypatch):
+    import libsumo
+
+    step, calls = libsumo.simulationStep, []
+
+    def breaks():
+        calls.append(1)
+        if len(calls) % 31 == 0:
+            raise libsumo.TraCIException("no more")
+        step()
+
+    monkeypatch.setattr(libsumo, "simulationStep", breaks)
+    result, *_ = street.both(ANSWERS["steady"])
+    assert "SUMO gave up: no more" in result
+    assert "kind='simulator error'" in result
+
+
+def test_an_agent_that_takes_itself_off_the_road_is_told_of(street):
+    import libsumo
+
+    def leave(step, _):
+        if step == 20:
+            libsumo.vehicle.remove("ego")
+        return 8.0, 0
+
+    street.both(leave)
+
+
+@pytest.mark.parametrize("place", range(13))
+def test_what_reads_something_else_takes_no_steps(street, place):
+    class Lying:
+        def __init__(self, *given):
+            self._steps = core.UsualSteps(*given)
+
+        def reads(self, vehicles):
+            read = [*self._steps.reads(vehicles)]
+            read[place] = f"{read[place]}0" if isinstance(read[place], str) else read[place] + 1e-9
+            return tuple(read)
+
+        def __getattr__(self, name):
+            return getattr(self._steps, name)
+
+    class Core:
+        UsualSteps = Lying
+
+        def __getattr__(self, name):
+            return getattr(core, name)
+
+    street.simulator._sight.core = Core()
+    ours = street.run(ANSWERS["steady"], steps=2)
+    assert street.simulator.at_once is street.simulator._sight.core is None
+    assert len(street.simulator.notices) == 1
+    assert ours == street.run(ANSWERS["steady"], steps=2)
+
+
+def test_a_meta_action_is_applied_by_python(tmp_path):
+    street = Street(tmp_path, 'action = "meta"\ntarget_speeds = [0, 4, 8, 12]')
+    street.both(lambda step, _: step % 5)
+    assert street.simulator.at_once is not None
+    street.box.close()
+    street.simulator.close()
+
+
+def test_arguments_of_another_kind_are_refused(street):
+    street.run(ANSWERS["steady"], steps=12)
+    steps = street.simulator.at_once.core
+    sized = core.Vehicles(("a",), [5.0], [2.0], [5.1])
+    for call in (
+        lambda: core.UsualSteps("ego", None, (), 1, 0.1, False, True, (sized, 10, 1.0), 0.0),
+        lambda: core.UsualSteps("ego", None, (None, None, None), 1, 0.1, False, True, (None, 10, 1.0), 0.0),
+        lambda: core.UsualSteps("ego", None, (None, None, None), -1, 0.1, False, True, (sized, 10, 1.0), 0.0),
+        lambda: core.UsualSteps("ego", None, (None, None, None), 1, 0.1, False, True, (sized, 0, 1.0), 0.0),
+        lambda: steps.heed([], 0.0, {}, 1),
+        lambda: steps.judge(1),
+        lambda: steps.borrow(bytearray(200), 0, 100, (1, 2, 3, 4)),
+        lambda: steps.borrow(bytearray(200), 201, 100, (1, 2, 3, 4)),
+        lambda: steps.borrow(b"", 64, 100, (1, 2, 3, 4)),
+        lambda: steps.resume((sized, (), 0, {}), None, None, 0.0, "", ("", 0, "", 0.0), "", 1),
+        lambda: steps.reads(None),
+    ):
+        with pytest.raises((TypeError, ValueError, BufferError)):
+            call()
+    columns = core.columns(sized, [(0.0, 0.0)], [0.0], [0.0])
+    for ids, row in (((), 0), (("a",), 1), (("a",), -1)):
+        with pytest.raises(ValueError, match="not the vehicles"):
+            steps.resume((sized, ids, row, {}), None, columns, 0.0, "", ("", 0, "", 0.0), "", 1)
+    assert steps.take({}) == steps.take(None) == 2
+    assert not steps.note(np.zeros(2))
