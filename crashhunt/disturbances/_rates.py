@@ -32,6 +32,8 @@ NONE = "none"
 """The word for no disturbances, whatever the scenario says."""
 _STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
 _BRANCH = 0x6272616E  # and what is drawn for copies of it
+_STRONGEST = 0x73747267  # as strong as it may be
+_TRIED = 32  # draws of a model, of which the strongest is taken: what a model may draw at most, nobody says
 _SHOWN = "--disturb"
 
 
@@ -209,6 +211,27 @@ class Disturber:
         others = [one for agent, name in places for one in self._between(first.step, last, name, agent, rng)]
         return self._with_fixed([first, *others], after, last)
 
+    def draw_strongest(self, seed: int, number: int, after: int, soon: int) -> tuple[tuple[Disturbance, ...], ...]:
+        """Return how strongly each model may disturb each agent soon: of many draws, the strongest first.
+
+        Args:
+            seed: of the trial.
+            number: which of several draws.
+            after: the step.
+            soon: all begin within so many steps after it.
+
+        Returns:
+            Of each model around each agent several to choose from: not everywhere is somebody who can err.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STRONGEST, after, number)))
+        found = []
+        for agent in self.agents:
+            for name in self.models:
+                step = after + 1 + int(rng.integers(soon))
+                drawn = dict.fromkeys(self._one(step, name, agent, rng) for _ in range(_TRIED))
+                found.append(tuple(sorted(drawn, key=_strength, reverse=True)))
+        return tuple(found)
+
     def _with_fixed(self, drawn: Iterable[Disturbance], after: int, last: int) -> tuple[Disturbance, ...]:
         """What is drawn, and what is there anyway; in its step and of its kind, that alone."""
         given = [one for one in self.fixed if after < one.step <= last]
@@ -266,6 +289,11 @@ class Disturber:
 
     def _chance(self, name: str) -> float:
         return min(1.0, self.rates[name] * self.step_length_s)
+
+
+def _strength(one: Disturbance) -> tuple[float, float]:
+    kind = KINDS.get(one.what)
+    return -one.how_strong if kind is not None and kind.less_is_worse else one.how_strong, one.how_long
 
 
 def _key(one: Disturbance) -> tuple[int, str, str]:

@@ -1,11 +1,16 @@
-"""Branches: where an episode comes near to a crash, copies of it go on with other disturbances.
+"""Branches: where somebody is near, copies of an episode go on with other disturbances.
 
-Every second of simulation, a copy is left asleep. How near it was is only known some seconds later, when it is seen
-what has become of it: then the copies from that moment, and from some seconds before, are asked.
+Every second of simulation in which somebody is near, a copy is left asleep. Now and then it is asked at once to go on
+with everything that may happen, as strong as it may be: what survives that mostly survives whatever is milder, so that
+one question does for many. Only where it crashes, one disturbance after another is left out, as long as it still does.
+
+How near to a crash a moment was is only known some seconds later, when it is seen what has become of it: then copies
+from that moment, and from some seconds before, go on with disturbances that are drawn as ever.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -13,12 +18,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, cast
 
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.faculties import offers
 from crashhunt.base.memory import FREE, free_memory
 from crashhunt.base.plain import finite
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._observer import Observer
-from crashhunt.trial import Branch, Branches, Disturbance, Outcome, in_turn, steps_of
-from crashhunt.world import dangers
+from crashhunt.simulators import Disturbs
+from crashhunt.trial import OF_AGENT, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
+from crashhunt.world import approaches, dangers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -32,14 +39,16 @@ if TYPE_CHECKING:
 
 __all__ = ["BRANCHED", "Brancher"]
 
-BRANCHED: Final = 2
+BRANCHED: Final = 4
 """Steps that branches may take for each step of their trial."""
+_DRAWN = 1  # of them, those that are drawn as ever
+_STRONGEST_S = 2  # between two questions for everything at once
+_AT_ONCE_S = 1.0  # in which all of that begins
 _NEAR = 0.2  # danger: 1.9 s behind somebody, or 2.4 m/s² needed of a blind agent; see `crashhunt guide probes`
-_KEPT = 8  # copies asleep, one a second
+_KEPT = 8  # copies asleep, one a second, and none that has been so for longer
 _SEEN_S = 3  # of simulation time, after which it is seen how near a moment was
 _BEFORE_S = (0, 1, 3)  # before that moment, from where copies go on
 _REST_S = 3  # at least, between such moments
-_EACH = 3  # copies, from each of these
 _SOON_S = 2.0  # in which the first disturbance of a branch begins
 _HORIZON_S = 6.0  # for which a branch is followed
 _WINDOW_S = 10  # of scenes, by which a moment is judged
@@ -51,6 +60,25 @@ _BEGINS = 2  # steps on, at the earliest: what an agent sees late is noticed a s
 class _Sleeper:
     step: int
     copy: Asleep
+
+
+@dataclass(frozen=True, slots=True)
+class _Crashed:
+    """A branch that crashed.
+
+    Args:
+        took_place: of its disturbances.
+        branched: after which step.
+        outcome: of it.
+        step: at which it ended.
+        log_likelihood: as `Branch` has it.
+    """
+
+    took_place: tuple[Disturbance, ...]
+    branched: int
+    outcome: str
+    step: int
+    log_likelihood: float | None
 
 
 class Brancher(Observer):
@@ -86,13 +114,16 @@ class Brancher(Observer):
         self._second = 1  # in steps
         self._draws = 0
         self._rests_until = 0
-        self._any = False  # whether any copy has been left asleep
+        self._drawn_steps = 0
+        self._strongest_at = 0  # when everything may be asked for again
+        self._any = False  # whether there might have been any
 
     def begin(self, episode: Episode) -> None:
         """Note how long a second is; the next episode begins."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
         self._branches, self._draws, self._rests_until = Branches(), 0, 0
+        self._drawn_steps, self._strongest_at = 0, 0
         self._owner = os.getpid()
         self._any = False
 
@@ -105,18 +136,22 @@ class Brancher(Observer):
         return not self.why_not and episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
-        """Leave a copy asleep; where the episode was near to a crash some seconds ago, ask those from then."""
+        """Leave a copy asleep where somebody is near, and ask it, and those of some seconds ago."""
         began = time.monotonic()
         try:
-            while len(self._asleep) >= _KEPT:
+            while self._asleep and self._asleep[0].step <= episode.steps - _KEPT * self._second:
                 self._asleep.popleft().copy.end()
-            if free_memory() >= FREE:
-                copy = episode.leave_asleep(self._go_on)
-                self._any = True
-                self._asleep.append(_Sleeper(episode.steps, copy))
-            else:
+            near = self._is_near(episode)
+            if near and free_memory() < FREE:
                 self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
-            self._look(episode, episode.steps)
+            else:
+                self._any = True
+                if near:
+                    self._asleep.append(_Sleeper(episode.steps, episode.leave_asleep(self._go_on)))
+                    if episode.steps >= self._strongest_at:
+                        self._ask_for_everything(episode, self._asleep[-1])
+            if not self.why_not:
+                self._look(episode, episode.steps)
         except CrashhuntError as error:
             self.why_not = error.message
         finally:
@@ -142,12 +177,53 @@ class Brancher(Observer):
             self._disturber = disturber_of(rates, agents=names, step_length_s=dt, fixed=fixed)
         return self._disturber
 
+    def _is_near(self, episode: Episode) -> bool:
+        """Whether anybody is near enough for a disturbance to matter soon: within 50 m, or on a collision course."""
+        frames = [self._frames[-1]]
+        found = (approaches(frames, name)[:2] for name in episode.names)
+        return any(math.isfinite(float(measured[-1])) for both in found for measured in both)
+
+    def _is_spent(self, episode: Episode) -> bool:
+        if self._branches.steps < BRANCHED * episode.steps:
+            return False
+        self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
+        return True
+
+    def _ask_for_everything(self, episode: Episode, sleeper: _Sleeper) -> None:
+        """Have a copy go on with everything at once; while it crashes, with one disturbance less."""
+        self._strongest_at = episode.steps + _STRONGEST_S * self._second
+        if self._is_spent(episode):
+            return
+        draws, begins, until = self._draws_of(episode), *self._span(sleeper)
+        self._branches = replace(self._branches, moments=self._branches.moments + 1)
+        choices = draws.draw_strongest(episode.spec.seed, self._draws, begins, round(_AT_ONCE_S * self._second))
+        self._draws += 1
+        fixed = [(one,) for one in draws.fixed if begins < one.step <= until]
+        found = self._branch(sleeper, [*choices, *fixed], until)
+        if found is None:
+            return
+        if self._branch(sleeper, fixed, min(until, found.step + self._second)) is not None or self.why_not:
+            return  # it is about to crash anyway
+        first = not self._branches.crashes  # of which one that is likelier is looked for whatever it takes
+        self._take(episode, found)
+        kept = [one for one in found.took_place if one not in draws.fixed]
+        for one in kept:
+            fewer = [other for other in kept if other is not one]
+            if not fewer or self.why_not or (not first and self._is_spent(episode)):
+                return
+            found = self._branch(sleeper, [*((other,) for other in fewer), *fixed], until)
+            if found is not None:
+                kept = fewer
+                self._take(episode, found)
+
     def _look(self, episode: Episode, now: int) -> None:
-        """Ask the copies from a moment that was near, and nearer than those around it."""
+        """Ask the copies from a moment that was near to a crash, and nearer than those around it."""
         second = self._second
+        if not self._asleep or now < self._rests_until:
+            return
         found, _ = dangers(list(self._frames), episode.names, episode.simulator.step_length_s)
         ends = len(found) - _SEEN_S * second
-        if ends < second or now < self._rests_until:
+        if ends < second:
             return
         moment, after = (float(found[ends + n * second :][:second].max()) for n in (-1, 0))
         if moment < _NEAR or moment < after:  # in the second case it is the next one that is asked
@@ -156,48 +232,86 @@ class Brancher(Observer):
         self._branches = replace(self._branches, moments=self._branches.moments + 1)
         step = now - (_SEEN_S + 1) * second
         froms = [next((one for one in self._asleep if one.step >= step - ago * second), None) for ago in _BEFORE_S]
-        for sleeper in [*dict.fromkeys(filter(None, froms))] * _EACH:
-            if self._branches.steps >= BRANCHED * episode.steps:
+        for sleeper in dict.fromkeys(filter(None, froms)):
+            if self._drawn_steps >= _DRAWN * episode.steps:
                 self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
-            else:
-                self._branch(episode, sleeper)
+            elif not self._is_spent(episode):
+                self._draw(episode, sleeper)
             if self.why_not:
                 return
 
-    def _branch(self, episode: Episode, sleeper: _Sleeper) -> None:
-        """Have a copy go on with other disturbances."""
-        second, begins = self._second, sleeper.step + _BEGINS - 1
-        until = sleeper.step + round(_HORIZON_S * second)
-        drawn = self._draws_of(episode).draw_another(
-            episode.spec.seed, self._draws, begins, round(_SOON_S * second), until
-        )
+    def _draw(self, episode: Episode, sleeper: _Sleeper) -> None:
+        """Have a copy go on with disturbances that are drawn as ever."""
+        begins, until = self._span(sleeper)
+        soon, before = round(_SOON_S * self._second), self._branches.steps
+        drawn = self._draws_of(episode).draw_another(episode.spec.seed, self._draws, begins, soon, until)
         self._draws += 1
-        answer = sleeper.copy.ask({"disturbances": [one.to_json() for one in drawn], "until": until}, _PATIENCE_S)
+        found = self._branch(sleeper, [(one,) for one in drawn], until)
+        self._drawn_steps += self._branches.steps - before
+        if found is not None:
+            self._take(episode, found)
+
+    def _span(self, sleeper: _Sleeper) -> tuple[int, int]:
+        """The step after which disturbances of a branch begin, and the one in which it ends."""
+        return sleeper.step + _BEGINS - 1, sleeper.step + round(_HORIZON_S * self._second)
+
+    def _branch(self, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int) -> _Crashed | None:
+        """Have a copy go on with other disturbances, of each choice the first for which somebody is there.
+
+        Returns:
+            None where it has not crashed.
+        """
+        job: Plain = {"choices": [[one.to_json() for one in some] for some in choices], "until": until}
+        answer = sleeper.copy.ask(job, _PATIENCE_S)
         if answer is None:
             self.why_not = sleeper.copy.raised or "a copy died, or hung"
-            return
-        found = self._branches
-        outcome, step, steps = str(answer["outcome"]), cast(int, answer["step"]), cast(int, answer["steps"])
-        self._branches = replace(found, asked=found.asked + 1, steps=found.steps + steps)
-        if outcome in self._crashes and outcome != Outcome.SIMULATOR_ERROR:
-            begun = [one for one in episode.spec.disturbances if one.step <= begins]
-            planned = in_turn([*begun, *drawn])
-            likely = cast("float | None", answer["log_likelihood"])
-            branch = Branch(planned, sleeper.step, outcome, step, likely)
-            self._branches = replace(self._branches, crashes=(*found.crashes, branch))
+            return None
+        before, steps = self._branches, cast(int, answer["steps"])
+        self._branches = replace(before, asked=before.asked + 1, steps=before.steps + steps)
+        outcome, step = str(answer["outcome"]), cast(int, answer["step"])
+        if outcome not in self._crashes or outcome == Outcome.SIMULATOR_ERROR:
+            return None
+        there = cast("list[DisturbanceData]", answer["there"])
+        likely = cast("float | None", answer["log_likelihood"])
+        return _Crashed(tuple(map(Disturbance.from_json, there)), sleeper.step, outcome, step, likely)
+
+    def _take(self, episode: Episode, found: _Crashed) -> None:
+        """Take a crash in, as a specification from the start."""
+        begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _BEGINS - 1]
+        planned = in_turn([*begun, *found.took_place])
+        branch = Branch(planned, found.branched, found.outcome, found.step, found.log_likelihood)
+        self._branches = replace(self._branches, crashes=(*self._branches.crashes, branch))
 
     def _go_on(self, copy: Episode, job: Plain) -> Plain:
-        drawn = [Disturbance.from_json(one) for one in cast("list[DisturbanceData]", job["disturbances"])]
+        choices = cast("list[list[DisturbanceData]]", job["choices"])
         until, began = cast(int, job["until"]), copy.steps
-        copy.replan(drawn)
+        chosen = [_choice(copy, list(map(Disturbance.from_json, some))) for some in choices]
+        planned = in_turn(one for one in chosen if one is not None)
+        copy.replan(planned)
         fixed = self._draws_of(copy).fixed  # these take place in the trial as well, so they are no reason to go on
-        first = next((one for one in drawn if one not in fixed), drawn[0])
+        other = [one for one in planned if one not in fixed]
+        first = min((one.step for one in other), default=until)
+        soon = [one for one in other if one.step <= first + self._second]
+        if None in chosen and not other:
+            until = began
         while copy.result is None and copy.steps < until:
             copy.step()
-            if copy.steps == first.step and not copy.takes_place(first):
+            if soon and copy.steps == soon[-1].step and not any(map(copy.takes_place, soon)):
                 break  # nobody was there
         outcome, likely = "", None
         if copy.result is not None:
             outcome, found = str(copy.result.outcome), self._draws_of(copy).log_likelihood_of(copy.result)
             likely = finite(found) if found is not None else None
-        return {"steps": copy.steps - began, "step": copy.steps, "outcome": outcome, "log_likelihood": likely}
+        took_place = [one.to_json() for one in planned if one in fixed or copy.takes_place(one)]
+        return {
+            "steps": copy.steps - began, "step": copy.steps, "outcome": outcome, "there": took_place,
+            "log_likelihood": likely,
+        }  # fmt: skip
+
+
+def _choice(copy: Episode, some: Sequence[Disturbance]) -> Disturbance | None:
+    """The first one for which somebody is there; where there is only one, that."""
+    simulator = copy.simulator
+    if len(some) == 1 or not offers(simulator, Disturbs):
+        return some[0]
+    return next((one for one in some if one.what in OF_AGENT or simulator.whom(one)), None)

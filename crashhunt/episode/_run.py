@@ -58,7 +58,7 @@ def run_episode(
         reset: what resets the simulator, where it is not the simulator itself.
         prober: asks copies of it how little it would take for a crash.
         first_copy: sees at once whether there can be copies.
-        brancher: has copies of it go on with other disturbances where it comes near to one.
+        brancher: has copies of it go on with other disturbances where somebody is near.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.

@@ -76,7 +76,7 @@ class WorkerSettings:
         warm_copies: for how many traffics a worker of a pool keeps a warmed-up copy of itself; 0 for none.
         probe_s: how often copies of a trial are asked how little it would take for a crash, in s of simulation time; 0
             for never.
-        branch: how often what disturbs copies that go on otherwise where a trial comes near to a crash, ``NAME=RATE``
+        branch: how often what disturbs copies that go on otherwise where somebody is near, ``NAME=RATE``
             each; empty for no such copies.
     """
 

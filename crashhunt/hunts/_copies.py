@@ -45,7 +45,7 @@ class BranchSums(TypedDict):
 
     Args:
         trials: of how many trials there might have been some.
-        moments: how often one came near to a crash.
+        moments: from how many copies went on.
         branches: how many there were.
         steps: how many steps they took.
         left_out: how many were left out, because branches had taken enough steps.

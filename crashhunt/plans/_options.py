@@ -135,8 +135,8 @@ class TrialOptions(_Options):
         "crashes, such as 4s", unset="never", flag="--probe", metavar="TIME", check=check_probe,
     )  # fmt: skip
     branch: bool = option(
-        False, "whether copies of a trial go on with other disturbances where it comes near to a crash",
-        help="where a trial comes near to a crash, have copies of it go on with other disturbances, from then and from "
+        False, "whether copies of a trial go on with other disturbances where somebody is near",
+        help="where somebody is near, have copies of a trial go on with several disturbances, from then and from "
         "some seconds before; needs --disturb",
         flag="--branch",
     )  # fmt: skip

@@ -43,9 +43,9 @@ def describe_branches(report: HuntReport) -> list[str]:
     if found is None or not found.trials:
         return []
     enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
-    near = f"Near a crash {found.moments} times in {found.trials} trials, {found.branches} copies went on with other"
+    copies = f"{found.branches} copies went on with other disturbances from {found.moments} moments of {found.trials}"
     lines = [
-        f"{near} disturbances: {found.crashed} crashed, of {found.crashed_trials} trials.",
+        f"{copies} trials: {found.crashed} crashed, of {found.crashed_trials} trials.",
         f"  they took {found.steps} steps beside {_of_trials(report)} of trials{enough}",
     ]
     if found.run_again:

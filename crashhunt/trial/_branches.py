@@ -1,4 +1,4 @@
-"""What else might have happened: copies of a trial that came near to a crash, and went on with other disturbances."""
+"""What else might have happened: copies of a trial that went on with other disturbances."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Branches:
     """What came of the branches of a trial.
 
     Args:
-        moments: how often it came near to a crash.
+        moments: from how many copies went on.
         asked: how many branches there were.
         steps: how many steps they took.
         left_out: how many were left out, because branches had taken enough steps.

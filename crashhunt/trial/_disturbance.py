@@ -41,12 +41,14 @@ class Kind:
             said where there is any strength.
         of_agent: whether it is the agent's own eyes or hands that err: then every simulator can do it.
         most: the strongest that means anything, such as the whole of a speed.
+        less_is_worse: whether a lower number is the stronger disturbance.
     """
 
     unit: str
     words: str
     of_agent: bool = False
     most: float = math.inf
+    less_is_worse: bool = False
 
 
 KINDS: Mapping[str, Kind] = {
@@ -55,7 +57,9 @@ KINDS: Mapping[str, Kind] = {
     "dawdle": Kind("", "{vehicle} drives {share:.0f} % slower than it did for {long:g} s", most=1.0),
     "speed": Kind("", "{vehicle} wants to drive {share:.0f} % faster for {long:g} s"),
     "cut_in": Kind("m/s²", "{vehicle} cuts in on {agent} within {long:g} s| and brakes with {strong:.3g} m/s²"),
-    "late_merge": Kind("m", "{vehicle} merges only in the last {strong:.3g} m of its lane, for {long:g} s"),
+    "late_merge": Kind(
+        "m", "{vehicle} merges only in the last {strong:.3g} m of its lane, for {long:g} s", less_is_worse=True
+    ),
     "step_out": Kind("m/s", "{vehicle} steps out onto the road with {strong:.3g} m/s, and is back after {long:g} s"),
     "ignore_priority": Kind("", "{vehicle} heeds neither red lights nor priority for {long:g} s"),
     "late_observation": Kind("s", "{agent} sees everything {strong:g} s late for {long:g} s", of_agent=True),

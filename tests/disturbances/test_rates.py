@@ -214,3 +214,19 @@ def test_weights_are_shares():
     rng = np.random.default_rng(1)
     assert {model.draw(rng).who for _ in range(200)} == set(model.who)
     assert math.isclose(sum(math.exp(model.log_likelihood(Drawn(who, 0.0, 2.0))) for who in model.who), 0.5 * 0.5)
+
+
+def test_the_strongest_that_a_model_may_draw_comes_first_and_is_as_likely_as_any():
+    rates = {"brake": 0.1, "cut_in": 0.1, "late_merge": 0.1}
+    draws = disturber_of(rates, agents=("ego",), step_length_s=DT)
+    for number in range(20):
+        found = draws.draw_strongest(3, number, 10, 5)
+        assert [each[0].what for each in found] == sorted(rates)
+        assert [each[0].how_strong for each in found] == [6.0, 4.0, 5.0]  # of the last, the least is the worst
+        assert found[0][0].how_long >= found[0][1].how_long or found[0][1].how_strong < 6.0
+        assert {one.who for one in found[1]} == {"left", "right", "left ahead", "right ahead"}
+        for each in found:
+            (step,) = {one.step for one in each}
+            assert 10 < step <= 15
+            assert all(math.isfinite(draws.log_likelihood([one], 60)) for one in each)
+        assert found == draws.draw_strongest(3, number, 10, 5) != draws.draw_strongest(4, number, 10, 5)

@@ -65,6 +65,8 @@ def branches(name, stage, speed, seed, steps):
         )
         found["itself"] = [str(itself.outcome), itself.branches.to_json()]
         found["never"] = place.run(brancher, steps=5).branches
+        place.given = {"gap_m": 400.0}
+        found["alone"] = place.run(brancher, KeepLaneWithSpeed(5.0), steps=40).branches.to_json()
     return found
 
 

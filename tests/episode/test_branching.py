@@ -39,7 +39,7 @@ def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scena
     branches = found["branches"]
     assert branches["moments"] >= 2
     assert branches["asked"] >= 3
-    assert 0 < branches["steps"] < 2 * 150 + 60
+    assert 0 < branches["steps"] < 4 * 150 + 60
     assert branches["left_out"] > 0
     assert branches["crashes"]
     assert found["starts"] == [
@@ -50,6 +50,9 @@ def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scena
         assert crash["branched"] + 2 <= first <= crash["branched"] + 2 + 20
         assert first <= crash["step"] <= crash["branched"] + 60
         assert crash["log_likelihood"] < 0
+    of_first = [crash for crash in branches["crashes"] if crash["branched"] == branches["crashes"][0]["branched"]]
+    assert [len(crash["disturbances"]) for crash in of_first[:2]] == [2, 1]  # left out as long as it crashes
+    assert of_first[0]["log_likelihood"] < of_first[1]["log_likelihood"]
     assert found["waited"]
     assert (found["left"], found["why_not"]) == (0, "")
     if scenario == "toy":
@@ -57,6 +60,7 @@ def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scena
         assert found["itself"][0] == "collision"
         assert found["itself"][1]["crashes"] == []  # it needed no other
         assert found["never"] is None
+        assert found["alone"] == {"moments": 0, "asked": 0, "steps": 0, "left_out": 0, "crashes": []}  # nobody is near
 
 
 def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
