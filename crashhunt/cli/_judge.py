@@ -25,21 +25,23 @@ def add_judge(commands: Commands) -> None:
     """Add the command."""
     judge = commands.add_parser(
         "judge",
-        help="find out until when a collision could have been avoided, by running it",
+        help="find out until when a collision could have been avoided, and what a crash hangs on, by running it",
         description="Run the trial of a collision again and again, each time with the agent overruled from another "
         "step on: braking as hard as its vehicle can, or changing lanes and braking, the others reacting as they then "
         "do. Says until when that avoids it. Then with one thing left out at a time: a decision of the agent's, what "
-        "another vehicle did, the value of an argument; says what the collision hangs on. Writes it into crash.json, "
-        "and from then on show tells it too.",
+        "another vehicle did, the value of an argument; says what the crash hangs on, which is all that is asked of a "
+        "crash that is no collision with somebody. Writes it into crash.json, and from then on show tells it too.",
     )
     add_crash(judge)
-    judge.add_argument("--all", action="store_true", help="all collisions of the hunt that have not been judged yet")
+    judge.add_argument(
+        "--all", action="store_true", help="all crashes of the hunt that have not been judged yet, but for hangs"
+    )
     judge.add_argument(
         "--runs", metavar="N", type=integer, default=60, help="the most trials to run for one collision; default: 60"
     )
     judge.add_argument(
         "--why", metavar="N", type=integer, default=80,
-        help="the most trials to run for what one collision hangs on; 0: none; default: 80",
+        help="the most trials to run for what one crash hangs on; 0: none; default: 80",
     )  # fmt: skip
     judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
@@ -75,7 +77,7 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
 
 
 def _unjudged(options: argparse.Namespace) -> list[Bundle]:
-    from crashhunt.crashes import judgement_of, list_bundles
+    from crashhunt.crashes import judgement_of, list_bundles, partner
     from crashhunt.hunts import find_hunts
     from crashhunt.trial import Outcome
 
@@ -85,9 +87,7 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     return [
         bundle
         for bundle in bundles
-        if bundle.result.outcome is Outcome.COLLISION
-        and bundle.result.collision is not None
-        and bundle.result.collision.other
+        if (partner(bundle.result) or (options.why and bundle.result.outcome is not Outcome.HANG))
         and ((known := judgement_of(bundle)) is None or known.is_interrupted)
     ]
 

@@ -44,16 +44,16 @@ class Doing:
 
 
 def near_ones(recording: Recording, agent: str, other: str, most: int) -> list[str]:
-    """Return who may have to do with a collision: the other one, and who came nearest to the agent before it.
+    """Return who may have to do with a crash: the other one, and who came nearest to the agent before it.
 
     Args:
         recording: of the collision.
         agent: the controlled vehicle.
-        other: whom it collided with.
+        other: whom it collided with; empty for nobody.
         most: how many at most.
     """
     scenes = recording.scenes()
-    since = scenes[-1].time_s - _NEAR_S
+    since = scenes[-1].time_s - _NEAR_S if scenes else 0.0
     nearest: dict[str, float] = {}
     for scene in scenes:
         row = scene.roster.index.get(agent)
@@ -63,7 +63,8 @@ def near_ones(recording: Recording, agent: str, other: str, most: int) -> list[s
         for actor, distance in zip(scene.roster.actors, away.tolist(), strict=True):
             if actor.id != agent and distance < min(_NEAR_M, nearest.get(actor.id, _NEAR_M)):
                 nearest[actor.id] = distance
-    nearest[other] = -1.0
+    if other:
+        nearest[other] = -1.0
     return sorted((name for name in nearest if name not in recording.agents), key=lambda name: (nearest[name], name))[
         :most
     ]

@@ -1,4 +1,4 @@
-"""Judging a collision: its trial is run again, overruled or with something left out, to see what avoids it."""
+"""Judging a crash: its trial is run again, overruled or with something left out, to see what avoids it."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Judgement
     from crashhunt.recording import Recording
+    from crashhunt.replays._prepare import Rerun
     from crashhunt.replays._warm import Ended
     from crashhunt.trial import TrialResult
 
@@ -39,7 +40,7 @@ def judge(
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Judgement:
-    """Return until when a collision could have been avoided, how, and what it hangs on, by running its trial again.
+    """Return until when a collision could have been avoided, how, and what a crash hangs on, by running it again.
 
     The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes; the
     others react as they then do. The search begins where a calculation guesses it, bisects, and then runs the steps
@@ -47,7 +48,7 @@ def judge(
     late after the next. What it hangs on is found by leaving one thing out at a time.
 
     Args:
-        bundle: of a collision.
+        bundle: of a crash; of one that is no collision with somebody, only what it hangs on is run.
         options: of the replays; only whose code drives, and whether it is trusted.
         runs: the most trials to run to avoid it.
         why: the most trials to run for what it hangs on; 0 leaves that out.
@@ -56,7 +57,7 @@ def judge(
         stopped: asked now and then whether to give up; what has been found by then is returned.
 
     Raises:
-        UsageError: it is no collision with somebody, or ``runs`` is below 1.
+        UsageError: it is a near miss or a hang, there is nothing to run, or ``runs`` is below 1.
         BundleError: the bundle is damaged.
         CrashhuntError: the trials could not be run.
     """
@@ -64,10 +65,9 @@ def judge(
         raise UsageError(f"--runs is {runs}", fix="give at least 1")
     result = bundle.result
     hit = result.collision
-    if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
-        raise UsageError(f"{bundle.id} is no collision with somebody else", fix="give one that is")
+    of_two = result.outcome is Outcome.COLLISION and hit is not None and bool(hit.other)
+    _see_that_it_can_be_judged(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
-    guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_GUESS)
     with tempfile.TemporaryDirectory(prefix="crashhunt-judge-") as folder:
         reruns = Reruns(rerun, Path(folder), parallel=parallel, stopped=stopped)
 
@@ -76,18 +76,48 @@ def judge(
                 watch(done, runs + why)
 
         trials = _Trials(result, rerun.recorded, reruns, tell)
-        start = result.steps - 1 if guess is None else guess
-        search = Search(result.steps, start, trials.run, runs=runs, parallel=parallel)
+        search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None
         try:
-            search.all()
+            if of_two:
+                search.all()
             if why > 0:
                 found = find_why(rerun, reruns, most=why, tell=lambda done: tell(trials.done + done))
         except StoppedError:
             search.why_not = INTERRUPTED
         finally:
             reruns.close()
-    return replace(search.judgement(), why=found, visible_step=visible_from(rerun.recorded, hit.agent, hit.other))
+    visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
+    return replace(search.judgement(), why=found, visible_step=visible)
+
+
+def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> None:
+    """See that there is something to run.
+
+    Raises:
+        UsageError: there is not.
+    """
+    outcome = bundle.result.outcome
+    if bundle.is_near_miss:
+        raise UsageError(f"{bundle.id} is a near miss, and nothing crashes in it", fix="give a crash")
+    if outcome is Outcome.HANG:
+        raise UsageError(
+            f"{bundle.id} is a hang, and every run of it would take its time limit",
+            fix=f"look where it hangs: crashhunt show {bundle.path}",
+        )
+    if not of_two and why == 0:
+        raise UsageError(
+            f"{bundle.id} is no collision with somebody else, so that only what it hangs on can be run",
+            fix="leave --why out, or give at least 1",
+        )
+
+
+def _start(rerun: Rerun) -> int:
+    """The step after which braking may just have helped, as far as a calculation says it."""
+    hit, end = rerun.bundle.result.collision, rerun.bundle.result.steps
+    assert hit is not None
+    guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_GUESS)
+    return end - 1 if guess is None else guess
 
 
 @dataclass(slots=True)

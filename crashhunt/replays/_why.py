@@ -1,4 +1,4 @@
-"""What a collision hangs on: its trial is run again with one thing left out at a time.
+"""What a crash hangs on: its trial is run again with one thing left out at a time.
 
 What was done in the episode is left out from just before it began: up to there, every such run is the same to the bit,
 or it says nothing. Arguments and seeds are of the whole trial, and with them the traffic is another one from the
@@ -16,12 +16,12 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
-from crashhunt.crashes import INTERRUPTED, Factor, LeftOut, Why
+from crashhunt.crashes import INTERRUPTED, Factor, LeftOut, Why, partner
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
 from crashhunt.replays._doings import Doing, doings_of, near_ones
 from crashhunt.replays._warm import StoppedError
-from crashhunt.triage import LaneMap
+from crashhunt.triage import LaneMap, signature_of_fault
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
 from crashhunt.world import first_contact
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.replays._prepare import Rerun
     from crashhunt.replays._warm import Ended, Reruns
-    from crashhunt.trial import Distribution, TrialSpec, Value
+    from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
 
 __all__ = ["find_why"]
 
@@ -70,10 +70,10 @@ class _Asked:
 
 
 def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], None]) -> Why:
-    """Return what a collision of two hangs on.
+    """Return what a crash hangs on.
 
     Args:
-        rerun: the collision.
+        rerun: the crash.
         runs: which runs its trials.
         most: how many to run, besides one that must be as it was.
         tell: called with how many have been run.
@@ -111,12 +111,12 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
 
 
 class _Search:
-    """What there is to leave out of one collision."""
+    """What there is to leave out of one crash."""
 
     def __init__(self, rerun: Rerun) -> None:
         result = rerun.bundle.result
-        assert result.collision is not None
-        self._rerun, self._hit, self._spec = rerun, result.collision, rerun.spec
+        self._rerun, self._result, self._spec = rerun, result, rerun.spec
+        self._agent, self._other = rerun.bundle.driver, partner(result)
         self._recording: Recording = rerun.recorded
         self._dt = self._recording.prologue.step_length_s
         self._end = result.steps
@@ -124,13 +124,23 @@ class _Search:
         self.steps = max(min(self._spec.max_steps, 2 * self._end + longer), self._end)
         self._inside = replace(self._spec, max_steps=self._end + longer)
         self._settings = read_settings(rerun.bundle.hunt / layout.HUNT)
-        lanes = read_lanes(rerun.bundle.path / layout.LOG)
-        self._lanes = LaneMap(lanes, (self._hit.x, self._hit.y))
+        self._lanes = LaneMap(read_lanes(rerun.bundle.path / layout.LOG), self._place())
+
+    def _place(self) -> tuple[float, float]:
+        """Where it was: around there, lanes are known."""
+        hit = self._result.collision
+        if hit is not None:
+            return hit.x, hit.y
+        for scene in reversed(self._recording.scenes()):
+            if self._agent in scene.roster.index:
+                x, y = scene.points[scene.roster.index[self._agent]]
+                return float(x), float(y)
+        return 0.0, 0.0
 
     def asked(self) -> list[_Asked]:
         """Return everything, what says most first."""
         found = [*self._disturbances(), *self._agents()]
-        names = near_ones(self._recording, self._hit.agent, self._hit.other, _OTHERS)
+        names = near_ones(self._recording, self._agent, self._other, _OTHERS)
         others = {name: self._others(name) for name in names}
         found += [one for name in names for one in others[name] if one.factor.what != "there"]
         found += [*self._arguments(), *self._seeds()]
@@ -140,9 +150,8 @@ class _Search:
     def ending(self, asked: _Asked, place: int, ended: Ended) -> LeftOut:
         """Return what became of the collision in a run."""
         given = asked.runs[place][0]
-        result, hit = ended.result, ended.result.collision
-        recording = ended.recording
-        if result.outcome in _SAYS_NOTHING:
+        result, recording = ended.result, ended.recording
+        if result.outcome in _SAYS_NOTHING and result.outcome is not self._result.outcome:
             return LeftOut(given, "unclear")
         into = ""
         if asked.inside:
@@ -157,10 +166,17 @@ class _Search:
             into = self._into(recording, asked.held, step) if asked.held else ""
         ending: Without = "none"
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
-            pair = {self._hit.collider, self._hit.victim}
-            same = hit is not None and result.outcome is Outcome.COLLISION and {hit.collider, hit.victim} == pair
-            ending = "same" if same else "other"
+            ending = "same" if self._is_same(result) else "other"
         return LeftOut(given, ending, into)
+
+    def _is_same(self, result: TrialResult) -> bool:
+        """Whether a run ended in the same crash: with the same other one, or in the same failure at the same place."""
+        was, now = self._result.collision, result.collision
+        if result.outcome is not self._result.outcome:
+            return False
+        if was is None or now is None:
+            return was is now and signature_of_fault(result) == signature_of_fault(self._result)
+        return {was.collider, was.victim} == {now.collider, now.victim}
 
     def _alike(self, recording: Recording, step: int) -> bool:
         """Whether a run was the same to the bit up to a step."""
@@ -198,7 +214,7 @@ class _Search:
 
     def _agents(self) -> Iterator[_Asked]:
         """What the agent decided; and the other one, where that is one too."""
-        agents = [name for name in (self._hit.agent, self._hit.other) if name in self._recording.agents]
+        agents = [name for name in (self._agent, self._other) if name in self._recording.agents]
         for doing in (doing for agent in agents for doing in self._doings(agent)):
             runs = [
                 (step, replace(self._inside, overruled=Overruled(doing.actor, step, keeps=_KEEPS[doing.what])))
@@ -231,7 +247,7 @@ class _Search:
     def _held(self, name: str, what: str, step: int) -> TrialSpec:
         """The trial with somebody kept from something after a step."""
         how_long = (self._inside.max_steps - step) * self._dt
-        held = Disturbance(step + 1, "itself", what, 0.0, how_long, self._hit.agent, name)
+        held = Disturbance(step + 1, "itself", what, 0.0, how_long, self._agent, name)
         return replace(self._inside, disturbances=(*self._inside.disturbances, held))
 
     def _arguments(self) -> Iterator[_Asked]:

@@ -122,6 +122,8 @@ class Story:
             sentences.append(about_danger(self.danger))
         if result.failure is not None:
             sentences += self._about_failure()
+        if self.encounter is None:
+            sentences += self.about_judgement()
         return sentences
 
     def describe(self) -> str:

@@ -8,4 +8,4 @@ from ._groups import (
     groups_of as groups_of,
 )
 from ._lanes import LaneMap as LaneMap
-from ._signature import Signature as Signature, signature_of as signature_of
+from ._signature import Signature as Signature, signature_of as signature_of, signature_of_fault as signature_of_fault

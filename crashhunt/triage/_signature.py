@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.trial import Collision, Failure, TrialResult
 
-__all__ = ["Signature", "SignatureData", "signature_of"]
+__all__ = ["Signature", "SignatureData", "signature_of", "signature_of_fault"]
 
 _BEFORE_S = 3.0  # a lane change that began longer ago is over
 _CHANGES = {
@@ -105,7 +105,7 @@ def signature_of(bundle: Bundle, recording: Recording | None = None) -> Signatur
     result = bundle.result
     hit = result.collision
     if hit is None:
-        found = _of_a_fault(result)
+        found = signature_of_fault(result)
     else:
         from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
 
@@ -154,7 +154,8 @@ def _manner(recording: Recording, hit: Collision) -> str:
     return manner
 
 
-def _of_a_fault(result: TrialResult) -> Signature:
+def signature_of_fault(result: TrialResult) -> Signature:
+    """Return the signature of a crash that is no collision, from what its trial came to; disturbances do not count."""
     outcome, failure, event = str(result.outcome), result.failure, result.event
     if event is not None:
         return Signature(outcome, manner=event.kind)

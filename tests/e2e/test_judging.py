@@ -8,8 +8,11 @@ from dataclasses import replace
 import pytest
 
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
-from crashhunt.replays import ReplayOptions, judge
+from crashhunt.errors import UsageError
+from crashhunt.replays import ReplayOptions, judge, prepare
 from crashhunt.replays._avoiding import Search
+from crashhunt.replays._why import _Search
+from crashhunt.trial import Outcome
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 
@@ -83,10 +86,35 @@ def test_slips(toy, words, said):
     assert said in toy.crashhunt("judge", "h", *words, expect=2).err
 
 
-def test_what_is_no_collision_is_refused(toy):
+def test_what_a_failure_hangs_on_is_run_and_told(toy):
+    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")
+    toy.crashhunt("run", "h", "1", "9", "9", *words)
+    (judged,) = toy.crashhunt("judge", "h", "--why", "9", "--parallel", "1", "--json").json["judged"]
+    assert (judged["runs"], judged["verdict"], judged["avoidable"]) == (0, "unknown", None)
+    factors = {(factor["kind"], factor["name"]): factor for factor in judged["why"]["factors"]}
+    at = factors["argument", "ego.at"]
+    assert (at["needed"], [run["given"] for run in at["runs"]]) == (True, [30])
+    assert factors["seed", "seed"]["needed"] is False
+    said = toy.crashhunt("show", "h").out
+    assert "- other values of ego.at (it was 2): no crash." in said
+    assert "the seed (" in said.partition("No difference, in any run without it: ")[2]
+    assert "only what it hangs on can be run" in toy.crashhunt("judge", "h", "--why", "0", expect=2).err
+    assert toy.crashhunt("judge", "h", "--all", "--json").json == {"judged": []}  # it has been judged
+
+
+def test_another_failure_is_not_the_same(toy):
     words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2", "--seed", "1")
     toy.crashhunt("run", "h", "1", "1", "9", *words)
-    assert "is no collision with somebody else" in toy.crashhunt("judge", "h", expect=2).err
+    bundle = find_bundle(toy.folder / "h")
+    search = _Search(prepare(bundle, ReplayOptions()))
+    result = bundle.result
+    assert search._is_same(replace(result, steps=5))
+    assert not search._is_same(replace(result, failure=replace(result.failure, kind="KeyError")))
+    assert not search._is_same(replace(result, outcome=Outcome.PROCESS_DIED))
+    with pytest.raises(UsageError, match="is a hang, and every run of it"):
+        judge(replace(bundle, result=replace(result, outcome=Outcome.HANG)), why=9)
+    with pytest.raises(UsageError, match="is a near miss"):
+        judge(replace(bundle, result=replace(result, outcome=Outcome.SURVIVED, failure=None)), why=9)
 
 
 @pytest.mark.nightly
