@@ -28,6 +28,9 @@ PYTEST = (
     "-W", "ignore::pytest.PytestAssertRewriteWarning",
 )  # fmt: skip
 
+_STARTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn"}
+"""What Python calls it when a process is started (sys.audit)."""
+
 
 class Watcher:
     """A pytest plugin that notes which lines of some files each test runs, and how long it takes.
@@ -40,11 +43,13 @@ class Watcher:
         self.test = ""
         self.reached: dict[str, dict[str, set[int]]] = {file: {} for file in files}
         self.seconds: Counter[str] = Counter()
+        self.forked: set[str] = set()  # tests that have started processes, of which no line is seen
         self._known: dict[CodeType, bool] = {}
 
     def start(self) -> None:
         """Begin to trace."""
         sys.settrace(self._call)
+        sys.addaudithook(self._audit)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """A test begins."""
@@ -57,6 +62,10 @@ class Watcher:
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
         """A test is over."""
         self.test = ""
+
+    def _audit(self, event: str, _: object) -> None:
+        if event in _STARTS and self.test:
+            self.forked.add(self.test)
 
     def _call(self, frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
         code = frame.f_code
@@ -168,7 +177,7 @@ class Slot:
                 file: {test: sorted(lines) for test, lines in found.items()} for file, found in watcher.reached.items()
             }
             others = [name for name, module in [*sys.modules.items()] if self._is_installed(name, module)]
-            facts = {"reached": reached, "seconds": watcher.seconds, "modules": others}
+            facts = {"reached": reached, "seconds": watcher.seconds, "forked": [*watcher.forked], "modules": others}
             Path(".facts").write_text(json.dumps(facts), encoding="utf-8")
         sys.stdout.flush()
         return int(code)

@@ -48,6 +48,7 @@ class Target:
         tests: the nearest test files, likewise.
         reached: test to the lines that it runs; those that run at import have no test.
         seconds: test to how long it takes.
+        forked: tests that start processes, which may reach any line.
     """
 
     package: str
@@ -56,14 +57,16 @@ class Target:
     tests: Sequence[Path]
     reached: dict[str, set[int]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    forked: set[str] = field(default_factory=set)
 
     def tests_of(self, slip: Slip) -> list[str]:
-        """Return the tests that reach a slip, the fastest first."""
+        """Return the tests that reach a slip, or that may, where none is seen to; the fastest first."""
         lines = range(slip.span[0], slip.span[1] + 1)
         imported = not self.reached.get("", set()).isdisjoint(lines)
         found = [test for test, reached in self.reached.items() if test and not reached.isdisjoint(lines)]
         if imported and not found:
             found = [test for test, reached in self.reached.items() if test and reached] or [*self.seconds]
+        found = found or [*self.forked]
         return sorted(found, key=lambda test: (self.seconds[test], test))
 
 
@@ -143,6 +146,7 @@ def survey(slot: Slot, targets: list[Target]) -> None:
         mine = {test for test in facts["seconds"] if test.partition("::")[0] in map(str, target.tests)}
         found = facts["reached"][str(slot.tree / target.file)]
         target.seconds = {test: facts["seconds"][test] for test in mine}
+        target.forked = mine.intersection(facts["forked"])
         target.reached = {test: set(lines) for test, lines in found.items() if not test or test in mine}
     for name in facts["modules"]:  # so that the forks have them
         with contextlib.suppress(Exception):

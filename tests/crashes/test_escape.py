@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.crashes import find_escape, partner
+from crashhunt.crashes._escape import overruled_trial, slowing
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
@@ -210,3 +211,29 @@ def test_the_partner_is_the_other_one():
     assert of(role="victim", collider="other", victim="ego") == "other"
     assert of(role="alone") == ""
     assert partner(TrialResult(SPEC, Outcome.COLLISION)) == ""
+
+
+def test_who_brakes_better_than_was_said_is_looked_at_up_to_the_last_step():
+    for gap in (60.0, 75.0, 90.0, 103.0):
+        world = World(gap, braking=60.0)
+        assert world.escape(said=1.5).step == world.truth() == world.crash()[0].steps - 1
+
+
+def test_how_long_it_is_run_and_how_hard_it_braked_by_hand():
+    speeds = [10.0, 9.5, 7.5, 7.0, 1.0]
+    scenes = [
+        Scene(step * DT, ROSTER, [(float(step), 0.0), (50.0, 0.0)], [0.0, 0.0], [speed, 0.0])
+        for step, speed in enumerate(speeds)
+    ]
+    recording = World().recording(scenes)
+    crashed = TrialResult(SPEC, Outcome.COLLISION, steps=4, collision=HIT)
+    survived = dataclasses.replace(crashed, outcome=Outcome.SURVIVED, collision=None)
+    # Not what the collision itself did to the speed.
+    assert slowing("ego", 0, crashed, recording) == pytest.approx(2.0 / DT)
+    assert slowing("ego", 2, crashed, recording) == pytest.approx(0.5 / DT)
+    assert slowing("ego", 2, survived, recording) == pytest.approx(6.0 / DT)
+    assert slowing("nobody", 0, survived, recording) == 0.0
+    for after, speed in enumerate(speeds):  # the last is nearly standing
+        spec = overruled_trial(crashed, recording, after, 4.0)
+        assert spec.max_steps == 4 + math.ceil((5.0 + speed / 4.0) / DT)
+        assert (spec.overruled.agent, spec.overruled.after, spec.overruled.manoeuvre) == ("ego", after, "brake")

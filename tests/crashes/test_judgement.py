@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.crashes import Attempt, Judgement, judgement_of, with_judgement
+from crashhunt.crashes import Attempt, Factor, Judgement, Why, judgement_of, with_judgement
 
 BRAKE = Attempt("brake", 10, {3: "avoided", 4: "avoided", 5: "hit", 6: "hit", 7: "other", 8: "hit", 9: "hit"}, 6.5)
 LEFT = Attempt("left", 10, {0: "avoided", 9: "hit"})
@@ -67,6 +67,9 @@ def test_it_is_kept_in_a_bundle_beside_what_others_have_added():
     assert (first["last_step"], first["too_late_step"], first["all_later_run"]) == (4, 5, True)
     assert (first["deceleration"], second["deceleration"]) == (6.5, None)
     assert judgement_of(Bundle({"judged": data})) == judgement
+    whole = replace(judgement, visible_step=3, why=Why((Factor("agent", "ego", "sped up", 2),), 30))
+    (kept,) = with_judgement(Bundle(), whole).added.values()
+    assert judgement_of(Bundle({"judged": json.loads(json.dumps(kept))})) == whole
     none = with_judgement(Bundle(), Judgement((HOPELESS,))).added["judged"]
     assert (none["manoeuvre"], none["last_step"], none["avoidable"]) == ("", None, False)
 
