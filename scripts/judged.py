@@ -93,6 +93,7 @@ def main() -> int:
 def _hunted(name: str, given: argparse.Namespace, folder: Path) -> Path:
     """The directory of a hunt for crashes of a scenario, or in a town."""
     place, hunt, scenario = Path.cwd(), folder / name / "hunt", name
+    hunt.parent.mkdir(parents=True, exist_ok=True)
     more: tuple[str, ...] = ()
     if given.towns:
         town = make_town(name, folder / name)

@@ -27,7 +27,7 @@ _CATEGORIES = {
 }  # fmt: skip
 _NO_LIMIT = "100"  # of speed and acceleration, which the format wants: nobody is to be held back on a recorded way
 _HEIGHT_M = 1.5  # where none was recorded
-_AXLE = 0.3  # of the length, ahead of the middle and behind it
+_AXLES = 0.6  # of the length, from one axle to the other
 
 
 def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[str]]:
@@ -35,8 +35,9 @@ def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = Fals
 
     Lengths are in m, angles in rad, speeds in m/s, times in s, 0 before the first recorded step. Everybody follows the
     recorded way, a vertex for each step at its time, from when it was first seen until it was last seen. The reference
-    point of a vehicle is its middle, not its rear axle: nobody has recorded where that is, and what takes the middle
-    for granted is right as well. Performance, axles and a height that was not recorded are made up.
+    point of a vehicle is its middle, and there its rear axle is said to be: nobody has recorded where that is, and an
+    axle behind the point of reference has esmini shift the vehicle ahead. Performance, axles and a height that was not
+    recorded are made up.
 
     Args:
         bundle: the crash.
@@ -109,10 +110,13 @@ def _add_entity(entities: ET.Element, way: Way) -> None:
     if thing.tag == "Vehicle":
         add(thing, "Performance", maxSpeed=_NO_LIMIT, maxAcceleration=_NO_LIMIT, maxDeceleration=_NO_LIMIT)
         axles = add(thing, "Axles")
-        for tag, side in (("FrontAxle", _AXLE), ("RearAxle", -_AXLE)):
+        for tag, ahead in (
+            ("FrontAxle", _AXLES),
+            ("RearAxle", 0.0),
+        ):  # whoever reads it takes the rear one for the middle
             add(
                 axles, tag, maxSteering="0.5", wheelDiameter="0.6", trackWidth=number(actor.width),
-                positionX=number(side * actor.length), positionZ="0.3",
+                positionX=number(ahead * actor.length), positionZ="0.3",
             )  # fmt: skip
     add(thing, "Properties")
 
