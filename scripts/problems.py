@@ -209,5 +209,17 @@ REAL = {
          "arguments": {"blind_spot_m": "0:12", "desired_speed": "18:32", "patience_s": "1:4"},
          "scenario_arguments": {"motorway_demand": "2200:3000"}}, warmup_s=12.0, held_out=True,
     ),
+    "highway-calm": Real(
+        "car following with a short delay and a fair headway on highway-env", 1 / 200,
+        {"scenario": "highway", "agents": {"": "car-following"}, "max_steps": 15,
+         "arguments": {"delay_s": "0.2:0.8", "headway_s": "0.4:2"}, "scenario_arguments": {"vehicles_count": "6:12"}},
+        held_out=True,
+    ),
+    "loop-follow": Real(
+        "car following with a delay on a ring of SUMO", 1 / 330,
+        {"scenario": "loop", "agents": {"": "car-following"}, "max_steps": 100,
+         "arguments": {"delay_s": "0:2", "headway_s": "0.2:2", "desired_speed": "15:30", "max_brake": "2:8"},
+         "scenario_arguments": {"vehicles": "12:20", "speed_spread": "0:0.4"}}, warmup_s=3.0, held_out=True,
+    ),
 }  # fmt: skip
 """Each has other traffic with every seed. Their rates were seen in a few hundred random trials."""

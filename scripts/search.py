@@ -33,12 +33,14 @@ from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, 
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from problems import Problem, Real
 
     from crashhunt.trial import TrialSpec
 
+Hunt = tuple[str, str, int]
+"""Problem, sampler and seed."""
 LAG = 4
 OURS = ("random", "halton", "sobol", "guided", "cross-entropy", "mutation", "cma-es")
 FIRST_SEED = 100
@@ -198,9 +200,13 @@ def synthetic_run(name: str, sampler: str, seed: int) -> Run:
     return Run(name, sampler, seed, found.trials, found.found, found.steps, found.cpu_s)
 
 
-def real_runs(name: str, samplers: Sequence[str], seeds: Sequence[int], parallel: int) -> Iterator[Run]:
-    """All hunts on a problem with a simulator, on the same warm workers."""
+def real_runs(
+    name: str, samplers: Sequence[str], seeds: Sequence[int], parallel: int, known: Collection[Hunt]
+) -> Iterator[Run]:
+    """All hunts on a problem with a simulator that are not known, on the same warm workers."""
     problem: Real = REAL[name]
+    if all((name, sampler, seed) in known for sampler in samplers for seed in seeds):
+        return
     most = math.ceil(GIVE_UP / problem.rate)
     with tempfile.TemporaryDirectory(prefix="crashhunt-search-") as folder:
         scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
@@ -217,18 +223,22 @@ def real_runs(name: str, samplers: Sequence[str], seeds: Sequence[int], parallel
         try:
             for seed in seeds:
                 for sampler in samplers:
+                    if (name, sampler, seed) in known:
+                        continue
                     asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
                     yield replace(hunted(plan(asked)[1], place, most, name), sampler=sampler)
         finally:
             pool.close()
 
 
-def all_runs(samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str], workers: int) -> Iterator[Run]:
-    """Every sampler on every problem without a simulator."""
+def all_runs(
+    samplers: Sequence[str], seeds: Sequence[int], names: Sequence[str], workers: int, known: Collection[Hunt] = ()
+) -> Iterator[Run]:
+    """Every sampler on every problem without a simulator, but for what is known."""
     with ProcessPoolExecutor(workers) as pool:
         jobs = [
             pool.submit(synthetic_run, name, sampler, seed)
-            for name in names for sampler in samplers for seed in seeds
+            for name in names for sampler in samplers for seed in seeds if (name, sampler, seed) not in known
         ]  # fmt: skip
         for job in jobs:
             yield job.result()
@@ -250,7 +260,7 @@ def store(path: Path, runs: Sequence[Run]) -> None:
     path.write_text("{\n" + ",\n".join(problems) + "\n}\n", encoding="utf-8")
 
 
-def stored(path: Path) -> dict[tuple[str, str, int], Run]:
+def stored(path: Path) -> dict[Hunt, Run]:
     """Read what `store` wrote."""
     found: dict[str, dict[str, dict[str, int | list[int]]]] = json.loads(path.read_text(encoding="utf-8"))
     runs = {}
@@ -272,15 +282,18 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
+    parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     options = parser.parse_args(words)
     if options.quick:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
-    seeds = range(FIRST_SEED, FIRST_SEED + options.repetitions)
+    seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
+    known = () if options.again else (*runs,)
     for found in (
-        all_runs(samplers, seeds, [name for name in names if name in PROBLEMS], options.parallel),
-        *(real_runs(name, samplers, seeds, options.parallel) for name in names if name in REAL),
+        all_runs(samplers, seeds, [name for name in names if name in PROBLEMS], options.parallel, known),
+        *(real_runs(name, samplers, seeds, options.parallel, known) for name in names if name in REAL),
     ):
         for run in found:
             runs[run.problem, run.sampler, run.seed] = run

@@ -45,6 +45,14 @@ class Cube:
         }
         return {key: chosen[key] if key in chosen else self._fixed[key] for key in self._space}
 
+    def values(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points with the place of the value that is meant, instead of a share, where that is a choice."""
+        if not self.categorical.any():
+            return points
+        options = np.array(self.options)
+        places = np.minimum(np.floor(points * options), options - 1)
+        return np.where(self.categorical, places, points)
+
     def point(self, spec: TrialSpec) -> NDArray[np.float64]:
         """Return the point that stands for the arguments of a trial; of whole numbers and choices, the middle."""
         return np.array(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ __all__ = ["CRASHED", "Told", "told_of"]
 
 CRASHED = 1.0
 _NEAREST = 0.999  # of what is no crash
+_NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane: which of its road's it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +32,7 @@ class Told:
         score: 0 to 1, `CRASHED` for a crash.
         origin: from which strategy it was.
         parent: the number of the trial that it was made from; None where there is none.
+        kind: of a crash, its manner and its place as far as its result says so; empty where it does not.
     """
 
     number: int
@@ -38,6 +41,7 @@ class Told:
     score: float
     origin: str = ""
     parent: int | None = None
+    kind: str = ""
 
     @property
     def crashed(self) -> bool:
@@ -54,4 +58,20 @@ def told_of(result: TrialResult, cube: Cube, hunt: HuntFacts) -> Told | None:
     else:
         score = min(max(result.danger, 0.0), _NEAREST)
     spec = result.spec
-    return Told(spec.number, cube.point(spec), spec.seed, score, spec.origin, spec.parent)
+    kind = _kind(result) if score == CRASHED else ""
+    return Told(spec.number, cube.point(spec), spec.seed, score, spec.origin, spec.parent, kind)
+
+
+def _kind(result: TrialResult) -> str:
+    """Return what tells crashes apart without their recordings: who drove into whom and where, or what was raised."""
+    hit, failed, event = result.collision, result.failure, result.event
+    words = [str(result.outcome)]
+    if hit is not None:
+        words += [hit.role, hit.kind, _NUMBER_AT_END.sub("", hit.lane)]
+    elif failed is not None:
+        words += [failed.kind, failed.agent]
+    elif event is not None:
+        words += [event.kind, _NUMBER_AT_END.sub("", event.lane)]
+    else:
+        return ""
+    return " ".join(words)

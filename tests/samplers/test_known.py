@@ -1,0 +1,107 @@
+"""Crashes that are known keep others away by what their results say of manner and place."""
+
+from __future__ import annotations
+
+import numpy as np
+from spaces import ask, spec_of
+
+from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, RandomSampler
+from crashhunt.samplers._known import KnownCrashes
+from crashhunt.samplers._told import Told, told_of
+from crashhunt.space import Range
+from crashhunt.trial import Collision, Failure, Outcome, TrialResult
+from crashhunt.world import Event
+
+UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
+
+
+def crash(x, kind=""):
+    return Told(0, np.array([x, x, x, x]), 0, 1.0, kind=kind)
+
+
+def at(x):
+    return np.array([x, x, x, x])
+
+
+def test_without_manner_and_place_arguments_are_all_there_is():
+    known = KnownCrashes(4)
+    assert not known
+    assert not known.cover(at(0.5))
+    assert known.add(crash(0.5))
+    assert known
+    assert known.cover(at(0.59))
+    assert not known.cover(at(0.61))
+    assert not known.add(crash(0.55))  # nothing new
+
+
+def test_the_first_crash_of_a_kind_keeps_next_to_nothing_away_and_the_second_does():
+    known = KnownCrashes(4)
+    assert known.add(crash(0.5, "rear end"))
+    assert not known.cover(at(0.53))
+    assert known.add(crash(0.53, "rear end"))
+    assert known.cover(at(0.6))
+    assert not known.add(crash(0.6, "rear end"))
+
+
+def test_where_another_kind_comes_there_is_more_to_find():
+    known = KnownCrashes(4)
+    assert known.add(crash(0.5))
+    assert known.add(crash(0.55, "side swipe"))
+    assert not known.cover(at(0.58))
+    assert known.cover(at(0.52))
+
+
+def test_what_is_most_dangerous_just_beside_a_crash_is_that_crash_still():
+    known = KnownCrashes(4)
+    known.add(crash(0.5))
+    assert not known.widen(at(0.8))
+    assert known.widen(at(0.62))
+    assert known.cover(at(0.64))
+    assert not known.cover(at(0.66))
+    for _ in range(20):
+        known.widen(at(0.62))
+        assert not known.cover(at(1.0))
+
+
+def kind_of(**evidence):
+    outcome = evidence.pop("outcome", Outcome.COLLISION)
+    spec = spec_of(0, ask(RandomSampler(UNIT), 0))
+    return told_of(TrialResult(spec, outcome, danger=0.5, **evidence), Cube(UNIT), HuntFacts()).kind
+
+
+def test_kinds_are_told_by_manner_and_road_and_by_what_was_raised():
+    hit = Collision("ego", "collider", "ego", "a", kind="collision", lane="north_1")
+    assert kind_of(collision=hit) == "collision collider collision north"
+    same = Collision("ego", "collider", "ego", "b", kind="collision", lane="north_0", x=3.0)
+    assert kind_of(collision=same) == kind_of(collision=hit)
+    other = Collision("ego", "victim", "b", "ego", kind="collision", lane="north_0")
+    assert kind_of(collision=other) != kind_of(collision=hit)
+    junction = Collision("ego", "collider", "ego", "a", kind="collision", lane=":J1_0_0")
+    assert kind_of(collision=junction) != kind_of(collision=hit)
+    raised = kind_of(outcome=Outcome.AGENT_ERROR, failure=Failure("ValueError", "no", agent="ego"))
+    assert raised == "agent_error ValueError ego"
+    assert kind_of() == ""
+    assert kind_of(outcome=Outcome.SURVIVED) == ""
+    light = Event("red_light", "ego", "ego ran the red light", lane="north_1")
+    assert kind_of(event=light) == "collision red_light north"
+
+
+def test_a_hunt_that_goes_on_comes_back_to_arguments_that_lead_to_several_kinds():
+    """All crashes are in one small region, and of four kinds: whoever kept away from it would find one."""
+
+    def found(lanes):
+        sampler, kinds = GuidedSampler(UNIT), []
+        for number in range(700):
+            proposal = ask(sampler, number)
+            x = np.array([*proposal.arguments.values()])
+            away = float(np.linalg.norm(x - 0.7))
+            hit = Collision("ego", "collider", "ego", lane=lanes[number % len(lanes)]) if away < 0.1 else None
+            outcome = Outcome.COLLISION if hit else Outcome.SURVIVED
+            kinds += [hit.lane] if hit else []
+            danger = 1.0 if hit else 0.95 - away / 2
+            sampler.tell(TrialResult(spec_of(number, proposal), outcome, danger=danger, collision=hit))
+        return kinds
+
+    many = found(["north_0", "south_0", "east_0", "west_0"])
+    assert len(set(many)) >= 3
+    assert len(many) < 60
