@@ -118,19 +118,18 @@ def copies_told(state: HuntState) -> list[str]:
     if (probes := state.probes) is not None:
         least = "no stress margin yet"
         if probes["least"] is not None:
-            least = f"least stress margin {probes['least']:.2f}, trial {probes['trial']}"
-        crashed = f"{probes['crashed_trials']} of {probes['trials']} trials made to crash"
-        told.append(f"{least}; {probes['probes']} probes, {crashed}{_confirmed(probes)}")
+            least = f"least stress margin {probes['least']:.2f} (trial {probes['trial']})"
+        crashed = f"{probes['crashed_trials']} of {probes['trials']} trials"
+        told.append(f"{least}; probes {probes['probes']}, made to crash {crashed}{_confirmed(probes)}")
     if (branches := state.branches) is not None:
-        crashed = f"{branches['crashed']} crashed, {branches['crashed_trials']} of {branches['trials']} trials"
-        told.append(
-            f"{branches['branches']} branches from {branches['moments']} moments, {crashed}{_confirmed(branches)}"
-        )
+        asked = f"branches {branches['branches']} (moments {branches['moments']})"
+        crashed = f"crashed {branches['crashed']} (in {branches['crashed_trials']} of {branches['trials']} trials)"
+        told.append(f"{asked}, {crashed}{_confirmed(branches)}")
     return told
 
 
 def _confirmed(sums: ProbeSums | BranchSums) -> str:
-    return f"; from the start {sums['confirmed']} of {sums['run_again']} as well" if sums["run_again"] else ""
+    return f", confirmed {sums['confirmed']} of {sums['run_again']}" if sums["run_again"] else ""
 
 
 def _crashes(state: HuntState) -> str:

@@ -22,8 +22,8 @@ def describe_probes(report: HuntReport) -> list[str]:
     said = f"nothing plausible made {safe} of them crash"
     enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
     lines = [
-        f"Stress margin of {len(found.margins)} trials: least {least:.2f}, median {median:.2f}; {said}.",
-        f"  {found.probes} copies were asked, with {found.steps} steps beside {steps} of trials{enough}",
+        f"Stress margin of {_many(len(found.margins), 'trial')}: least {least:.2f}, median {median:.2f}; {said}.",
+        f"  copies were asked {_many(found.probes, 'time')}, with {found.steps} steps beside {steps} of trials{enough}",
     ]
     if found.run_again:
         lines.append(
@@ -43,9 +43,10 @@ def describe_branches(report: HuntReport) -> list[str]:
     if found is None or not found.trials:
         return []
     enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
-    copies = f"{found.branches} copies went on with other disturbances from {found.moments} moments of {found.trials}"
+    moments = f"{_many(found.moments, 'moment')} of {_many(found.trials, 'trial')}"
+    crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
     lines = [
-        f"{copies} trials: {found.crashed} crashed, of {found.crashed_trials} trials.",
+        f"Branches: copies went on with other disturbances {_many(found.branches, 'time')}, from {moments}; {crashed}.",
         f"  they took {found.steps} steps beside {_of_trials(report)} of trials{enough}",
     ]
     if found.run_again:
@@ -55,6 +56,10 @@ def describe_branches(report: HuntReport) -> list[str]:
         said = f", log-likelihood {likely:.2f}" if likely is not None else ""
         lines.append(f"  {bundle.path}: {bundle.result.summary}{said}")
     return lines
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _of_trials(report: HuntReport) -> int:

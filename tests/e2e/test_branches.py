@@ -47,10 +47,7 @@ def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_
     assert state["branches"] == {name: value for name, value in found.items() if name != "crashes"}
     assert "probes" not in state
     told = " ".join(shell.crashhunt("status", "h").out.split())
-    assert (
-        f"{found['branches']} branches from {found['moments']} moments, {found['crashed']} crashed, 1 of 1 trials"
-        in told
-    )
+    assert f"branches {found['branches']} (moments {found['moments']}), crashed {found['crashed']} (in 1 of 1" in told
 
 
 def test_branches_need_disturbances(shell):
