@@ -56,15 +56,14 @@ class Ahead:
         self.at_once = at_once
         self._box, self._agent, self._encode = box, agent, encode
 
-    def go_on_from(
-        self, come: int, agents: dict[str, Agent], tells: Sequence[Callable[[int, NDArray[np.generic]], None]]
-    ) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
+    def go_on_from(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
         """Return what a step has come to in the end, and what the agent answered; None where it was not asked.
+
+        Where it ends with `ANSWERED`, nobody has been told of the answer yet.
 
         Args:
             come: what it has come to so far.
             agents: by name.
-            tells: who is told of an action, where the core does not record it.
         """
         core = self.at_once.core
         if come == REFUSED and self._resume():
@@ -72,12 +71,8 @@ class Ahead:
         if come in (DONE, ASK, REFUSED):
             return come, None
         action = self._encode(core.answer)
-        if come == ANSWERED:
-            if core.note(action):
-                come = core.go_on(self.at_once.apply(self._agent, action))
-            else:
-                for tell in tells:
-                    tell(0, action)
+        if come == ANSWERED and core.note(action):
+            come = core.go_on(self.at_once.apply(self._agent, action))
         return come, {self._agent: action}
 
     def _resume(self) -> bool:
@@ -105,7 +100,9 @@ def goes_ahead(
     first = observers[0] if observers else None
     if not isinstance(first, Recorder) or type(first) is not Recorder or not offers(simulator, StepsAtOnce):
         return None
-    if simulator.at_once is None or offers(simulator, FlattensObservations):
+    if simulator.at_once is None or not simulator.at_once.stands_for(simulator):
+        return None
+    if offers(simulator, FlattensObservations):
         return None
     rest = [one for one in observers[1:] if type(one) is not Nearness]
     if any(wants(one, "observation") or wants(one, "action") for one in rest):

@@ -17,7 +17,7 @@ from crashhunt.episode._ending import Ending
 from crashhunt.episode._failures import close_agent, is_emptied
 from crashhunt.episode._whereabouts import Whereabouts
 from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
-from crashhunt.native import ASK, DONE, SIMULATED
+from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
 from crashhunt.simulators import FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
@@ -168,6 +168,8 @@ class Episode(Copied, Ending, Whereabouts):
         given: Mapping[str, NDArray[np.generic]],
         actions: dict[str, NDArray[np.generic]] | None = None,
         advance: Callable[[Mapping[str, NDArray[np.generic]]], StepResult] | None = None,
+        *,
+        untold: bool = False,
     ) -> TrialResult | None:
         """Take a step one thing after the other.
 
@@ -175,6 +177,7 @@ class Episode(Copied, Ending, Whereabouts):
             given: as of `step`.
             actions: where agents have been asked already, what they answered.
             advance: what is left for the simulator to do with that; None where it is all of it.
+            untold: whether nobody has been told of these answers.
         """
         self._catch_up()
         if self.result is not None or self._scene is None:
@@ -183,6 +186,8 @@ class Episode(Copied, Ending, Whereabouts):
         try:
             names, agents, observations, unflatten = self.names, self.agents, self._observations, self._unflatten
             asked, actions = (self.acting, {}) if actions is None else ((), actions)
+            for tell in self._on_action if untold else ():
+                tell(0, actions[names[0]])
             for number in asked:
                 name = names[number]
                 observation: Any = observations[name]
@@ -236,13 +241,14 @@ class Episode(Copied, Ending, Whereabouts):
         ahead = self._ahead
         assert ahead is not None
         try:
-            come, actions = ahead.go_on_from(come, self.agents, self._on_action)
+            come, actions = ahead.go_on_from(come, self.agents)
         except RecorderError:
             raise
         except BaseException as error:
             return self._fail_at_once(error)
         if come not in (DONE, ASK):
-            return self._step(_ASK_ALL, actions, ahead.at_once.finish if come == SIMULATED else None)
+            advance = ahead.at_once.finish if come == SIMULATED else None
+            return self._step(_ASK_ALL, actions, advance, untold=come == ANSWERED)
         self._is_behind = True
         self.steps += 1
         return self._look_into() if come == ASK else None

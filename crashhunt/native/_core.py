@@ -77,7 +77,7 @@ class UsualSteps(Protocol):
     """
 
     answer: object
-    """What the agent answered last."""
+    """What the agent answered last; handed over, and not there afterwards."""
     step: int
     """The number of the step that is complete."""
     simulating: bool

@@ -591,9 +591,10 @@ PyObject *usual_reads(PyObject *object, PyObject *given) {
     }
 }
 
+// Handed over: it may be a view of what the agent goes on with, and is let go as soon as it has been read.
 PyObject *usual_answer(PyObject *object, void *) {
-    PyObject *answer = steps_of(object).answer;
-    return Py_NewRef(answer ? answer : Py_None);
+    PyObject *answer = std::exchange(steps_of(object).answer, nullptr);
+    return answer ? answer : Py_NewRef(Py_None);
 }
 
 PyObject *usual_step(PyObject *object, void *) { return PyLong_FromLongLong(steps_of(object).step); }
@@ -617,7 +618,7 @@ PyMethodDef usual_methods[] = {
     {nullptr, nullptr, 0, nullptr},
 };
 PyGetSetDef usual_getters[] = {
-    {"answer", usual_answer, nullptr, "What the agent answered last.", nullptr},
+    {"answer", usual_answer, nullptr, "What the agent answered last, once.", nullptr},
     {"step", usual_step, nullptr, "The number of the step that is complete.", nullptr},
     {"simulating", usual_simulating, nullptr, "Whether the last step had come to the simulator.", nullptr},
     {nullptr, nullptr, nullptr, nullptr, nullptr},

@@ -336,6 +336,9 @@ class AtOnce(Protocol):
     core: UsualSteps
     """What takes a step, and says what has come of it."""
 
+    def stands_for(self, simulator: Simulator, /) -> bool:
+        """Whether it does what a simulator does: not where somebody has wrapped that, or a method of it."""
+
     def resume(self) -> Scene | None:
         """Have `core` go on from where the simulator is; return its scene, None where that has to wait."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -11,10 +12,11 @@ import numpy as np
 import pytest
 
 from crashhunt.episode import Episode, Nearness, Observer, Recorder
-from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
+from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import load_scenario
+from crashhunt.simulators import SpeedAndLaneChange
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
@@ -274,6 +276,94 @@ def test_a_simulator_of_somebody_elses_takes_its_own_steps(street, tmp_path):
     street.simulator.__class__ = Slower
     assert street.both(ANSWERS["steady"]) != before
     assert street.simulator.at_once is None
+
+
+class _Wrapper:
+    """Somebody's around a simulator, of which one thing is another."""
+
+    def __init__(self, simulator, **others):
+        self._simulator = simulator
+        vars(self).update(others)
+
+    def __getattr__(self, name):
+        return getattr(self._simulator, name)
+
+
+class _Halved:
+    names, space = SpeedAndLaneChange.names, SpeedAndLaneChange().space
+
+    def encode(self, action):
+        return np.array(action) / 2
+
+
+def _slower(street):
+    """What has a steady agent drive half as fast: in a wrapper, or set in the simulator itself."""
+    simulator, step = street.simulator, street.simulator.step
+
+    def halved(actions):
+        return step({agent: action / 2 for agent, action in actions.items()})
+
+    yield _Wrapper(simulator, step=halved)
+    yield _Wrapper(simulator, actions={"ego": _Halved()})
+    simulator.actions["ego"] = _Halved()
+    yield simulator
+    simulator.actions["ego"] = SpeedAndLaneChange()
+    simulator.step = halved
+    yield simulator
+    del simulator.step
+
+
+def test_what_somebody_wraps_or_sets_is_not_passed_by(street):
+    plain, simulator = street.run(ANSWERS["steady"]), street.simulator
+    found = set()
+    for slower in _slower(street):
+        street.simulator = slower
+        found.add(street.both(ANSWERS["steady"]))
+    assert len(found) == 2  # recorded as it was answered, or as it was encoded
+    assert plain not in found
+    street.comes.clear()
+    street.simulator = _Wrapper(simulator, scene=simulator.scene)
+    assert street.both(ANSWERS["steady"]) == plain
+    assert street.comes[DONE] > 60  # what only hands on is no other
+
+
+def test_an_answer_is_let_go_when_it_has_been_read(street):
+    def view(step, _):
+        kept.extend(b"more")  # an error while somebody looks into it
+        del kept[16:]
+        return np.frombuffer(kept)
+
+    kept = bytearray(np.array([8.0, 0.0]).tobytes())
+    assert "survived" in street.both(view)[0]
+
+
+def test_a_black_box_that_fails_at_an_action_is_the_agents_doing(street, monkeypatch):
+    lend, action, told = street.box.lend, street.box.action, []
+
+    class Scarce:
+        """Room for an observation, and not for what the agent answers."""
+
+        def __init__(self, steps):
+            self.give_back, self._borrow = steps.give_back, steps.borrow
+
+        def borrow(self, tape, offset, reserved, tags):
+            self._borrow(tape, offset, offset + street.simulator._shown["ego"].nbytes + 16, tags)
+
+    def scarcely(steps, roster):
+        return lend(Scarce(steps), roster)
+
+    def closed(number, array):
+        told.append(number)
+        if len(told) % 30 == 0:
+            raise OSError(errno.EBADF, "closed")
+        action(number, array)
+
+    monkeypatch.setattr(street.box, "lend", scarcely)
+    monkeypatch.setattr(street.box, "action", closed)
+    result, *_ = street.both(ANSWERS["of NumPy's"])
+    assert "agent_error" in result
+    assert "closed" in result
+    assert street.comes[REFUSED] > 20
 
 
 def test_another_simulator_is_told_of(street, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from functools import cache
+from types import MethodType
 from typing import TYPE_CHECKING
 
 import libsumo
@@ -299,6 +300,11 @@ class SumoSimulator:
         if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual:
             return None
         (agent,) = self.agents
+        # Not as attributes of this one, which somebody may have set.
+        own = {
+            one.__name__: MethodType(one, self)
+            for one in (SumoSimulator.reset, SumoSimulator.step, SumoSimulator.scene)
+        }
         return UsualSteps(
             core,
             agent,
@@ -314,7 +320,8 @@ class SumoSimulator:
             start_m=self._start[agent],
             step_length_s=self.step_length_s,
             lateral=self._lateral,
-            takes_speed=self._scenario.agents[agent].action != "meta",
+            takes_speed=type(self.actions[agent]) is SpeedAndLaneChange,
+            instead_of={"actions": self.actions, **own},
         )
 
     def _arrive(self, present: Present) -> None:

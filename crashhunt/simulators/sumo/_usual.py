@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from crashhunt.native import Core
     from crashhunt.simulators._kinematics import Kinematics
-    from crashhunt.simulators._protocol import Observations, StepResult
+    from crashhunt.simulators._protocol import Observations, Simulator, StepResult
     from crashhunt.simulators.sumo._sight import Sight
     from crashhunt.simulators.sumo._traffic_events import SumoEvents
 
@@ -62,6 +62,7 @@ class UsualSteps:
         step_length_s: in s.
         lateral: whether vehicles may be elsewhere than in the middle of a lane.
         takes_speed: whether actions are a speed and a change of lane.
+        instead_of: what it does without calling it, as a simulator has it.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class UsualSteps:
         step_length_s: float,
         lateral: bool,
         takes_speed: bool,
+        instead_of: Mapping[str, object],
     ) -> None:
         self._core, self._agent = core, agent
         self._sight, self._events, self._kinematics = sight, events, kinematics
@@ -92,8 +94,12 @@ class UsualSteps:
             agent, libsumo, (np.ndarray, shape, _OBSERVED), shape[0] - 1, step_length_s, lateral, takes_speed,
             sight.around, start_m,
         )  # fmt: skip
-        self._edge = edge
+        self._edge, self._instead_of = edge, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
+
+    def stands_for(self, simulator: Simulator) -> bool:
+        """Whether nothing that it does is somebody else's in a simulator, such as in a wrapper around this one."""
+        return all(getattr(simulator, name) == own for name, own in self._instead_of.items())
 
     def begin(self) -> None:
         """Take what is counted in this episode, which is about to begin."""
