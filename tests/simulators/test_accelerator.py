@@ -32,6 +32,7 @@ from hypothesis import given, settings, strategies as st
 from crashhunt.simulators.accelerator import (
     Frame,
     Network,
+    Onlooker,
     _known,
     _switch as accelerator,
     kind_of,
@@ -123,13 +124,9 @@ def episode(name, config, seed, steps, *, idm):
             env.controlled_vehicles[0] = driver
             env.action_type.controlled_vehicle = driver
             env.observation_type.observer_vehicle = driver
-    advance = env.road.step
-
-    def step(dt):
-        advance(dt)
-        trace.append(state(env))
-
-    env.road.step = step
+    onlooker = Onlooker(env.road.step, after=lambda: trace.append(state(env)))
+    # Where any other function stands in its place, everybody is looked at again in every sub-step.
+    env.road.step = onlooker if idm or seed == 0 else lambda dt: onlooker(dt)
     env.action_space.seed(seed)
     try:
         for _ in range(steps):

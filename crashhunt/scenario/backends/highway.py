@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ACCELERATED", "BACKEND", "HighwaySetup"]
 
-ACCELERATED = {"1.12.1": "863e3d3e122c46ec"}
+ACCELERATED = {"1.12.1": "744f46c99845090f"}
 """The versions of highway-env that the accelerator knows, and the digest of the modules in which it replaces
 something."""
 

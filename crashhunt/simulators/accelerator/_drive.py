@@ -1,55 +1,44 @@
 """How vehicles decide: `Road.act`, with everybody's arithmetic done at once.
 
-Vehicles decide one after another, and may see where those before them now want to go; lanes are therefore chosen in
-their order. Steering and acceleration depend on nothing that changes meanwhile.
+Vehicles decide one after another, and may see where those before them now want to go. All that such a decision
+depends on besides, who drives where and how hard each would brake, does not change meanwhile and is computed before.
 """
 
 from __future__ import annotations
 
-import math
-from itertools import chain
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from highway_env.utils import not_zero
-from highway_env.vehicle.controller import ControlledVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.simulators.accelerator._frame import MANY
-from crashhunt.simulators.accelerator._known import are_numbers, kinds_of, originals
+from crashhunt.simulators.accelerator._frame import ASK, MANY
+from crashhunt.simulators.accelerator._known import are_numbers, originals
 from crashhunt.simulators.accelerator._network import wrap_to_pi
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from highway_env.road.road import LaneIndex, Road
-    from highway_env.vehicle.behavior import IDMVehicle
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
+    from crashhunt.simulators.accelerator._crowd import Crowd
     from crashhunt.simulators.accelerator._frame import Frame
 
 __all__ = ["decide"]
 
-_STEERING = attrgetter("speed", "heading", "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "LENGTH", "MAX_STEERING_ANGLE")
-_FOLLOWING = attrgetter("COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DELTA", "DISTANCE_WANTED", "TIME_WANTED")
-_THINKING = attrgetter(
-    "ACC_MAX", "POLITENESS", "LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED", "timer"
-)
 _WHOLE = 2**53  # up to here, floats hold whole numbers
 
 
-def decide(road: Road, frame: Frame) -> bool:
-    """Let all vehicles decide; False where one of them is not known, and nothing was done."""
-    vehicles = road.vehicles
-    kinds, others = kinds_of(vehicles), kinds_of(road.objects)
-    if not all(kind.drives and kind.is_of(vehicle) for kind, vehicle in zip(kinds, vehicles, strict=True)):
-        return False
-    if not all(kind.collides and kind.is_of(thing) for kind, thing in zip(others, road.objects, strict=True)):
-        return False
-    try:
-        decisions = _Decisions(road, frame, [kind.drives for kind in kinds])
-    except AttributeError:  # highway-env may never ask for what somebody's vehicle lacks
-        return False
+def decide(road: Road, frame: Frame, crowd: Crowd) -> bool:
+    """Let all vehicles decide; False where one of them is not known, and nothing was done.
+
+    Args:
+        road: with its vehicles.
+        frame: where everybody is.
+        crowd: who they are; it is known how all of them drive.
+    """
+    decisions = _Decisions(road, frame, crowd)
     if not decisions.are_usual:
         return False
     decisions.take()
@@ -57,252 +46,256 @@ def decide(road: Road, frame: Frame) -> bool:
 
 
 class _Decisions:
-    def __init__(self, road: Road, frame: Frame, drives: list[str]) -> None:
+    def __init__(self, road: Road, frame: Frame, crowd: Crowd) -> None:
         self.road = road
         self.frame = frame
+        self.crowd = crowd
         self.network = frame.network
-        self.drives = drives
-        drivers = [(vehicle, how) for vehicle, how in zip(road.vehicles, drives, strict=True) if how != "nothing"]
-        self.steering = {id(vehicle): _STEERING(vehicle) for vehicle, _ in drivers}
-        self.following = {id(vehicle): _FOLLOWING(vehicle) for vehicle, how in drivers if how == "idm"}
-        read = [*self.steering.values(), *self.following.values()]
-        read += [_THINKING(vehicle) for vehicle, how in drivers if how == "idm"]
-        read += [(vehicle.KP_A,) for vehicle, _ in drivers]
-        read += [(thing.heading, thing.speed) for thing in frame.things]
-        #: whether all that they reckon with are numbers of the usual kinds, whose road is this one
-        self.are_usual = (
-            are_numbers(chain.from_iterable(read))
-            and all(_is_speed(vehicle.target_speed) for vehicle, _ in drivers)
-            and all(vehicle.road is road for vehicle in road.vehicles)
-        )
+        vehicles, index, number = crowd.vehicles, self.network.index, self.network.number
+        self.idm = [row for row in crowd.idm if not vehicles[row].crashed]
+        self.rows = sorted(crowd.controlled + self.idm) if crowd.controlled else self.idm
+        self.lanes = np.array([number.get(id(vehicle.lane), -1) for vehicle in vehicles])
+        targets = [index.get(vehicles[row].target_lane_index, -1) for row in self.rows]
+        self.wanted = [getattr(vehicle, "target_speed", 0) for vehicle in vehicles]
+        timers = [vehicles[row].timer for row in self.idm]
+        #: whether all that they reckon with are numbers of the usual kinds, and lanes of this road
+        self.are_usual = _are_speeds(self.wanted) and are_numbers(timers)
+        self.are_usual &= -1 not in targets and bool((self.lanes >= 0).all())
         if not self.are_usual:
             return
-        self.headings = np.array([thing.heading for thing in frame.things], float)
-        self.speeds = np.array([thing.speed for thing in frame.things], float)
-        self.directions = np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)
-        self.velocities = self.speeds[:, None] * self.directions
+        self.targets = np.array(targets, int)
+        self.along, self.across = frame.coordinates_of(self.rows, self.targets)
+        over = self.along > self.network.every_length[self.targets] - 5 / 2
+        self.leaving = [self.rows[number] for number in np.flatnonzero(over).tolist()]
+        if self.leaving:
+            routes = [id(vehicles[row].route) for row in self.rows if vehicles[row].route]
+            self.are_usual = len(set(routes)) == len(routes)  # else what one drops from its route matters to others
+        #: of whom by whose numbers, behind whom, the accelerations are computed
+        self.asked: tuple[list[int], list[int], list[int]] = ([], [], [])
+        #: where among these is what a vehicle does on a lane that it is not on, by its row and that lane
+        self.elsewhere: dict[tuple[int, LaneIndex], int] = {}
+        #: the lanes that vehicles wanted to be on, of those who see the end of theirs
+        self.before: dict[int, LaneIndex] = {}
+        self.directions = np.empty((len(crowd.headings), 2))
+        np.cos(crowd.headings, out=self.directions[:, 0])
+        np.sin(crowd.headings, out=self.directions[:, 1])
+        self.velocities = crowd.speeds[:, None] * self.directions
 
     def take(self) -> None:
         """Choose lanes one after another, then steer and accelerate."""
-        steering: list[tuple[int, int | None]] = []  # row, lane
-        following: list[tuple[int, IDMVehicle, Vehicle]] = []  # row, who follows, whom
-        changing: list[int] = []  # which of these follow somebody on another lane as well
-        index = self.network.index
-        for row, vehicle in enumerate(self.road.vehicles):
-            drives = self.drives[row]
-            if drives == "nothing" or (drives == "idm" and vehicle.crashed):
-                continue
-            self._follow_road(row, vehicle)
-            if drives == "idm":
-                if vehicle.enable_lane_change and (
-                    vehicle.lane_index != vehicle.target_lane_index or vehicle.timer > vehicle.LANE_CHANGE_DELAY
-                ):
-                    self._change_lane(row, vehicle)
-                lane, target = vehicle.lane_index, vehicle.target_lane_index
-                following.append((row, vehicle, self._neighbours(row, vehicle, lane)[0]))
-                if lane != target:
-                    changing.append(len(following))
-                    following.append((row, vehicle, self._neighbours(row, vehicle, target)[0]))
-            steering.append((row, index.get(vehicle.target_lane_index)))
-        if not steering:
+        if not self.rows:
             return
-        angles = self._steer(steering)
-        accelerations = self._accelerate_all(following) if following else []
-        second = set(changing)
-        wanted: dict[int, float] = {}
-        for number, ((row, _, _), acceleration) in enumerate(zip(following, accelerations, strict=True)):
-            wanted[row] = min(wanted[row], acceleration) if number in second else acceleration
-        for (row, _), angle in zip(steering, angles, strict=True):
-            vehicle = self.road.vehicles[row]
-            action = {"steering": angle}
-            if self.drives[row] == "idm":
-                limit = vehicle.ACC_MAX
-                action["acceleration"] = _clip(wanted[row], -limit, limit)
-            else:
-                action["acceleration"] = vehicle.KP_A * (vehicle.target_speed - vehicle.speed)
-            vehicle.action = action
+        vehicles = self.crowd.vehicles
+        for row in self.leaving:
+            self.before[row] = vehicles[row].target_lane_index
+            vehicles[row].follow_road()
+        elsewhere = [row for row in self.idm if vehicles[row].lane_index != vehicles[row].target_lane_index]
+        there = set(elsewhere)
+        thinking = [
+            row for row in self.idm
+            if vehicles[row].timer > vehicles[row].LANE_CHANGE_DELAY
+            and vehicles[row].enable_lane_change and row not in there
+        ]  # fmt: skip
+        self._ask_all(elsewhere)
+        ways = {row: self._ways(row) for row in thinking}
+        accelerations = [*self._accelerations(), 0.0]  # of nobody, it is 0
+        for row in sorted(elsewhere + thinking):
+            if row in ways:
+                self._choose(row, ways[row], accelerations)
+            elif vehicles[row].enable_lane_change:
+                self._turn_back(row)
+        number_of = {row: number for number, row in enumerate(self.idm)}
+        for row in elsewhere + thinking:
+            if (key := vehicles[row].target_lane_index) != vehicles[row].lane_index:
+                number = number_of[row]
+                accelerations[number] = min(accelerations[number], accelerations[self.elsewhere[row, key]])
+        self._look_again({*self.leaving, *elsewhere, *thinking})
+        self._act(accelerations[: len(self.idm)])
 
-    def _neighbours(self, row: int, vehicle: Vehicle, key: LaneIndex) -> tuple[RoadObject | None, RoadObject | None]:
+    def _act(self, accelerations: list[float]) -> None:
+        vehicles = self.crowd.vehicles
+        if self.idm:
+            limit = self.crowd.numbers["ACC_MAX"][self.idm]
+            accelerations = np.array(accelerations).clip(-limit, limit).tolist()
+        found: dict[int, float] = dict(zip(self.idm, accelerations, strict=True))
+        for row, angle in zip(self.rows, self._steer(), strict=True):
+            vehicle = vehicles[row]
+            if row in found:
+                vehicle.action = {"steering": angle, "acceleration": found[row]}
+            else:
+                acceleration = vehicle.KP_A * (vehicle.target_speed - vehicle.speed)
+                vehicle.action = {"steering": angle, "acceleration": acceleration}
+
+    def _neighbours(self, row: int, key: LaneIndex) -> tuple[RoadObject | None, RoadObject | None]:
+        vehicle = self.crowd.vehicles[row]
         found = self.frame.neighbours(vehicle, row, key or vehicle.lane_index)
         if found is None:
             found = originals["Road.neighbour_vehicles"](self.road, vehicle, key)
         return found
 
-    def _follow_road(self, row: int, vehicle: Vehicle) -> None:
-        key = vehicle.target_lane_index
-        lane = self.network.index.get(key)
-        if lane is None:  # such as a key without a number
-            found = self.road.network.get_lane(key)
-            s, length = float(found.local_coordinates(vehicle.position)[0]), found.length
-        else:
-            s, length = self.frame.coordinates(row, lane)[0], self.network.lengths[lane]
-        if s > length - 5 / 2:
-            vehicle.follow_road()
+    def _ask(self, driver: int, vehicle: RoadObject | None, ahead: RoadObject | None) -> int:
+        """Have an acceleration computed: `IDMVehicle.acceleration`; return which it is."""
+        if vehicle is None or not isinstance(vehicle, Vehicle):
+            return -1
+        drivers, whose, behind = self.asked
+        drivers.append(driver)
+        whose.append(self.frame.row[id(vehicle)])
+        behind.append(-1 if ahead is None else self.frame.row[id(ahead)])
+        return len(drivers) - 1
 
-    def _change_lane(self, row: int, vehicle: Vehicle) -> None:
+    def _ask_all(self, elsewhere: list[int]) -> None:
+        """Ask how all accelerate behind those ahead of them, on their lanes and on those that they want to be on."""
+        vehicles, idm = self.crowd.vehicles, self.idm
+        lanes = self.lanes[idm]
+        columns = self.network.axis_columns[lanes]
+        ahead = [ASK] * len(idm)
+        if len(idm) >= MANY and columns.min() >= 0 and not self.road.neighbour_vehicles_connected_lanes:
+            ahead = self.frame.ahead[idm, columns].tolist()
+        keys = self.network.keys
+        for number, (row, lane) in enumerate(zip(idm, lanes.tolist(), strict=True)):
+            key = vehicles[row].lane_index
+            if ahead[number] == ASK or key != keys[lane]:
+                found = self._neighbours(row, key)[0]
+                ahead[number] = -1 if found is None else self.frame.row[id(found)]
+        self.asked = list(idm), list(idm), ahead
+        for row in elsewhere:
+            key = vehicles[row].target_lane_index
+            self.elsewhere[row, key] = self._ask(row, vehicles[row], self._neighbours(row, key)[0])
+
+    def _ways(self, row: int) -> list[tuple[LaneIndex, tuple[int, ...]]]:
+        """The lanes beside that a vehicle could change to, and the accelerations that decide about each."""
+        vehicle = self.crowd.vehicles[row]
+        found = []
+        for key in self.road.network.side_lanes(vehicle.lane_index):
+            lane = self.network.index[key]
+            if abs(vehicle.speed) < 1 or not self.network.is_reachable(lane, *self.frame.coordinates(row, lane)):
+                continue
+            ahead, behind = self._neighbours(row, key)
+            self.elsewhere[row, key] = own_then = self._ask(row, vehicle, ahead)
+            asked = [own_then, self._ask(row, behind, vehicle)]
+            if vehicle.POLITENESS != 0:
+                old_ahead, old_behind = self._neighbours(row, vehicle.lane_index)
+                pairs = ((behind, ahead), (old_behind, vehicle), (old_behind, old_ahead))
+                asked += [self._ask(row, *pair) for pair in pairs]
+            found.append((key, tuple(asked)))
+        return found
+
+    def _choose(self, row: int, ways: list[tuple[LaneIndex, tuple[int, ...]]], accelerations: list[float]) -> None:
         """`IDMVehicle.change_lane_policy`, where it is time to think of that."""
-        lane, target = vehicle.lane_index, vehicle.target_lane_index
-        if lane != target:
-            if lane[:2] == target[:2]:
-                for other in self.road.vehicles:
-                    if (
-                        other is not vehicle
-                        and other.lane_index != target
-                        and isinstance(other, ControlledVehicle)
-                        and other.target_lane_index == target
-                    ):
-                        distance = self._lane_distance(row, vehicle, other)
-                        if 0 < distance < self._desired_gap(row, vehicle, vehicle, other):
-                            vehicle.target_lane_index = lane
-                            break
-            return
+        vehicle = self.crowd.vehicles[row]
         vehicle.timer = 0
-        for key in self.road.network.side_lanes(lane):
-            number = self.network.index[key]
-            if not self.network.is_reachable(number, *self.frame.coordinates(row, number)):
-                continue
-            if abs(vehicle.speed) < 1:
-                continue
-            if self._mobil(row, vehicle, key):
+        own = accelerations[self.idm.index(row)]
+        for key, asked in ways:
+            if self._recommends(vehicle, key, own, *[accelerations[number] for number in asked]):
                 vehicle.target_lane_index = key
 
-    def _mobil(self, row: int, vehicle: Vehicle, key: LaneIndex) -> bool:
-        """`IDMVehicle.mobil`; accelerations that cannot decide anything are not computed."""
-        ahead, behind = self._neighbours(row, vehicle, key)
+    def _recommends(
+        self, vehicle: Vehicle, key: LaneIndex, own_now: float, own_then: float, behind_then: float, *others: float
+    ) -> bool:
+        """`IDMVehicle.mobil`."""
         limit = -vehicle.LANE_CHANGE_MAX_BRAKING_IMPOSED
-        behind_then = self._acceleration(vehicle, behind, vehicle)
         if behind_then < limit:
             return False
-        old_ahead, old_behind = self._neighbours(row, vehicle, vehicle.lane_index)
-        own_then = self._acceleration(vehicle, vehicle, ahead)
         route = vehicle.route
         if route and route[0][2] is not None:
             current = vehicle.target_lane_index[2]
             if np.sign(key[2] - current) != np.sign(route[0][2] - current):
                 return False
             return not own_then < limit
-        gain = own_then - self._acceleration(vehicle, vehicle, old_ahead)
-        if vehicle.POLITENESS != 0:
-            behind_now = self._acceleration(vehicle, behind, ahead)
-            old_now = self._acceleration(vehicle, old_behind, vehicle)
-            old_then = self._acceleration(vehicle, old_behind, old_ahead)
+        gain = own_then - own_now
+        if others:
+            behind_now, old_now, old_then = others
             gain = gain + vehicle.POLITENESS * (behind_then - behind_now + old_then - old_now)
         return not gain < vehicle.LANE_CHANGE_MIN_ACC_GAIN
 
-    def _lane_distance(self, row: int, vehicle: Vehicle, other: RoadObject) -> float:
+    def _turn_back(self, row: int) -> None:
+        """The same while a vehicle changes lanes, if somebody else is about to change to the same one."""
+        vehicles = self.crowd.vehicles
+        vehicle = vehicles[row]
+        lane, target = vehicle.lane_index, vehicle.target_lane_index
+        if lane[:2] != target[:2]:
+            return
+        for number, (other, aims) in enumerate(zip(vehicles, self.crowd.aims, strict=True)):
+            if number == row or not aims or other.lane_index == target:
+                continue
+            wanted = other.target_lane_index
+            if number > row:  # who does not yet see the end of its lane
+                wanted = self.before.get(number, wanted)
+            if wanted == target and 0 < self._lane_distance(row, number) < self._desired_gap(row, number):
+                vehicle.target_lane_index = lane
+                return
+
+    def _lane_distance(self, row: int, other: int) -> float:
         """`RoadObject.lane_distance_to`."""
-        lane = self.network.number.get(id(vehicle.lane))
-        if lane is None:
-            return float(vehicle.lane_distance_to(other))
-        return self.frame.coordinates(self.frame.row[id(other)], lane)[0] - self.frame.coordinates(row, lane)[0]
+        lane = int(self.lanes[row])
+        return self.frame.coordinates(other, lane)[0] - self.frame.coordinates(row, lane)[0]
 
-    def _desired_gap(self, row: int, driver: IDMVehicle, vehicle: Vehicle, other: RoadObject) -> float:
-        """`IDMVehicle.desired_gap`, with the driver's parameters."""
-        limit = -driver.COMFORT_ACC_MAX * driver.COMFORT_ACC_MIN
-        faster = self.velocities[row] - self.velocities[self.frame.row[id(other)]]
-        closing = float(np.dot(faster, self.directions[row]))
-        speed = vehicle.speed
-        return float(driver.DISTANCE_WANTED + speed * driver.TIME_WANTED + speed * closing / (2 * math.sqrt(limit)))
+    def _desired_gap(self, row: int, other: int) -> float:
+        """`IDMVehicle.desired_gap`."""
+        rows, others = np.array([row]), np.array([other])
+        return float(self._desired_gaps(rows, rows, others)[0])
 
-    def _acceleration(self, driver: IDMVehicle, vehicle: Vehicle, ahead: RoadObject) -> float:
-        """`IDMVehicle.acceleration`: of a vehicle behind another one, with the driver's parameters."""
-        if not vehicle or not isinstance(vehicle, Vehicle):
-            return 0
-        speed, comfort = vehicle.speed, driver.COMFORT_ACC_MAX
-        ratio = max(speed, 0) / abs(not_zero(_target_speed(vehicle)))
-        wanted = comfort * (1 - float(np.power(ratio, driver.DELTA)))
-        if ahead:
-            row = self.frame.row[id(vehicle)]
-            gap = self._desired_gap(row, driver, vehicle, ahead)
-            distance = self._lane_distance(row, vehicle, ahead)
-            wanted -= comfort * float(np.power(gap / not_zero(distance), 2))
-        return float(wanted)
-
-    def _accelerate_all(self, following: list[tuple[int, IDMVehicle, Vehicle]]) -> list[float]:
-        """The same for many who follow for themselves."""
-        table = np.array([self.following[id(vehicle)] for _, vehicle, _ in following], float).T
-        comfort, braking, delta, distance_wanted, time_wanted = table
-        rows = np.array([row for row, _, _ in following])
-        speed = self.speeds[rows]
-        target = np.array([not_zero(_target_speed(vehicle)) for _, vehicle, _ in following], float)
-        wanted = comfort * (1 - np.power(np.maximum(speed, 0) / np.abs(target), delta))
-        behind = [number for number, (_, _, ahead) in enumerate(following) if ahead]
-        if behind:
-            number_of = self.frame.row
-            some = np.array(behind)
-            own, others = rows[some], np.array([number_of[id(following[number][2])] for number in behind])
-            speed, comfort = speed[some], comfort[some]
-            closing = np.vecdot(self.velocities[own] - self.velocities[others], self.directions[own])
-            limit = -comfort * braking[some]
-            gap = distance_wanted[some] + speed * time_wanted[some] + speed * closing / (2 * np.sqrt(limit))
-            distance = self._lane_distances([following[number] for number in behind], own, others)
-            wanted[some] -= comfort * np.power(gap / distance, 2)
-        found: list[float] = wanted.tolist()
-        return found
-
-    def _lane_distances(
-        self, pairs: list[tuple[int, IDMVehicle, Vehicle]], own: NDArray[np.intp], others: NDArray[np.intp]
+    def _desired_gaps(
+        self, drivers: NDArray[np.intp], whose: NDArray[np.intp], ahead: NDArray[np.intp]
     ) -> NDArray[np.float64]:
-        """`RoadObject.lane_distance_to` of many pairs, of which none is zero."""
-        if len(pairs) < MANY:
-            return np.array([not_zero(self._lane_distance(*pair)) for pair in pairs])
-        number_of, column_of = self.network.number, self.network.axis_column
-        columns = [column_of.get(number_of.get(id(vehicle.lane), -1), -1) for _, vehicle, _ in pairs]
-        if -1 in columns:
-            return np.array([not_zero(self._lane_distance(*pair)) for pair in pairs])
-        along = self.frame.on_axis[0]
-        distance: NDArray[np.float64] = along[others, columns] - along[own, columns]
-        return np.where(np.abs(distance) > 1e-2, distance, np.where(distance >= 0, 1e-2, -1e-2))
+        """The same of many, with their drivers' parameters."""
+        comfort, braking, wanted, time = self.crowd.of_gaps[:, drivers]
+        speed, limit = self.crowd.speeds[whose], -comfort * braking
+        closing = np.vecdot(self.velocities[whose] - self.velocities[ahead], self.directions[whose])
+        gap: NDArray[np.float64] = wanted + speed * time + speed * closing / (2 * np.sqrt(limit))
+        return gap
 
-    def _places(
-        self, steering: list[tuple[int, int | None]], speed: NDArray[np.float64], pursuit: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How far to the side of their lanes vehicles are, and how these run where they look at."""
-        vehicles, column_of = self.road.vehicles, self.network.axis_column
-        columns = [column_of.get(lane, -1) if lane is not None else -1 for _, lane in steering]
-        if len(steering) >= MANY and -1 not in columns:
-            return self.frame.on_axis[1][[row for row, _ in steering], columns], self.network.heading[columns]
-        places, ahead = [], []
-        for (row, lane), v, tau in zip(steering, speed.tolist(), pursuit.tolist(), strict=True):
-            if lane is None:
-                key = vehicles[row].target_lane_index
-                found = self.road.network.get_lane(key)
-                s, r = map(float, found.local_coordinates(vehicles[row].position))
-                ahead.append(float(found.heading_at(s + v * tau)))
-            else:
-                s, r = self.frame.coordinates(row, lane)
-                ahead.append(self.network.heading_at(lane, s + v * tau))
-            places.append(r)
-        return np.array(places), np.array(ahead)
+    def _accelerations(self) -> list[float]:
+        """`IDMVehicle.acceleration` of all that have been asked for."""
+        if not self.asked[0]:
+            return []
+        drivers, whose, ahead = map(np.array, self.asked)
+        low, high = self.network.limit[:, self.lanes]
+        wanted = np.abs(_not_zero(np.array(self.wanted, float).clip(low, high)))
+        comfort, delta = self.crowd.of_speeds[:, drivers]
+        found = comfort * (1 - np.power((np.maximum(self.crowd.speeds, 0)[whose] / wanted[whose]), delta))
+        some = np.flatnonzero(ahead >= 0)
+        if len(some):
+            drivers, whose, ahead = drivers[some], whose[some], ahead[some]
+            lanes = self.lanes[whose]
+            distance = self.frame.coordinates_of(ahead, lanes)[0] - self.frame.coordinates_of(whose, lanes)[0]
+            gap = self._desired_gaps(drivers, whose, ahead)
+            found[some] -= comfort[some] * np.power(gap / _not_zero(distance), 2)
+        listed: list[float] = found.tolist()
+        return listed
 
-    def _steer(self, steering: list[tuple[int, int | None]]) -> list[float]:
+    def _look_again(self, rows: set[int]) -> None:
+        """Find the coordinates of those who may have chosen another lane."""
+        index, vehicles = self.network.index, self.crowd.vehicles
+        for number, row in enumerate(self.rows if rows else ()):
+            if row in rows:
+                lane = self.targets[number] = index[vehicles[row].target_lane_index]
+                self.along[number], self.across[number] = self.frame.coordinates(row, lane)
+
+    def _steer(self) -> list[float]:
         """`ControlledVehicle.steering_control` of many."""
-        vehicles = self.road.vehicles
-        table = np.array([self.steering[id(vehicles[row])] for row, _ in steering], float).T
-        speed, heading, pursuit, lateral, turning, length, most = table
-        places, ahead = self._places(steering, speed, pursuit)
-        speed = np.where(np.abs(speed) > 1e-2, speed, np.where(speed >= 0, 1e-2, -1e-2))
-        command = np.arcsin(np.clip(-lateral * places / speed, -1, 1))
-        reference = ahead + np.clip(command, -np.pi / 4, np.pi / 4)
+        rows = self.rows
+        pursuit, lateral, turning, length, most = self.crowd.of_steering[:, rows]
+        heading, speed = self.crowd.headings[rows], self.crowd.speeds[rows]
+        ahead = self.network.headings_at(self.targets, self.along + speed * pursuit)
+        speed = _not_zero(speed)
+        command = np.arcsin((-lateral * self.across / speed).clip(-1, 1))
+        reference = ahead + command.clip(-np.pi / 4, np.pi / 4)
         rate = turning * wrap_to_pi(reference - heading)
-        slip = np.arcsin(np.clip(length / 2 / speed * rate, -1, 1))
-        found_angles: list[float] = np.clip(np.arctan(2 * np.tan(slip)), -most, most).tolist()
-        return found_angles
+        slip = np.arcsin((length / 2 / speed * rate).clip(-1, 1))
+        angles: list[float] = np.arctan(2 * np.tan(slip)).clip(-most, most).tolist()
+        return angles
+
+
+def _not_zero(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`highway_env.utils.not_zero` of many."""
+    return np.where(np.abs(x) > 1e-2, x, np.where(x >= 0, 1e-2, -1e-2))
+
+
+def _are_speeds(values: Sequence[object]) -> bool:
+    """Whether target speeds are usual numbers, or whole ones of NumPy's that a float holds: out of a list."""
+    return are_numbers(values) or all(map(_is_speed, values))
 
 
 def _is_speed(value: object) -> bool:
-    """Whether a target speed is a usual number, or a whole one of NumPy's that a float holds: one out of a list."""
     return are_numbers((value,)) or (isinstance(value, np.int64) and -_WHOLE < int(value) < _WHOLE)
-
-
-def _target_speed(vehicle: Vehicle) -> float:
-    target = getattr(vehicle, "target_speed", 0)
-    lane = vehicle.lane
-    if lane and lane.speed_limit is not None:
-        return _clip(target, 0, lane.speed_limit)
-    return float(target)
-
-
-def _clip(value: float, low: float, high: float) -> float:
-    """`numpy.clip` of one number; what is not a number stays so."""
-    return float(low if value < low else high if value > high else value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,11 +19,13 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
+    from crashhunt.simulators.accelerator._known import Kind
     from crashhunt.simulators.accelerator._network import Network
 
-__all__ = ["MANY", "Frame", "are_plain"]
+__all__ = ["ASK", "MANY", "NOBODY", "Frame", "are_plain"]
 
 MANY = 12  # from so many on, arrays are faster than one after another
+NOBODY, ASK = -1, -2
 
 
 class Frame:
@@ -31,21 +34,32 @@ class Frame:
     Args:
         network: of the road.
         road: with its vehicles and objects.
+        places: where they are, of shape (things, 2) and in m, if that has been looked at.
+        before: of the same ones earlier, if there is one.
 
     Attributes:
         plain: whether all have a place of the usual kind; otherwise nothing here may be used.
     """
 
-    def __init__(self, network: Network, road: Road) -> None:
+    def __init__(
+        self, network: Network, road: Road, places: NDArray[np.float64] | None = None, before: Frame | None = None
+    ) -> None:
         self.network = network
         self.road = road
-        self.things: list[RoadObject] = road.vehicles + road.objects
         self._looks_further = road.neighbour_vehicles_connected_lanes
-        self.row = {id(thing): row for row, thing in enumerate(self.things)}
-        self.plain = are_plain(self.things)
+        self.things: list[RoadObject]
+        self.row: dict[int, int]
+        if before is None:
+            self.things = road.vehicles + road.objects
+            self.row = {id(thing): row for row, thing in enumerate(self.things)}
+        else:
+            self.things, self.row, self.no_landmark = before.things, before.row, before.no_landmark
+        self.plain = places is not None or are_plain(self.things)
         if not self.plain:
             return
-        self.places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
+        if places is None:
+            places = np.array([thing.position for thing in self.things], float).reshape(-1, 2)
+        self.places = places
         self._columns: dict[int, tuple[list[float], list[float]]] = {}
         self._single: dict[tuple[int, int], tuple[float, float]] = {}
         self._queues: dict[LaneIndex, tuple[list[float], list[RoadObject]]] = {}
@@ -53,12 +67,20 @@ class Frame:
     def is_of(self, road: Road) -> bool:
         """Whether everybody is still there, and where they were."""
         things = road.vehicles + road.objects
-        # By identity: a class of somebody's may call two vehicles equal.
-        if list(map(id, things)) != list(self.row) or self._looks_further != road.neighbour_vehicles_connected_lanes:
-            return False
         if not self.plain or not are_plain(things):
             return False
-        return np.array_equal(np.array([thing.position for thing in things], float).reshape(-1, 2), self.places)
+        places = np.array([thing.position for thing in things], float).reshape(-1, 2)
+        return self.has(things, places)
+
+    def has(self, things: list[RoadObject], places: NDArray[np.float64]) -> bool:
+        """Whether these are everybody, and this is where they were."""
+        # By identity: a class of somebody's may call two vehicles equal.
+        return (
+            self.plain
+            and list(map(id, things)) == list(self.row)
+            and self._looks_further == self.road.neighbour_vehicles_connected_lanes
+            and np.array_equal(places, self.places)
+        )
 
     @cached_property
     def on_axis(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -74,6 +96,42 @@ class Frame:
     def boxes(self) -> NDArray[np.float64]:
         """Lower bounds of the distances of all from the other lanes."""
         return self.network.box_distance(self.places[:, 0], self.places[:, 1])
+
+    @cached_property
+    def _order(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """All who are on a lane along an axis, by lane and by their place there: column of the lane, row, m."""
+        (s, r), network = self.on_axis, self.network
+        on = (np.abs(r) <= network.half_width) & (s >= -5) & (s < network.length + 5) & self.no_landmark[:, None]
+        columns, rows = np.nonzero(on.T)
+        along = s[rows, columns]
+        order = np.lexsort((along, columns))
+        return columns[order], rows[order], along[order]
+
+    @cached_property
+    def ahead(self) -> NDArray[np.intp]:
+        """Who is next on the lanes along an axis, of shape (things, lanes): a row, or one of the two below.
+
+        `NOBODY`, or `ASK` for those who are not on the lane themselves, or where two are in the same place.
+        """
+        columns, rows, along = self._order
+        found = np.full((len(self.things), len(self.network.axis)), ASK)
+        same = columns[1:] == columns[:-1]
+        if not (same & (along[1:] == along[:-1])).any():
+            after = np.full(len(rows), NOBODY)
+            after[:-1][same] = rows[1:][same]
+            found[rows, columns] = after
+        return found
+
+    def coordinates_of(
+        self, rows: Sequence[int] | NDArray[np.intp], lanes: NDArray[np.intp]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coordinates of so many, each on a lane of its own."""
+        columns = self.network.axis_columns[lanes]
+        if len(rows) >= MANY and columns.min() >= 0:
+            s, r = self.on_axis
+            return s[rows, columns], r[rows, columns]
+        pairs = [self.coordinates(row, lane) for row, lane in zip(map(int, rows), lanes.tolist(), strict=True)]
+        return np.array([s for s, _ in pairs]), np.array([r for _, r in pairs])
 
     def coordinates(self, row: int, lane: int) -> tuple[float, float]:
         """Coordinates of one on one lane."""
@@ -143,12 +201,9 @@ class Frame:
 
     def _axis_queue(self, lane: int) -> tuple[list[float], list[RoadObject]]:
         """The same on one lane along an axis alone."""
-        (s, r), column = self.on_axis, self.network.column[lane]
-        s, r = s[:, column], r[:, column]
-        on = (np.abs(r) <= self.network.half_widths[lane]) & (s >= -5) & (s < self.network.lengths[lane] + 5)
-        rows = np.flatnonzero(on & self.no_landmark)
-        rows = rows[s[rows].argsort(kind="stable")]
-        return s[rows].tolist(), [self.things[row] for row in rows.tolist()]
+        columns, rows, along = self._order
+        begin, end = columns.searchsorted((self.network.column[lane], self.network.column[lane] + 1)).tolist()
+        return along[begin:end].tolist(), [self.things[row] for row in rows[begin:end].tolist()]
 
     def _on_lane(self, lane: int) -> list[tuple[float, int]]:
         network = self.network
@@ -182,16 +237,22 @@ class Frame:
         return found
 
 
-def are_plain(things: list[RoadObject]) -> bool:
+def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool:
     """Whether all have a place of the usual kind, which nobody else has; nobody is on the road twice."""
-    if not all(kind.plain for kind in kinds_of(things)):
+    if not all(map(_PLAIN, kinds or kinds_of(things))):
         return False
     positions = [thing.position for thing in things]
     return (
         len(set(map(id, things))) == len(set(map(id, positions))) == len(things)
-        and all(type(position) is np.ndarray and position.dtype is _FLOAT for position in positions)
-        and all(position.shape == (2,) for position in positions)
+        and _ARRAYS.issuperset(map(type, positions))
+        and all(map(_is_place, positions))
     )
 
 
+def _is_place(position: NDArray[np.float64]) -> bool:
+    return position.dtype is _FLOAT and position.shape == (2,)
+
+
+_PLAIN = attrgetter("plain")
 _FLOAT = np.dtype(np.float64)
+_ARRAYS = frozenset((np.ndarray,))

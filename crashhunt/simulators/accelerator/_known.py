@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import highway_env
 import numpy as np
-from highway_env.envs.common import observation
-from highway_env.vehicle import behavior, controller, kinematics, objects
+from highway_env.envs.common import abstract, observation
+from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
 from crashhunt.scenario.backends.highway import ACCELERATED
 from crashhunt.simulators.accelerator._watch import MODULES, is_plain
@@ -20,14 +20,18 @@ from crashhunt.simulators.accelerator._watch import MODULES, is_plain
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-__all__ = ["Kind", "Own", "are_numbers", "kind_of", "kinds_of", "left_alone", "originals", "reason_against"]
+__all__ = [
+    "NUMBERS_OF", "Kind", "Own", "are_numbers", "is_genuine", "kind_of", "kinds_of", "left_alone", "originals",
+    "reason_against",
+]  # fmt: skip
 
-_MODULES = (*MODULES[:1], observation, *MODULES[1:])  # in this order they are digested
+_MODULES = (*MODULES, observation)
 
 _COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
 _MOVES = ("step", "clip_actions", "on_state_update")
 _DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
 _DRIVES += ("change_lane_policy", "mobil")
+_SLIDES = ("state", "derivative_func")
 _PREDICTS = ("predict_trajectory_constant_speed",)
 _DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
 _SPECIAL = (
@@ -46,12 +50,20 @@ _BASES = {
     behavior.IDMVehicle: "idm",
     controller.MDPVehicle: "controlled",
     controller.ControlledVehicle: "controlled",
+    dynamics.BicycleVehicle: "nothing",
     kinematics.Vehicle: "nothing",
     objects.Obstacle: "",
     objects.Landmark: "",
     objects.RoadObject: "",
 }
-_METHODS = frozenset((*_COLLIDES, *_MOVES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
+_OUTLINE: tuple[str, ...] = ("LENGTH", "WIDTH")
+_LIMITED = (*_OUTLINE, "MAX_SPEED", "MIN_SPEED")
+_STEERED = (*_LIMITED, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A")
+_THINKING = (*_STEERED, "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS")
+_THINKING += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
+NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING}
+"""The numbers that classes have for all of their vehicles, as long as none has its own, by how they decide."""
+_METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
 _ORIGINALS = {
     (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
 }
@@ -107,11 +119,14 @@ class Kind:
         plain: whether what it is made of is mere values, wherever they are read.
         collides: whether it collides as that does.
         moves: whether it moves so.
+        slides: whether it moves by the dynamic model, which nobody does at once for many.
         times: whether it counts the time since it last thought of changing lanes.
         drives: how it decides: ``idm``, ``controlled``, ``nothing``; empty where that is not known.
         predicts: whether where it will be is foreseen so.
         describes: whether it describes itself so.
+        base: how its base in highway-env decides.
         methods: all names that an object must not have of its own.
+        fixed: these, and those of the numbers that its objects share, if none of them has its own.
     """
 
     def __init__(self, kind: type) -> None:
@@ -126,12 +141,15 @@ class Kind:
 
         moving = issubclass(kind, kinematics.Vehicle)
         self.collides = leaves(_COLLIDES)
-        self.moves = moving and self.collides and leaves(_MOVES)
+        self.slides = base is dynamics.BicycleVehicle
+        self.moves = moving and self.collides and leaves((*_MOVES, *(_SLIDES if self.slides else ())))
         self.times = base is behavior.IDMVehicle
         self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
-        self.predicts = moving and self.collides and leaves((*_PREDICTS, *_MOVES, *_DRIVES))
+        self.predicts = self.moves and leaves((*_PREDICTS, *_DRIVES))
         self.describes = self.collides and leaves(_DESCRIBES)
+        self.base = _BASES[base] if base is not None else ""
         self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
+        self.fixed = self.methods | frozenset(NUMBERS_OF[self.base])
         if moving and not (self.moves and self.drives):
             own = self.own.names + [
                 name for name in sorted(_METHODS)
@@ -163,7 +181,7 @@ def kinds_of(things: Iterable[object]) -> list[Kind]:
     """Return what is known about the class of each object."""
     types = list(map(type, things))
     known = {kind: kind_of(kind) for kind in set(types)}
-    return [known[kind] for kind in types]
+    return list(map(known.__getitem__, types))
 
 
 _kinds: dict[type, Kind] = {}
@@ -183,7 +201,7 @@ def reason_against() -> str:
     if version not in ACCELERATED:
         return f"highway-env {version} is not known to it; it knows {', '.join(ACCELERATED)}"
     digest = hashlib.blake2b(digest_size=8)
-    for module in _MODULES:
+    for module in (*_MODULES, abstract):  # of the last one, a single function is replaced
         digest.update(Path(str(module.__file__)).read_bytes())
     if digest.hexdigest() != ACCELERATED[version]:
         return f"the installed highway-env {version} is not the published one"
@@ -200,7 +218,13 @@ def reason_against() -> str:
     return ""
 
 
-_FILES = {str(module.__file__) for module in _MODULES}
+_FILES = {str(module.__file__) for module in (*_MODULES, abstract)}
+
+
+def is_genuine(name: str, function: Callable[..., object]) -> bool:
+    """Whether a function is the one that highway-env's source has by this name, such as ``Class.method``."""
+    found = inspect.unwrap(function)
+    return getattr(getattr(found, "__code__", None), "co_filename", "") in _FILES and found.__qualname__ == name
 
 
 def _functions() -> Iterator[tuple[str, Callable[..., object]]]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from itertools import chain
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 from highway_env import utils
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 
-from crashhunt.simulators.accelerator._frame import Frame, are_plain
+from crashhunt.simulators.accelerator._frame import Frame
 from crashhunt.simulators.accelerator._known import are_numbers, kinds_of
 from crashhunt.simulators.accelerator._network import wrap_to_pi
 
@@ -22,64 +21,102 @@ if TYPE_CHECKING:
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
 
+    from crashhunt.simulators.accelerator._crowd import Crowd
+    from crashhunt.simulators.accelerator._known import Kind
     from crashhunt.simulators.accelerator._network import Network
 
     Path = tuple[list[NDArray[np.float64]], list[float]]  # positions and headings that are predicted
 
 __all__ = ["collide", "enforce", "move"]
 
-_OUTLINE = attrgetter("LENGTH", "WIDTH", "heading", "speed", "diagonal")
+_DICTS, _FLOATS = frozenset((dict,)), frozenset((float,))
 _MARGIN = 1e-6  # m; what is nearer than this is left to the exact test
 
 
-def move(road: Road, network: Network, dt: float) -> Frame | None:
-    """Move all vehicles; return where they are then, or None where one of them is not known and nothing was done."""
-    vehicles = road.vehicles
-    kinds = kinds_of(vehicles)
-    if road.record_history or not vehicles or not are_plain(vehicles + road.objects):
+def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) -> Frame | None:
+    """Move all vehicles, of whom it is known how they move, and have the crowd know.
+
+    Args:
+        crowd: the vehicles, where they are.
+        network: the lanes of their road.
+        dt: how long, in s.
+        frame: where they are, if that is known.
+
+    Returns:
+        Where everybody is then, or None where numbers are not of the usual kinds and nothing was done.
+    """
+    vehicles, count = crowd.vehicles, len(crowd.vehicles)
+    actions = [vehicle.action for vehicle in vehicles]
+    if not _DICTS.issuperset(map(type, actions)) or len(set(map(id, actions))) < count:
         return None
-    if not all(
-        kind.moves and kind.is_of(vehicle) and vehicle.road is road and type(vehicle.action) is dict
-        for kind, vehicle in zip(kinds, vehicles, strict=True)
-    ):
+    acts = [action.get("steering") for action in actions] + [action.get("acceleration") for action in actions]
+    if not are_numbers((dt, *acts)):
         return None
-    headings, speeds = [vehicle.heading for vehicle in vehicles], [vehicle.speed for vehicle in vehicles]
-    lengths = [vehicle.LENGTH for vehicle in vehicles]
-    acts = [vehicle.action.get(name) for vehicle in vehicles for name in ("steering", "acceleration")]
-    if not are_numbers((dt, *headings, *speeds, *lengths, *acts)) or 2 * len({id(v.action) for v in vehicles}) < len(
-        acts
-    ):
-        return None
-    for kind, vehicle in zip(kinds, vehicles, strict=True):
-        if kind.times:
-            vehicle.timer += dt
-        _clip_actions(vehicle)
-    heading, speed = np.array(headings, float), np.array(speeds, float)
-    steering = np.array([vehicle.action["steering"] for vehicle in vehicles])
-    half_length = np.array(lengths) / 2
+    for vehicle in crowd.timed:
+        vehicle.timer += dt
+    heading, speed = crowd.headings[:count], crowd.speeds[:count]
+    _clip_all(crowd, acts, speed)
+    steering, acceleration = np.array(acts, float).reshape(2, -1)
     slip = np.arctan(1 / 2 * np.tan(steering))
     course = heading + slip
-    dx, dy = ((speed * np.cos(course)) * dt).tolist(), ((speed * np.sin(course)) * dt).tolist()
-    turned = heading + speed * np.sin(slip) / half_length * dt
-    for row, vehicle in enumerate(vehicles):
+    places = crowd.places.copy()
+    places[:count, 0] += (speed * np.cos(course)) * dt
+    places[:count, 1] += (speed * np.sin(course)) * dt
+    turned = heading + speed * np.sin(slip) / (crowd.numbers["LENGTH"][:count] / 2) * dt
+    faster = speed + acceleration * dt
+    _write(crowd, places, turned.tolist(), faster.tolist())
+    for row in crowd.sliding:
+        _slide(vehicles[row], dt)
+        places[row], turned[row], faster[row] = vehicles[row].position, vehicles[row].heading, vehicles[row].speed
+    crowd.places, crowd.headings[:count], crowd.speeds[:count] = places, turned, faster
+    frame = Frame(network, crowd.road, places, frame)
+    if not np.isfinite(places).all() or not np.isfinite(turned).all():
+        for vehicle in vehicles:
+            vehicle.on_state_update()
+        return frame
+    keys, lanes = network.keys, network.lanes
+    for vehicle, lane in zip(vehicles, _closest(frame, turned), strict=True):
+        vehicle.lane_index = keys[lane]
+        vehicle.lane = lanes[lane]
+    return frame
+
+
+def _slide(vehicle: Vehicle, dt: float) -> None:
+    """Move a vehicle by its own model; the lane that it is on is looked for with everybody else's."""
+    road, vehicle.road = vehicle.road, None
+    try:
+        vehicle.step(dt)
+    finally:
+        vehicle.road = road
+
+
+def _write(crowd: Crowd, places: NDArray[np.float64], headings: list[float], speeds: list[float]) -> None:
+    """Tell vehicles where they are; those that something has hit are pushed, and their places here as well."""
+    for row, (vehicle, (x, y)) in enumerate(zip(crowd.vehicles, places[: len(headings)].tolist(), strict=True)):
+        if row in crowd.sliding:
+            continue
         position = vehicle.position
-        position[0] += dx[row]
-        position[1] += dy[row]
+        position[0] = x
+        position[1] = y
         if vehicle.impact is not None:
             vehicle.position += vehicle.impact
             vehicle.crashed = True
             vehicle.impact = None
-        vehicle.heading = turned[row]
-        vehicle.speed += vehicle.action["acceleration"] * dt
-    frame = Frame(network, road)
-    if not np.isfinite(frame.places).all() or not np.isfinite(turned).all():
-        for vehicle in vehicles:
-            vehicle.on_state_update()
-        return frame
-    for vehicle, lane in zip(vehicles, _closest(frame, turned), strict=True):
-        vehicle.lane_index = network.keys[lane]
-        vehicle.lane = network.lanes[lane]
-    return frame
+            places[row] = vehicle.position
+        vehicle.heading = headings[row]
+        vehicle.speed = speeds[row]
+
+
+def _clip_all(crowd: Crowd, acts: list[float], speed: NDArray[np.float64]) -> None:
+    """`Vehicle.clip_actions` of all where it does something, but for those that do it themselves."""
+    vehicles, numbers, count = crowd.vehicles, crowd.numbers, len(crowd.vehicles)
+    over = (speed > numbers["MAX_SPEED"][:count]) | (speed < numbers["MIN_SPEED"][:count])
+    rows = {*np.flatnonzero(over).tolist(), *[row for row, vehicle in enumerate(vehicles) if vehicle.crashed]}
+    if not _FLOATS.issuperset(map(type, acts)):
+        rows.update([number % count for number, act in enumerate(acts) if type(act) is not float])
+    for row in rows.difference(crowd.sliding):
+        _clip_actions(vehicles[row])
+        acts[row], acts[row + count] = vehicles[row].action["steering"], vehicles[row].action["acceleration"]
 
 
 def _clip_actions(vehicle: Vehicle) -> None:
@@ -130,44 +167,34 @@ def _distance(frame: Frame, row: int, lane: int, heading: float) -> float:
     return frame.network.distance(lane, *frame.coordinates(row, lane), heading)
 
 
-def collide(road: Road, dt: float) -> None:
-    """Let everybody collide with everybody, as `Road.step` does, but without the pairs that cannot touch."""
-    vehicles, things = road.vehicles, road.vehicles + road.objects
-    if not _can_collide(things):
+def collide(road: Road, dt: float, crowd: Crowd) -> bool:
+    """Let everybody collide with everybody, as `Road.step` does, but without the pairs that cannot touch.
+
+    Returns:
+        Whether it is known how all collide; otherwise highway-env's own code has done everything.
+    """
+    pairs = crowd.pairs if crowd.collides else None
+    if pairs is None:
         for number, vehicle in enumerate(road.vehicles):
             for other in road.vehicles[number + 1 :]:
                 vehicle.handle_collisions(other, dt)
             for other in road.objects:
                 vehicle.handle_collisions(other, dt)
-        return
-    count = len(vehicles)
-    places = np.array([thing.position for thing in things], float).reshape(-1, 2)
-    radius = np.array([thing.diagonal for thing in things], float) / 2
-    checks = np.array([thing.check_collisions for thing in things], bool)
-    ghosts = np.array([not thing.collidable for thing in things], bool)
-    speed = np.array([vehicle.speed for vehicle in vehicles], float)
-    # Of two that neither of them look for collisions, nothing is asked.
-    rows = np.arange(len(things))
-    first, second = np.nonzero((rows > rows[:count, None]) & (checks | checks[:count, None]))
-    offset = places[second] - places[first]
-    reach = np.maximum(radius[first] + radius[second] + speed[first] * dt, 0.0) + _MARGIN
-    near = offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1] <= reach * reach
-    near &= ~(ghosts[first] | ghosts[second])
-    near |= ~np.isfinite(offset).all(axis=1)
-    for number in np.flatnonzero(near).tolist():
-        one, two = vehicles[first[number]], things[second[number]]
-        if not _stay_apart(one, two, dt):
-            one.handle_collisions(two, dt)
-
-
-def _can_collide(things: list[RoadObject]) -> bool:
-    """Whether all collide as highway-env has it, and all that this depends on are numbers of the usual kinds."""
-    if not all(kind.collides and kind.is_of(thing) for kind, thing in zip(kinds_of(things), things, strict=True)):
         return False
-    try:
-        return are_plain(things) and are_numbers(chain.from_iterable(map(_OUTLINE, things)))
-    except AttributeError:  # highway-env may never ask for what somebody's object lacks
-        return False
+    asked, apart = pairs
+    (x, y), count = crowd.places.T, len(crowd.vehicles)
+    dx, dy = x - x[:count, None], y - y[:count, None]
+    reach = np.maximum(apart + crowd.speeds[:count, None] * dt, 0.0) + _MARGIN
+    squared = dx * dx + dy * dy
+    near = asked & (squared <= reach * reach)
+    if not np.isfinite(squared).all():
+        near |= asked & ~(np.isfinite(dx) & np.isfinite(dy))
+    if near.any():
+        for first, second in np.argwhere(near).tolist():
+            one, two = crowd.vehicles[first], crowd.things[second]
+            if not _stay_apart(one, two, dt):
+                one.handle_collisions(two, dt)
+    return True
 
 
 def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:
@@ -195,10 +222,8 @@ def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:
 
 def enforce(road: RegulatedRoad) -> bool:
     """`RegulatedRoad.enforce_road_rules`, foreseeing each vehicle once; False where one is not known."""
-    vehicles = road.vehicles
-    if not all(
-        kind.predicts and kind.is_of(vehicle) for kind, vehicle in zip(kinds_of(vehicles), vehicles, strict=True)
-    ):
+    vehicles, kinds = road.vehicles, kinds_of(road.vehicles)
+    if not all(kind.predicts and kind.is_of(vehicle) for kind, vehicle in zip(kinds, vehicles, strict=True)):
         return False
     for vehicle in vehicles:
         if getattr(vehicle, "is_yielding", False):
@@ -211,7 +236,7 @@ def enforce(road: RegulatedRoad) -> bool:
     if len(vehicles) < 2:
         return True
     times = np.arange(0.25, 3, 0.25)
-    foreseen = [vehicle.predict_trajectory_constant_speed(times) for vehicle in vehicles]
+    foreseen = [_foresee(vehicle, kind, times) for vehicle, kind in zip(vehicles, kinds, strict=True)]
     paths = np.array([np.reshape(positions, (len(times), 2)) for positions, _ in foreseen])
     for number, one in enumerate(vehicles[:-1]):
         offset = paths[number + 1 :] - paths[number]
@@ -230,6 +255,23 @@ def enforce(road: RegulatedRoad) -> bool:
                     yielding.is_yielding = True
                     yielding.yield_timer = 0
     return True
+
+
+def _foresee(vehicle: Vehicle, kind: Kind, times: NDArray[np.float64]) -> Path:
+    """`predict_trajectory_constant_speed`, on a copy of the vehicle alone instead of one of the whole road."""
+    if kind.base != "nothing" or vehicle.prediction_type not in ("zero_steering", "constant_steering"):
+        path: Path = vehicle.predict_trajectory_constant_speed(times)
+        return path
+    steering = 0.0 if vehicle.prediction_type == "zero_steering" else vehicle.action["steering"]
+    ahead = copy.copy(vehicle)
+    ahead.road, ahead.position = None, vehicle.position.copy()  # without a road, it looks for no lanes
+    ahead.action = {"acceleration": 0.0, "steering": steering}
+    positions, headings = [], []
+    for dt in np.diff(np.concatenate(([0.0], times))):
+        ahead.step(dt)
+        positions.append(ahead.position.copy())
+        headings.append(ahead.heading)
+    return positions, headings
 
 
 def _conflict(one: Vehicle, two: Vehicle, first: Path, second: Path) -> bool:

@@ -74,14 +74,19 @@ class Network:
         table = np.array(columns, float).reshape(-1, 8).T
         self.start_x, self.start_y, self.along_x, self.along_y, self.across_x, self.across_y = table[:6]
         self.length, self.heading = table[6:]
+        self.every_length = np.array([lane.length for lane in self.lanes], float)
         self.lengths = [float(lane.length) for lane in self.lanes]
         self.half_widths = [float(lane.width) / 2 + _ON_LANE_MARGIN for lane in self.lanes]
         self.widths = [float(lane.width) for lane in self.lanes]
+        self.half_width = np.array(self.half_widths)[straight]  # as `length` and `heading`, of those along an axis
+        self.limit = np.array([_limits(lane.speed_limit) for lane in self.lanes]).T
         boxes = np.array([_box(self.lanes[number]) for number in self.others]).reshape(-1, 4)
         self.low_x, self.low_y, self.high_x, self.high_y = boxes.T
-        #: a lane's place among the columns of the arrays of lanes along an axis, and of the others
-        self.axis_column = {number: column for column, number in enumerate(self.axis.tolist())}
-        self.column = self.axis_column | {number: column for column, number in enumerate(self.others)}
+        self.axis_columns = np.full(len(self.lanes), -1)
+        self.axis_columns[self.axis] = np.arange(len(self.axis))
+        #: a lane's place among the columns of the arrays of lanes along an axis, or of the others
+        self.column = {number: column for column, number in enumerate(self.axis.tolist())}
+        self.column |= {number: column for column, number in enumerate(self.others)}
 
     def is_of(self, network: RoadNetwork) -> bool:
         """Whether the network still has these very lanes, in these places, and they are what they were."""
@@ -130,6 +135,14 @@ class Network:
             return float((lane.direction * s / lane.radius + lane.start_phase) + np.pi / 2 * lane.direction)
         return float(lane.heading_at(s))
 
+    def headings_at(self, numbers: NDArray[np.intp], s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The headings of lanes, each at a longitudinal coordinate."""
+        columns = self.axis_columns[numbers]
+        if not len(columns) or columns.min() >= 0:
+            found: NDArray[np.float64] = self.heading[columns]
+            return found
+        return np.array([self.heading_at(number, at) for number, at in zip(numbers.tolist(), s.tolist(), strict=True)])
+
     def distance(self, number: int, s: float, r: float, heading: float) -> float:
         """How far a vehicle is from a lane, its heading counted in, as highway-env weighs it."""
         length = self.lengths[number]
@@ -161,6 +174,11 @@ def _laid_out(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[Ab
 
 def _values(lanes: list[AbstractLane]) -> list[tuple[object, ...]]:
     return [tuple(vars(lane).values()) if type(lane) in _KNOWN else () for lane in lanes]
+
+
+def _limits(speed_limit: float | None) -> tuple[float, float]:
+    """Between which a driver's speed is kept on a lane, in m/s."""
+    return (0.0, float(speed_limit)) if speed_limit is not None else (-math.inf, math.inf)
 
 
 def _reach() -> list[float]:

@@ -12,7 +12,7 @@ import numpy as np
 from highway_env import utils
 from highway_env.envs.common import observation
 from highway_env.road import lane, regulation, road
-from highway_env.vehicle import behavior, controller, kinematics, objects
+from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MODULES", "Watch", "is_plain"]
 
-MODULES = (utils, lane, regulation, road, behavior, controller, kinematics, objects)
+MODULES = (utils, lane, regulation, road, behavior, controller, dynamics, kinematics, objects)
 """In which everything matters to the accelerator; of `observation`, a few classes do."""
 
 _NUMPY = (

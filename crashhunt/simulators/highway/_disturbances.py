@@ -39,6 +39,11 @@ class HighwayDisturbances:
         self._controlled = controlled
         self._erring: list[_Errs] = []
 
+    @property
+    def anybody(self) -> bool:
+        """Whether somebody errs at the moment."""
+        return bool(self._erring)
+
     def before_moving(self, dt: float) -> None:
         """Overrule what erring vehicles have decided, in the sub-step that follows."""
         for errs in self._erring:

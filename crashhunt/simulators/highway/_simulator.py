@@ -31,7 +31,7 @@ from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, n
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
-from crashhunt.simulators.accelerator import switch_off, switch_on
+from crashhunt.simulators.accelerator import Onlooker, switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._hidden import Hidden
@@ -318,14 +318,9 @@ class HighwaySimulator:
 
     def _watch(self) -> None:
         """Note who hit whom in the very sub-step in which it happens: what moves on is pushed apart, and brakes."""
-        road = self._env.road
-        advance = road.step
-
         erring = self._disturbances
 
-        def step(dt: float) -> None:
-            erring.before_moving(dt)
-            advance(dt)
+        def after() -> None:
             erring.after_moving()
             for agent, vehicle in self._controlled.items():
                 if vehicle.crashed and agent not in self._crashed:
@@ -333,7 +328,10 @@ class HighwaySimulator:
                     lane = self._lane_name(vehicle.lane_index)
                     self._contacts.append(contact_of(agent, vehicle, self._objects(), self._actor, lane))
 
-        road.step = step
+        road = self._env.road
+        road.step = Onlooker(
+            road.step, before=erring.before_moving, after=after, interferes=lambda: erring.anybody
+        )  # fmt: skip
 
     def _objects(self) -> list[RoadObject]:
         """Everybody and everything that can be hit."""
