@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import secrets
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import ArgumentError, ScenarioError, UsageError
+from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
@@ -23,7 +24,7 @@ from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from crashhunt.disturbances import Disturber
     from crashhunt.plans._request import Request
@@ -54,8 +55,9 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
     options |= {
         "seed": request.seed if request.seed is not None else secrets.randbits(32),
         "crash_on": crash_on,
-        "disturb": _disturb(request, scenario),
     }
+    with _said_by(request, scenario):
+        options["disturb"] = _disturb(request, scenario)
     settings = HuntSettings(
         **options,
         scenario=str(request.scenario),
@@ -72,7 +74,8 @@ def plan(request: Request) -> tuple[Scenario, HuntSettings]:
         acting = {agent: replace(chosen, action=request.action) for agent, chosen in settings.agents.items()}
         settings = replace(settings, agents=acting)
     scenario = _with_untold(_noted(scenario, request.run), crash_on)
-    disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
+    with _said_by(request, scenario):
+        disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
     _check_branch(settings)
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
@@ -160,6 +163,18 @@ def sampler_of(settings: HuntSettings) -> NamedSampler:
     """
     hunt = HuntFacts(settings.seed, settings.crash_on)
     return NamedSampler(settings.sampler, settings.space, points=settings.points, hunt=hunt)
+
+
+@contextmanager
+def _said_by(request: Request, scenario: Scenario) -> Iterator[None]:
+    """Whoever has disturbances from a scenario, and not from the command line, is told so where something is wrong."""
+    try:
+        yield
+    except CrashhuntError as error:
+        if request.disturb:
+            raise
+        message = error.message.replace("--disturb", "[disturbances]", 1)
+        raise type(error)(message, fix=error.fix, where=error.where or scenario.origin) from error
 
 
 def _disturb(request: Request, scenario: Scenario) -> tuple[str, ...]:

@@ -167,7 +167,8 @@ def _value(where: str, field: str, text: str) -> Any:
     except ValueError:
         value = math.nan
     if not (0 <= value < math.inf) or (field == "how_long" and value == 0):
-        raise ArgumentError(f"{where}: {text!r} is none", fix="give a number above 0")
+        least = "seconds above 0" if field == "how_long" else "a number from 0 on"
+        raise ArgumentError(f"{where}: {text!r} is none", fix=f"give {least}")
     return value
 
 

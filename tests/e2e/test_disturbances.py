@@ -91,7 +91,11 @@ def test_a_scenario_says_it_and_none_takes_it_back(toy):
     hunt(toy, "--disturb", "none", "--overwrite", trials="2")
     assert "\ndisturb" not in (toy.folder / "h" / "hunt.toml").read_text()
     file.write_text(f"{before}\n[disturbances]\nbraek = 0.5\n")
-    assert "did you mean 'brake'" in hunt_refused(toy)
+    said = hunt_refused(toy)
+    assert "[disturbances]: there is no disturbance 'braek'; did you mean 'brake'" in said
+    assert "scenario.toml" in said
+    file.write_text(f"{before}\n[disturbances]\nbrake = -1\n")
+    assert "[disturbances] brake=-1.0: '-1.0' is no rate" in hunt_refused(toy)
 
 
 def test_another_rate_is_another_hunt_and_a_rerun_keeps_its_own(toy):
@@ -136,7 +140,7 @@ def test_what_cannot_be_meant_is_one_line_before_the_hunt(toy, words, says):
         ("disturbances=some", "'some' is not none"),
         ("disturbances.0.how_strong=2", "none begins at step '0'"),
         ("disturbances.{step}.how=2", "'how' is nothing to change"),
-        ("disturbances.{step}.how_long=0", "give a number above 0"),
+        ("disturbances.{step}.how_long=0", "give seconds above 0"),
         ("disturbances.{step}.who=above", "'above' is no place"),
         ("disturbances.{step}.who=itself", "brake is not about 'itself'"),
         ("disturbances.stop@{step}=none", "none begins at step '7'; they begin at brake@7"),

@@ -113,13 +113,16 @@ def test_disturbances_that_took_place_are_compared():
         return change
 
     step, agent, field, was, now = found(2, brakes(3.0))
-    assert (step, agent, field, was) == (2, "", "disturbance", "[]")
-    assert "'how_strong': 3.0" in now
-    both = [changed(2, brakes(strong)) for strong in (3.0, 3.0, 4.0)]
+    assert (step, agent, field, was) == (2, "", "disturbance", "nothing")
+    assert now == "bus brakes with 3 m/s² for 1 s (ahead of ego)"
+    both = [changed(2, brakes(strong)) for strong in (3.0, 3.0, 4.0, 3.0001)]
     assert first_divergence(both[0], both[1]) is None
     divergence = first_divergence(both[0], both[2])
-    assert "3.0" in divergence.recorded
-    assert "4.0" in divergence.replayed
+    assert "3 m/s²" in divergence.recorded
+    assert "4 m/s²" in divergence.replayed
+    divergence = first_divergence(both[0], both[3])  # in words the same
+    assert "'how_strong': 3.0," in divergence.recorded
+    assert "'how_strong': 3.0001," in divergence.replayed
 
 
 @pytest.mark.parametrize(("column", "place"), [("x", 0), ("y", 1), ("heading", 2), ("speed", 3)])

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["TYPE", "encode_disturbance"]
 
 _NAME = "disturbance"
+_NOTHING = "nothing"
 
 
 def encode_disturbance(disturbance: Disturbance) -> bytes:
@@ -29,8 +30,14 @@ def _read(reading: Reading, _aux: int, payload: bytes) -> None:
 
 
 def _difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
-    was, now = (str([one.to_json() for one in step.more.get(_NAME, ())]) for step in (left, right))
-    return Divergence(left.step, "", _NAME, was, now) if was != now else None
+    each = [step.more.get(_NAME, ()) for step in (left, right)]
+    exact = [str([one.to_json() for one in some]) for some in each]
+    if exact[0] == exact[1]:
+        return None
+    was, now = ["; ".join(f"{one.words} ({one.place})" for one in some) or _NOTHING for some in each]
+    if was == now:  # such as two strengths that are rounded alike
+        was, now = exact
+    return Divergence(left.step, "", _NAME, was, now)
 
 
 TYPE = RecordType(12, _NAME, "/disturbances", TextForm(), _read, _difference)
