@@ -54,6 +54,18 @@ struct Collision {
 };
 typedef std::vector<Collision> (*Collisions)();
 
+// A vehicle itself, of SUMO's class MSVehicle: looked up once instead of by name for each of its values.
+struct Place { // SUMO's Position, which has a destructor, and so is returned by way of memory
+    double x, y, z;
+    ~Place() {}
+};
+typedef const void *(*VehicleOf)(const std::string &);
+typedef bool (*TruthOf)(const void *);
+typedef Place (*PlaceOf)(const void *, double);
+typedef double (*ValueOf)(const void *);
+typedef double (*Conversion)(double);
+typedef const void *(*Singleton)();
+
 struct Sumo {
     PositionOf position;
     NumberOf angle, speed;
@@ -67,6 +79,13 @@ struct Sumo {
     Count departed, arrived, vanishing, appearing, on_foot, emergencies;
     Collisions collisions;
     Names everybody;
+    VehicleOf vehicle;
+    TruthOf is_visible;
+    PlaceOf place;
+    ValueOf turned, drives;
+    Conversion degrees;
+    Singleton net;
+    const char *vehicle_table; // that of the virtual functions of MSVehicle, and of nothing derived from it
     bool bound;
 };
 Sumo sumo = {};
@@ -116,7 +135,15 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZN7libsumo7Vehicle9getLaneIDE" STRING, found.lane) &&
                  find(library, "_ZN7libsumo7Vehicle11getFollowerE" STRING "d", found.follower) &&
                  find(library, "_ZN7libsumo7Vehicle8setSpeedE" STRING "d", found.set_speed) &&
-                 find(library, "_ZN7libsumo4Lane8getAngleE" STRING "d", found.lane_angle);
+                 find(library, "_ZN7libsumo4Lane8getAngleE" STRING "d", found.lane_angle) &&
+                 find(library, "_ZN7libsumo6Helper10getVehicleE" STRING, found.vehicle) &&
+                 find(library, "_ZN7libsumo7Vehicle9isVisibleEPK11SUMOVehicle", found.is_visible) &&
+                 find(library, "_ZNK9MSVehicle11getPositionEd", found.place) &&
+                 find(library, "_ZNK9MSVehicle8getAngleEv", found.turned) &&
+                 find(library, "_ZNK9MSVehicle8getSpeedEv", found.drives) &&
+                 find(library, "_ZN10GeomHelper10naviDegreeEd", found.degrees) &&
+                 find(library, "_ZN5MSNet11getInstanceEv", found.net) &&
+                 find(library, "_ZTV9MSVehicle", found.vehicle_table);
     dlclose(library); // Python keeps it loaded
     if (!whole) {
         return nullptr;
@@ -192,6 +219,9 @@ bool pairs(PyObject *list, std::vector<double> &values) {
 struct Roster {
     std::vector<std::string> ids;
     std::vector<double> lengths, widths, reaches;
+    // The vehicles themselves, as of when they were looked up last; empty where they are of another class of SUMO's.
+    mutable std::vector<const void *> found;
+    mutable const void *net = nullptr;
 };
 struct Vehicles {
     PyObject_HEAD Roster *roster;
@@ -372,12 +402,40 @@ double fastest(const Scene &scene) {
     return most;
 }
 
+// Looks vehicles up by name; throws what libsumo's getters throw.
+void find_vehicles(const Roster &roster) {
+    roster.found.clear();
+    roster.net = sumo.net();
+    for (const std::string &id : roster.ids) {
+        const void *vehicle = sumo.vehicle(id);
+        // The first two words of the table are none of its functions.
+        if (*static_cast<const char *const *>(vehicle) != sumo.vehicle_table + 2 * sizeof(void *)) {
+            roster.found.clear(); // such as those of sumo-gui
+            return;
+        }
+        roster.found.push_back(vehicle);
+    }
+}
+
 // What libsumo says about vehicles now; throws what its getters throw.
-void read_into(const Roster &roster, std::vector<double> &values) {
+// Where they are still those that were found last, they are not looked up.
+void read_into(const Roster &roster, std::vector<double> &values, bool still = false) {
     const size_t count = roster.ids.size();
     values.resize(4 * count);
+    if (!still || roster.net != sumo.net()) {
+        find_vehicles(roster);
+    }
     for (size_t row = 0; row < count; row++) {
         const std::string &id = roster.ids[row];
+        const void *vehicle = roster.found.empty() ? nullptr : roster.found[row];
+        if (vehicle && sumo.is_visible(vehicle)) {
+            const Place place = sumo.place(vehicle, 0.0);
+            values[2 * row] = place.x;
+            values[2 * row + 1] = place.y;
+            values[2 * count + row] = (90.0 - sumo.degrees(sumo.turned(vehicle))) * (3.141592653589793 / 180.0);
+            values[3 * count + row] = sumo.drives(vehicle);
+            continue;
+        }
         const Position place = sumo.position(id, false);
         values[2 * row] = place.x;
         values[2 * row + 1] = place.y;

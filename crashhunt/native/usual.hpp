@@ -42,7 +42,7 @@ struct Steps {
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
     // of the present roster, and of the step that is complete
-    bool ready = false, stopped = false;
+    bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
     Vehicles *vehicles = nullptr;
     PyObject *ids = nullptr;
     std::vector<char> controlled;
@@ -231,8 +231,12 @@ struct Steps {
             if (sumo.lane_index(agent) != lane_index || sumo.road(agent) != road) {
                 return SIMULATED;
             }
-            read_into(*vehicles->roster, next.values);
+            // A vehicle that goes is told of in the step in which it does, if it is one step that has been taken.
             next.time_s = sumo.time();
+            const bool still = known && !sumo.arrived() && fabs(next.time_s - now.time_s - step_s) < step_s / 2;
+            known = false;
+            read_into(*vehicles->roster, next.values, still);
+            known = true;
             next.lanes.clear();
             const Scene present(next.values, vehicles->roster), last(now.values, vehicles->roster);
             if ((number % LANES_EVERY == 0 && !note_lanes(next.lanes)) ||
@@ -290,6 +294,11 @@ struct Steps {
 
     PyObject *go_on(bool quiet) {
         simulating = true;
+        try {
+            known = known && !sumo.arrived(); // whom the agent itself has taken away is told of until the next step
+        } catch (...) {
+            known = false;
+        }
         PyObject *done = PyObject_CallMethodNoArgs(libsumo, simulate);
         if (!done) {
             return nullptr;
@@ -434,6 +443,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     steps.from_left = from_left;
     steps.follower = follower;
     steps.step = step;
+    steps.known = false;
     steps.ready = true;
     Py_RETURN_NONE;
 }

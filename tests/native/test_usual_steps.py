@@ -398,15 +398,26 @@ def test_what_sumo_raises_is_told(street, monkeypatch):
     assert "kind='simulator error'" in result
 
 
-def test_an_agent_that_takes_itself_off_the_road_is_told_of(street):
+MEDDLING = {
+    "goes": lambda libsumo: libsumo.vehicle.remove("ego"),
+    "takes somebody away": lambda libsumo: libsumo.vehicle.remove("behind"),
+    "simulates": lambda libsumo: [libsumo.vehicle.remove("behind"), libsumo.simulationStep()],
+    "simulates for long": lambda libsumo: [libsumo.simulationStep() for _ in range(9)],
+    "moves somebody": lambda libsumo: libsumo.vehicle.moveTo("behind", "west_0", 5.0),
+}
+
+
+@pytest.mark.parametrize("what", MEDDLING)
+def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what):
     import libsumo
 
-    def leave(step, _):
-        if step == 20:
-            libsumo.vehicle.remove("ego")
+    def meddle(step, _):
+        if step == 22:
+            MEDDLING[what](libsumo)
         return 8.0, 0
 
-    street.both(leave)
+    street.both(meddle)
+    assert street.comes[DONE] > 10
 
 
 @pytest.mark.parametrize("place", range(13))
