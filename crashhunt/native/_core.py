@@ -26,7 +26,7 @@ __all__ = [
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 5
+_INTERFACE = 6
 """Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
@@ -237,7 +237,7 @@ class Core(Protocol):
 
     def may_be_near(
         self, parts: list[Part], gap: float, horizon: float, gap_so_far: float, time_so_far: float,
-        braking_so_far: float, /,
+        braking_so_far: float, only_best: bool, /,
     ) -> tuple[bytes, bytes] | None:  # fmt: skip
         """Return who has a part in the closest approach, and perhaps some who have not.
 
@@ -250,6 +250,8 @@ class Core(Protocol):
             gap_so_far: who is further apart may be left out, in m.
             time_so_far: who touches later may be left out, in s,
             braking_so_far: if that takes less braking than this as well, in m/s².
+            only_best: whether whoever is further away, touches later and takes less braking than others may be left
+                out too.
 
         Returns:
             Columns one after another, float64 and int64: x, y, heading, speed, half the length, half the width; the
@@ -257,7 +259,7 @@ class Core(Protocol):
         """
 
     def tracks(
-        self, parts: list[Part], every: int, within: float, /
+        self, parts: list[Part], every: int, within: float, ahead: float, behind: float, unknown: float, /
     ) -> tuple[tuple[bytes, bytes], tuple[bytes, bytes]] | None:
         """Return where an agent was, and who was near it.
 
@@ -265,6 +267,9 @@ class Core(Protocol):
             parts: of an episode, in order.
             every: of how many scenes one is looked at.
             within: how near, between fronts and without the lengths of both, in m.
+            ahead: where it is not 0, those are left out who do not touch the way of the agent up to here, in m,
+            behind: nor back to here, in m.
+            unknown: how far straight on its way is taken to go at its end, in m.
 
         Returns:
             Twice columns one after another, float64 and int64, for the agent and for the others: x, y, heading, half

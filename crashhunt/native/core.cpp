@@ -919,27 +919,113 @@ PyObject *both(PyObject *one, PyObject *two) {
     return pair;
 }
 
-// may_be_near(parts, gap, horizon, gap so far, time so far, braking so far) -> (numbers, places) | None
+// A pair of outlines as NumPy measures it in crashhunt/world/_geometry.py, up to what that rounds otherwise.
+struct Pair {
+    double x, y, vx, vy, c, s, one_l, one_w, two_l, two_w; // as seen from the first; c and s of the turn
+
+    // As rectangle_gap.
+    double gap() const {
+        const double far = fabs(c), wide = fabs(s);
+        const double apart = std::max(std::max(fabs(x) - one_l - two_l * far - two_w * wide,
+                                               fabs(y) - one_w - two_l * wide - two_w * far),
+                                      std::max(fabs(x * c + y * s) - two_l - one_l * far - one_w * wide,
+                                               fabs(y * c - x * s) - two_w - one_l * wide - one_w * far));
+        if (apart <= 0) {
+            return 0;
+        }
+        const double back_x = -(x * c + y * s), back_y = x * s - y * c;
+        double nearest = HUGE_VAL;
+        const auto outside = [&](double px, double py, double length, double width) {
+            const double dx = std::max(fabs(px) - length, 0.0), dy = std::max(fabs(py) - width, 0.0);
+            nearest = std::min(nearest, dx * dx + dy * dy);
+        };
+        for (int corner = 0; corner < 4; corner++) {
+            const double along = corner & 1 ? 1 : -1, across = corner & 2 ? 1 : -1;
+            double px = along * two_l, py = across * two_w;
+            outside(x + px * c - py * s, y + px * s + py * c, one_l, one_w);
+            px = along * one_l, py = across * one_w;
+            outside(back_x + px * c + py * s, back_y - px * s + py * c, two_l, two_w);
+        }
+        return sqrt(nearest);
+    }
+
+    // As time_to_contact: from when to when that may be, infinite where they surely never touch within a horizon; sure
+    // is whether they do, and now whether they overlap already.
+    void contact(double horizon, double &soonest, double &latest, bool &sure, bool &now) const {
+        const double far = fabs(c), wide = fabs(s);
+        const double axes[4][3] = {{1, 0, one_l + two_l * far + two_w * wide},
+                                   {0, 1, one_w + two_l * wide + two_w * far},
+                                   {c, s, two_l + one_l * far + one_w * wide},
+                                   {-s, c, two_w + one_l * wide + one_w * far}};
+        double enter = -HUGE_VAL, leave = HUGE_VAL, loose = SLACK;
+        sure = true;
+        now = false;
+        soonest = latest = HUGE_VAL;
+        for (const double(&axis)[3] : axes) {
+            const double distance = x * axis[0] + y * axis[1], speed = vx * axis[0] + vy * axis[1], reach = axis[2];
+            const double slack = SLACK * (1 + fabs(x) + fabs(y) + reach);
+            if (fabs(speed) < SLACK) { // it hardly moves on this axis, for as long as anybody looks
+                const double room = reach - fabs(distance), most = slack + SLACK * 4 * horizon;
+                if (room < -most) {
+                    sure = false;
+                    return;
+                }
+                sure = sure && room > most;
+                continue;
+            }
+            const double first = (-reach - distance) / speed, last = (reach - distance) / speed;
+            loose = std::max(loose, slack * (1 + 1 / fabs(speed)) + 1e-9 * (fabs(first) + fabs(last)));
+            enter = std::max(enter, std::min(first, last));
+            leave = std::min(leave, std::max(first, last));
+        }
+        if (std::max(enter, 0.0) - loose > leave + loose || enter - loose > horizon) {
+            sure = false;
+            return;
+        }
+        now = sure && enter < -loose && leave > loose;
+        enter = std::max(enter, 0.0);
+        sure = sure && enter + loose < leave - loose && enter + loose < horizon;
+        soonest = std::max(0.0, enter - loose);
+        latest = enter + loose;
+    }
+};
+
+// may_be_near(parts, gap, horizon, gap so far, time so far, braking so far, only the best) -> (numbers, places) | None
 // The conditions of `approaches` in crashhunt/world/_approach.py with some slack: who fulfils them there does so here.
+// Where only the best is asked for, those are left out who are surely not as near, in any way, as somebody else.
 PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 6) {
-        PyErr_SetString(PyExc_TypeError, "may_be_near takes parts and five numbers");
+    if (count != 7) {
+        PyErr_SetString(PyExc_TypeError, "may_be_near takes parts, five numbers and a truth");
         return nullptr;
     }
     const double gap = PyFloat_AsDouble(given[1]), horizon = PyFloat_AsDouble(given[2]);
-    const double gap_so_far = PyFloat_AsDouble(given[3]), time_so_far = PyFloat_AsDouble(given[4]);
-    const double braking_so_far = PyFloat_AsDouble(given[5]);
+    double best_gap = PyFloat_AsDouble(given[3]), best_time = PyFloat_AsDouble(given[4]);
+    double best_braking = PyFloat_AsDouble(given[5]);
+    const bool only_best = given[6] == Py_True;
     std::vector<Part> parts;
     if (PyErr_Occurred() || !read_parts(given[0], parts)) {
         return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
     }
     struct Body {
-        double x, y, vx, vy, reach, apart;
+        double x, y, vx, vy, c, s, reach, apart;
+    };
+    // Who may be near, with what is surely not exceeded: the least gap, the soonest contact, the hardest braking.
+    struct Candidate {
+        const Part *part;
+        const double *line;
+        int64_t step;
+        size_t actor;
+        double gap, time, braking;
     };
     std::vector<Body> bodies;
-    std::vector<std::vector<double>> found(6); // x, y, heading, speed, half length, half width
-    std::vector<std::vector<int64_t>> places(2); // the scene, and where the agent is among those found
+    std::vector<Candidate> candidates;
+    // Nobody who surely touches nobody is sooner or harder than anybody.
+    const auto beaten = [&](const Candidate &one) {
+        return (one.gap > best_gap || one.gap == HUGE_VAL) && (one.time > best_time || one.time == HUGE_VAL) &&
+               (one.braking < best_braking || one.braking == 0);
+    };
     int64_t step = -1;
+    bool touched = only_best && best_gap == 0 && best_time == 0; // those that overlap are all as near
     for (const Part &part : parts) {
         const size_t actors = part.actors, own = static_cast<size_t>(part.own);
         bodies.resize(actors);
@@ -951,29 +1037,22 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
             const double *line = part.scene(scene);
             for (size_t actor = 0; actor < actors; actor++) {
                 const double heading = line[2 * actors + actor], speed = line[3 * actors + actor];
-                const double c = cos(heading), s = sin(heading), half = part.lengths[actor] / 2;
-                bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s,
-                                 std::hypot(half, part.widths[actor] / 2), 0.0};
+                const double half = part.lengths[actor] / 2, wide = part.widths[actor] / 2;
+                double c, s;
+                sincos(heading, &s, &c);
+                bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s, c, s,
+                                 sqrt(half * half + wide * wide), 0.0};
             }
             const Body me = bodies[own];
-            double best = gap_so_far;
+            double best = best_gap;
             for (size_t actor = 0; actor < actors; actor++) {
                 Body &body = bodies[actor];
-                body.apart = std::hypot(body.x - me.x, body.y - me.y);
-                if (actor != own && body.apart - me.reach - body.reach < gap) {
+                const double dx = body.x - me.x, dy = body.y - me.y;
+                body.apart = sqrt(dx * dx + dy * dy);
+                if (actor != own && body.apart - me.reach - body.reach < gap - SLACK * (1 + body.apart)) {
                     best = std::min(best, body.apart - part.widths[actor] / 2 - part.widths[own] / 2);
                 }
             }
-            const size_t before = found[0].size();
-            const auto keep = [&](size_t actor) {
-                const double values[] = {line[2 * actor], line[2 * actor + 1], line[2 * actors + actor],
-                                         line[3 * actors + actor], part.lengths[actor] / 2, part.widths[actor] / 2};
-                for (size_t column = 0; column < 6; column++) {
-                    found[column].push_back(values[column]);
-                }
-                places[0].push_back(step);
-                places[1].push_back(static_cast<int64_t>(before));
-            };
             for (size_t actor = 0; actor < actors; actor++) {
                 if (actor == own) {
                     continue;
@@ -989,29 +1068,199 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
                                       fabs(dx * vy - dy * vx) > reach * speed + scale ||
                                       bound > horizon * speed + scale ||
                                       // As near as they come, it is no sooner and no harder than once before.
-                                      (bound > slack && bound - slack > time_so_far * (speed + scale) &&
-                                       (speed + scale) * (speed + scale) < 2 * (bound - slack) * braking_so_far);
-                if (!(far && harmless)) {
-                    if (found[0].size() == before) {
-                        keep(own);
-                    }
-                    keep(actor);
+                                      (bound > slack && bound - slack > best_time * (speed + scale) &&
+                                       (speed + scale) * (speed + scale) < 2 * (bound - slack) * best_braking);
+                if (far && harmless) {
+                    continue;
                 }
+                const auto stood = [&](size_t one) { // since the scene before, which has been looked at
+                    const double *was = line - 4 * actors;
+                    return scene && was[2 * one] == line[2 * one] && was[2 * one + 1] == line[2 * one + 1] &&
+                           was[2 * actors + one] == line[2 * actors + one] &&
+                           was[3 * actors + one] == line[3 * actors + one];
+                };
+                if (only_best && stood(actor) && stood(own)) {
+                    continue;
+                }
+                Candidate found = {&part, line, step, actor, -HUGE_VAL, -HUGE_VAL, HUGE_VAL};
+                if (only_best && std::isfinite(body.apart) && std::isfinite(speed)) {
+                    const Pair pair = {dx * me.c + dy * me.s,
+                                       dy * me.c - dx * me.s,
+                                       vx * me.c + vy * me.s,
+                                       vy * me.c - vx * me.s,
+                                       body.c * me.c + body.s * me.s,
+                                       body.s * me.c - body.c * me.s,
+                                       part.lengths[own] / 2,
+                                       part.widths[own] / 2,
+                                       part.lengths[actor] / 2,
+                                       part.widths[actor] / 2};
+                    found.gap = far ? HUGE_VAL : pair.gap() - slack;
+                    if (!far && bound < gap - slack) {
+                        best_gap = std::min(best_gap, found.gap + 2 * slack);
+                    }
+                    found.time = HUGE_VAL;
+                    found.braking = 0;
+                    if (!harmless) {
+                        double latest;
+                        bool sure, now;
+                        pair.contact(horizon, found.time, latest, sure, now);
+                        if (now && bound < -slack && speed > scale) {
+                            if (touched) {
+                                continue;
+                            }
+                            touched = true;
+                        }
+                        // What NumPy leaves out for being far from a collision course counts for nothing here either.
+                        sure = sure && -(dx * vx + dy * vy) > scale && fabs(dx * vy - dy * vx) < reach * speed - scale &&
+                               bound < horizon * speed - scale;
+                        found.braking = found.time > 0 ? (speed + scale) / (2 * found.time) : HUGE_VAL;
+                        if (sure) {
+                            best_time = std::min(best_time, latest);
+                            best_braking = found.time > 0 ? std::max(best_braking, (speed - scale) / (2 * latest))
+                                                          : best_braking;
+                        }
+                    }
+                    if (beaten(found)) {
+                        continue;
+                    }
+                }
+                candidates.push_back(found);
             }
         }
+    }
+    std::vector<std::vector<double>> found(6); // x, y, heading, speed, half length, half width
+    std::vector<std::vector<int64_t>> places(2); // the scene, and where the agent is among those found
+    const auto keep = [&](const Candidate &one, size_t actor, int64_t agent) {
+        const size_t actors = one.part->actors;
+        const double values[] = {one.line[2 * actor],          one.line[2 * actor + 1],
+                                 one.line[2 * actors + actor], one.line[3 * actors + actor],
+                                 one.part->lengths[actor] / 2, one.part->widths[actor] / 2};
+        for (size_t column = 0; column < 6; column++) {
+            found[column].push_back(values[column]);
+        }
+        places[0].push_back(one.step);
+        places[1].push_back(agent);
+    };
+    int64_t agent = 0, last = -1;
+    for (const Candidate &one : candidates) {
+        if (beaten(one)) {
+            continue; // by somebody after it
+        }
+        if (one.step != last) {
+            last = one.step;
+            agent = static_cast<int64_t>(places[0].size());
+            keep(one, static_cast<size_t>(one.part->own), agent);
+        }
+        keep(one, one.actor, agent);
     }
     return both(bytes_of(found), bytes_of(places));
 }
 
-// tracks(parts, every, within) -> (numbers, places) | None, each a pair for the agent and for the others
-// As `_straight` of crashhunt/world/_tracks.py, of every so many scenes.
+// The way of an agent as _Way of crashhunt/world/_danger.py has it, up to what NumPy rounds otherwise: enough to rule out
+// that others touch it.
+struct Way {
+    std::vector<double> x, y, heading, along, half_length, half_width, reach;
+    double end = 0, spacing = 0;
+    bool known = true;
+
+    void add(const double *line, size_t actors, size_t row, double length, double width) {
+        const double angle = line[2 * actors + row];
+        x.push_back(line[2 * row] - length / 2 * cos(angle));
+        y.push_back(line[2 * row + 1] - length / 2 * sin(angle));
+        const double turn = heading.empty() ? 0.0 : remainder(angle - heading.back(), TAU);
+        known = known && fabs(turn) < 3.0; // NumPy unwraps half a turn to one side or the other
+        heading.push_back(heading.empty() ? angle : heading.back() + turn);
+        half_length.push_back(length / 2);
+        half_width.push_back(width / 2);
+        reach.push_back(sqrt(length * length + width * width) / 2);
+    }
+
+    void finish(double unknown) {
+        double driven = 0;
+        for (size_t sample = 0; sample < x.size(); sample++) {
+            driven += sample ? std::hypot(x[sample] - x[sample - 1], y[sample] - y[sample - 1]) : 0;
+            along.push_back(driven + 1e-9 * static_cast<double>(sample));
+        }
+        if (x.empty()) {
+            return;
+        }
+        const double last = heading.back();
+        x.push_back(x.back() + unknown * cos(last));
+        y.push_back(y.back() + unknown * sin(last));
+        heading.push_back(last);
+        along.push_back(along.back() + unknown);
+        end = along.back();
+        known = known && std::isfinite(end);
+        spacing = std::min(std::max(1.6 * *std::min_element(half_length.begin(), half_length.end()), 1.0), 4.0);
+    }
+
+    // How far two outlines are apart, on the axis where that is most.
+    double apart(size_t sample, double dx, double dy, double angle, double length, double width, double turned) const {
+        const double c = cos(angle), s = sin(angle), turn_c = cos(turned - angle), turn_s = sin(turned - angle);
+        const double along_x = dx * c + dy * s, across = dy * c - dx * s, far = fabs(turn_c), wide = fabs(turn_s);
+        const double own_l = half_length[sample], own_w = half_width[sample];
+        double found = fabs(along_x) - own_l - length * far - width * wide;
+        found = std::max(found, fabs(across) - own_w - length * wide - width * far);
+        found = std::max(found, fabs(along_x * turn_c + across * turn_s) - length - own_l * far - own_w * wide);
+        return std::max(found, fabs(across * turn_c - along_x * turn_s) - width - own_l * wide - own_w * far);
+    }
+
+    // Whether somebody, of whom the front and half sizes are given, may be touched on one of the places that are looked
+    // at, ahead of a sample (or behind it, with a negative spacing). What is not a number may.
+    bool touches(size_t sample, double gap, double far, double fx, double fy, double angle, double length,
+                 double width) const {
+        // From the front, until that is near: the middle is as far from it as half the length.
+        const double around = reach[sample] + sqrt(length * length + width * width) + length;
+        const double slack = SLACK * (1 + fabs(fx) + fabs(fy) + end);
+        const long places = 3 * (static_cast<long>(far / (3 * fabs(gap))) + 1);
+        size_t segment = std::min(sample, along.size() - 2);
+        for (long place = 0; place < places;) {
+            const double at = along[sample] + gap * static_cast<double>(place);
+            if (at > end + slack || at < along[0] - slack) {
+                return false;
+            }
+            while (segment + 2 < along.size() && along[segment + 1] < at) {
+                segment++;
+            }
+            while (segment > 0 && along[segment] > at) {
+                segment--;
+            }
+            const double share = (at - along[segment]) / (along[segment + 1] - along[segment]);
+            double dx = fx - (x[segment] + share * (x[segment + 1] - x[segment]));
+            double dy = fy - (y[segment] + share * (y[segment + 1] - y[segment]));
+            const double room = sqrt(dx * dx + dy * dy) - around;
+            if (room > 2 * far + 100) {
+                return false;
+            }
+            if (room > slack) { // nobody gets there in less than that
+                place += std::max(1L, static_cast<long>((room - slack) / fabs(gap)));
+                continue;
+            }
+            double c, s;
+            sincos(angle, &s, &c);
+            dx -= length * c;
+            dy -= length * s;
+            const double own = heading[segment] + share * (heading[segment + 1] - heading[segment]);
+            if (!(apart(sample, dx, dy, own, length, width, angle) > slack)) {
+                return true;
+            }
+            place++;
+        }
+        return false;
+    }
+};
+
+// tracks(parts, every, within, ahead, behind, unknown) -> (numbers, places) | None, each a pair for the agent and the others
+// As `_straight` of crashhunt/world/_tracks.py, of every so many scenes. Where a distance ahead is given, those are left
+// out whom the agent would not touch so far ahead of it and behind it, on its way and as much further straight on.
 PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 3) {
-        PyErr_SetString(PyExc_TypeError, "tracks takes parts and two numbers");
+    if (count != 6) {
+        PyErr_SetString(PyExc_TypeError, "tracks takes parts and five numbers");
         return nullptr;
     }
     const long long every = PyLong_AsLongLong(given[1]);
-    const double within = PyFloat_AsDouble(given[2]);
+    const double within = PyFloat_AsDouble(given[2]), ahead = PyFloat_AsDouble(given[3]);
+    const double behind = PyFloat_AsDouble(given[4]), unknown = PyFloat_AsDouble(given[5]);
     std::vector<Part> parts;
     if (PyErr_Occurred() || every < 1 || !read_parts(given[0], parts)) {
         return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
@@ -1019,6 +1268,21 @@ PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
     std::vector<std::vector<double>> own(5), others(5); // x, y, heading, half length, half width
     std::vector<std::vector<int64_t>> steps(1), pairs(2); // the scene; the sample and whose
     int64_t step = -1, sample = -1;
+    Way way;
+    if (ahead > 0) {
+        for (const Part &part : parts) {
+            const size_t row = static_cast<size_t>(part.own);
+            for (size_t scene = 0; scene < part.scenes; scene++) {
+                step++;
+                if (part.own >= 0 && step % every == 0) {
+                    way.add(part.scene(scene), part.actors, row, part.lengths[row], part.widths[row]);
+                }
+            }
+        }
+        way.finish(unknown);
+        step = -1;
+    }
+    const bool chosen = ahead > 0 && way.known;
     for (const Part &part : parts) {
         const size_t actors = part.actors, row = static_cast<size_t>(part.own);
         for (size_t scene = 0; scene < part.scenes; scene++) {
@@ -1041,6 +1305,15 @@ PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
                 const double dx = line[2 * actor] - line[2 * row], dy = line[2 * actor + 1] - line[2 * row + 1];
                 const double reach = within + 2 * (part.lengths[actor] / 2) + 2 * (part.lengths[row] / 2);
                 if (actor != row && dx * dx + dy * dy < reach * reach) {
+                    if (chosen) {
+                        const size_t number = static_cast<size_t>(sample);
+                        const double x = line[2 * actor], y = line[2 * actor + 1], angle = line[2 * actors + actor];
+                        const double half = part.lengths[actor] / 2, wide = part.widths[actor] / 2;
+                        if (!way.touches(number, way.spacing, ahead, x, y, angle, half, wide) &&
+                            !way.touches(number, -way.spacing, behind, x, y, angle, half, wide)) {
+                            continue;
+                        }
+                    }
                     put(others, actor);
                     pairs[0].push_back(sample);
                     pairs[1].push_back(part.numbers[actor]);

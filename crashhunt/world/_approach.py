@@ -46,7 +46,7 @@ class ApproachMeter:
         """Take scenes in."""
         for agent in self._agents:
             so_far = self.closest
-            times, gaps, brakes = approaches(frames, agent, so_far)
+            times, gaps, brakes = approaches(frames, agent, so_far, only_best=True)
             self.closest = ClosestApproach(
                 min(so_far.time_to_collision_s, float(times.min(initial=math.inf))),
                 min(so_far.gap_m, float(gaps.min(initial=math.inf))),
@@ -63,7 +63,7 @@ def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestA
 
 
 def approaches(
-    frames: Sequence[Frame], agent: str, so_far: ClosestApproach = _NOTHING
+    frames: Sequence[Frame], agent: str, so_far: ClosestApproach = _NOTHING, *, only_best: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return, for each scene, how near the agent is to the nearest danger.
 
@@ -71,6 +71,7 @@ def approaches(
         frames: in order.
         agent: the controlled vehicle; scenes without it are as safe as can be.
         so_far: what does not come nearer than this in any way may be left out.
+        only_best: what does not come nearer than another scene does, too.
 
     Returns:
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
@@ -78,7 +79,7 @@ def approaches(
     """
     count = sum(len(frame.columns) for frame in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-    whole = _near_block(frames, agent, so_far) or _whole_block(frames, agent, so_far)
+    whole = _near_block(frames, agent, so_far, only_best) or _whole_block(frames, agent, so_far)
     if whole is None or not len(whole.x):
         return times, gaps, brakes
     heading, speed, half, number, own = whole.heading, whole.speed, whole.half, whole.step, whole.own
@@ -162,14 +163,14 @@ def _whole_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -
     return _Block(*(np.concatenate(columns) for columns in zip(*blocks, strict=True))) if blocks else None
 
 
-def _near_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -> _Block | None:
+def _near_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach, only_best: bool = False) -> _Block | None:
     """Those only who may be near, as the core finds them; None where it does not."""
     core = core_of(frames)
     if core is None:
         return None
     parts = [part_of(frame, agent, frame.roster.rows) for frame in frames]
     least = so_far.gap_m, so_far.time_to_collision_s, so_far.required_deceleration
-    found = core.may_be_near(parts, _GAP_M, _HORIZON_S, *least)
+    found = core.may_be_near(parts, _GAP_M, _HORIZON_S, *least, only_best)
     if found is None:
         return None
     x, y, heading, speed, *half = np.frombuffer(found[0]).reshape(6, -1)

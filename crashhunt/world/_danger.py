@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crashhunt.world._outlines import LEVEL_M
-from crashhunt.world._tracks import spacing_s, ways
+from crashhunt.world._tracks import Reach, spacing_s, ways
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -108,7 +108,8 @@ class DangerMeter:
     def _summed(self, until: int) -> dict[str, float | None]:
         sums = dict(self._sums)
         for agent, before in self._sums.items():
-            measured = _measured(self._frames, agent, self._dt)
+            # Whoever is not touched adds nothing to the sum.
+            measured = _measured(self._frames, agent, self._dt, Reach(AHEAD_M, _BEHIND_M, _UNKNOWN_M))
             if measured is not None:
                 times, found, *_ = measured
                 fresh = (times > (self._done - 0.5) * self._dt) & (times < (until - 0.5) * self._dt)
@@ -158,10 +159,10 @@ def summed_danger(integral_s: float) -> float:
 
 
 def _measured(
-    frames: Sequence[Frame], agent: str, step_length_s: float
+    frames: Sequence[Frame], agent: str, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Array, Array, NDArray[np.intp], list[str]] | None:
     """Times, dangers and who else, of each sample; and the names of these."""
-    seen = ways(frames, agent, AHEAD_M, step_length_s)
+    seen = ways(frames, agent, AHEAD_M, step_length_s, reach)
     if seen is None:
         return None
     track, others, names = seen
@@ -248,9 +249,10 @@ class _Way:
         # A stretch of several places at a time; those of the agent are the same for all who are near it at one instant.
         stretch = _PLACES * spacing
         middles = stretch * (np.arange(int(far / abs(stretch)) + 1) + 0.5) - spacing / 2
-        at = self.along[:, None] + middles
+        samples, of = np.unique(others.sample, return_inverse=True)
+        at = self.along[samples, None] + middles
         at[(at < self._at[0] - far) | (at > self._at[-1] + far)] = np.nan
-        x, y = np.interp(at, self._at, self._x)[others.sample], np.interp(at, self._at, self._y)[others.sample]
+        x, y = np.interp(at, self._at, self._x)[of], np.interp(at, self._at, self._y)[of]
         x -= others.x[:, None]
         y -= others.y[:, None]
         around = reach + abs(stretch) / 2
@@ -319,6 +321,8 @@ def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tu
     block, depth, who = np.full(count, np.inf), np.zeros(count), np.full(count, -1)
     order = np.argsort(-ahead, kind="stable")  # of each sample, the one that is left last is the nearest
     order = order[np.isfinite(ahead[order])]
+    if not len(order):
+        return depth, who
     turn = np.abs(np.cos(others.heading - track.heading[others.sample]))
     deep = 2 * (track.half_length[others.sample] + others.half_length * turn + others.half_width * np.sqrt(1 - turn**2))
     at = others.sample[order]

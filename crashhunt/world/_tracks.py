@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["Others", "Track", "sampled", "spacing_s", "tracks", "ways"]
+__all__ = ["Others", "Reach", "Track", "sampled", "spacing_s", "tracks", "ways"]
 
 _APART_S = 0.3  # of the samples, at least: nobody gets far in it, and every step costs time
 _AT_MOST_S = 0.3  # where a step is longer, there are samples between two scenes
@@ -129,10 +129,32 @@ def _between(columns: Array, share: Array) -> Array:
     return found
 
 
+class Reach(NamedTuple):
+    """Who is of no interest: whoever does not touch the agent's way.
+
+    Args:
+        ahead: how far along it, in m; 0 where everybody is.
+        behind: how far back, in m.
+        unknown: how far straight on it is taken to go at its end, in m.
+    """
+
+    ahead: float = 0.0
+    behind: float = 0.0
+    unknown: float = 0.0
+
+
 def ways(
-    frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float
+    frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Track, Others, list[str]] | None:
-    """Return what `tracks` returns of scenes at regular instants, from the core where it can."""
+    """Return what `tracks` returns of scenes at regular instants, from the core where it can.
+
+    Args:
+        frames: of an episode.
+        agent: the controlled vehicle.
+        within_m: as of `tracks`.
+        step_length_s: in s.
+        reach: the core may leave out whoever is of no interest, and numbers nobody.
+    """
     core = core_of(frames)
     if core is None or _between_steps(step_length_s) > 1:
         return tracks(list(sampled(frames, step_length_s)), agent, within_m)
@@ -142,11 +164,12 @@ def ways(
     for frame in frames:
         whose = frame.roster.rows
         after = step + len(frame.columns)
-        if agent in frame.roster.index and -(-step // every) * every < after:  # it has a sample
+        # Where it has a sample; who somebody is says nothing where only some are of interest.
+        if reach is None and agent in frame.roster.index and -(-step // every) * every < after:
             whose = [numbers.setdefault(actor.id, len(numbers)) for actor in frame.roster.actors]
         parts.append(part_of(frame, agent, whose))
         step = after
-    found = core.tracks(parts, every, within_m)
+    found = core.tracks(parts, every, within_m, *(reach or Reach()))
     if found is None:
         return tracks(list(sampled(frames, step_length_s)), agent, within_m)
     (own, steps), (theirs, pairs) = found

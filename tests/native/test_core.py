@@ -21,8 +21,9 @@ from crashhunt.scenario import ObservationSetup, argument_values, load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.simulators import Kinematics
 from crashhunt.trial import CRASHES, TrialSpec
-from crashhunt.world import Actor, ApproachMeter, Roster, Scene, approaches, joined_frame
-from crashhunt.world._tracks import ways
+from crashhunt.world import Actor, ApproachMeter, DangerMeter, Roster, Scene, approaches, joined_frame
+from crashhunt.world._danger import _Way
+from crashhunt.world._tracks import Reach, ways
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
@@ -135,7 +136,7 @@ def test_of_many_far_away_nobody_is_looked_at():
 
     def found(row, *so_far, columns=frame):
         part = (columns, row, [5.0] * 4, [2.0] * 4, [0, 1, 2, 3])
-        return core.may_be_near([part], 50.0, 10.0, *(so_far or (math.inf, math.inf, 0.0)))
+        return core.may_be_near([part], 50.0, 10.0, *(so_far or (math.inf, math.inf, 0.0)), False)
 
     numbers, places = found(0)
     ahead = [0.0, 0.0, 0.0, 20.0, 2.5, 1.0], [30.0, 0.0, 0.0, 5.0, 2.5, 1.0]
@@ -154,7 +155,7 @@ def test_whoever_is_near_enough_leaves_out_those_further_away():
     # Outlines 45.6 m and 49.5 m away, and within 50 m it is the one ahead that is nearest, by 49 m at the most.
     frame = np.array([[0.0, 0.0, 51.0, 0.0, 0.0, 54.9, *[0.0] * 3, *[9.0] * 3]])
     part = (frame, 0, [5.0] * 3, [2.0] * 3, [0, 1, 2])
-    numbers, _ = core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0)
+    numbers, _ = core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0, False)
     assert np.frombuffer(numbers).reshape(6, -1)[:2].T.tolist() == [[0.0, 0.0], [51.0, 0.0]]
 
 
@@ -162,9 +163,9 @@ def test_scenes_without_the_agent_count_and_others_keep_their_numbers():
     frame = np.array([[0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 5.0, 5.0]] * 2)
     part = (frame, 1, [5.0] * 2, [2.0] * 2, [7, 4])
     absent = (frame, -1, *part[2:])
-    _, places = core.may_be_near([absent, part], 50.0, 10.0, math.inf, math.inf, 0.0)
+    _, places = core.may_be_near([absent, part], 50.0, 10.0, math.inf, math.inf, 0.0, False)
     assert np.frombuffer(places, np.int64).reshape(2, -1).tolist() == [[2, 2, 3, 3], [0, 0, 2, 2]]
-    (_, steps), (_, others) = core.tracks([absent, part], 1, 20.0)
+    (_, steps), (_, others) = core.tracks([absent, part], 1, 20.0, 0.0, 0.0, 0.0)
     assert np.frombuffer(steps, np.int64).tolist() == [2, 3]
     assert np.frombuffer(others, np.int64).reshape(2, -1).tolist() == [[0, 1], [7, 7]]
 
@@ -178,10 +179,10 @@ def test_a_part_that_is_not_whole_is_left_to_python():
     for place, instead in odd.items():
         for one in instead:
             part = (*whole[:place], one, *whole[place + 1 :])
-            assert core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0) is None
-            assert core.tracks([part], 1, 20.0) is None
+            assert core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0, False) is None
+            assert core.tracks([part], 1, 20.0, 0.0, 0.0, 0.0) is None
     for every in (0, -1):
-        assert core.tracks([tuple(whole)], every, 20.0) is None
+        assert core.tracks([tuple(whole)], every, 20.0, 0.0, 0.0, 0.0) is None
 
 
 @settings(deadline=None, max_examples=60)
@@ -193,6 +194,74 @@ def test_the_ways_that_were_driven_are_the_same(episodes, step_length_s):
         ours = ways([frame._replace(core=core) for frame in frames], agent, 100.0, step_length_s)
         theirs = ways(frames, agent, 100.0, step_length_s)
         assert repr_of(ours) == repr_of(theirs)
+
+
+def driven(seed, scenes=60, cars=14, step_s=0.1):
+    """An agent on a winding way, those beside it, those who cross it and some who stand about."""
+    draw = np.random.default_rng(seed)
+    at, turns = np.zeros(2), draw.uniform(-0.04, 0.04, scenes) * draw.integers(0, 2)
+    angle, speed = float(draw.uniform(-3.2, 3.2)), float(draw.choice([0.0, 3.0, 12.0, 30.0]))
+    own = []
+    for turn in turns:
+        angle = (angle + turn + math.pi) % math.tau - math.pi  # as SUMO's, they jump somewhere
+        at = at + speed * step_s * np.array([math.cos(angle), math.sin(angle)])
+        own.append((*at, angle, speed))
+    middle = np.array(own[scenes // 2][:2])
+    rows = [own]
+    for _ in range(cars):
+        start, heading = (
+            middle + draw.normal(0, 25, 2),
+            float(draw.choice([angle, angle + math.pi, draw.uniform(-3, 3)])),
+        )
+        fast = float(draw.choice([0.0, 2.0, 10.0, 20.0]))
+        way = np.arange(scenes)[:, None] * fast * step_s * np.array([math.cos(heading), math.sin(heading)])
+        rows.append([(*(start + moved), heading, fast) for moved in way])
+    sizes = [(float(draw.choice([0.6, 4.5, 12.0])), float(draw.choice([0.6, 1.8, 2.5]))) for _ in rows]
+    roster = Roster(tuple(Actor(str(row), "passenger", *size) for row, size in enumerate(sizes)))
+    values = np.array(rows).transpose(1, 0, 2)  # scene, actor, value
+    columns = np.concatenate([values[:, :, :2].reshape(scenes, -1), values[:, :, 2], values[:, :, 3]], axis=1)
+    return [joined_frame(roster, part, [None] * len(part)) for part in np.split(columns, [scenes // 3])]
+
+
+def test_the_danger_is_the_same_to_the_bit():
+    found, kept, all_of_them = [], 0, 0
+    for seed in range(16):
+        frames = driven(seed)
+        ours, theirs = (DangerMeter(["0"], 0.1) for _ in range(2))
+        ours.add([frame._replace(core=core) for frame in frames])
+        theirs.add(frames)
+        assert ours.danger == theirs.danger
+        found.append(ours.danger)
+        fast = [frame._replace(core=core) for frame in frames]
+        _, some_others, _ = ways(fast, "0", 100.0, 0.1, Reach(100.0, 30.0, 10.0))
+        track, others, _ = ways(frames, "0", 100.0, 0.1)
+        way = _Way(track, flat=True)
+        touched = np.isfinite(np.minimum(*way.first_contacts(others)))
+        left = set(zip(some_others.sample.tolist(), some_others.who.tolist(), strict=True))
+        assert left.issuperset(zip(others.sample[touched].tolist(), others.who[touched].tolist(), strict=True))
+        kept, all_of_them = kept + len(left) - int(touched.sum()), all_of_them + len(others.sample)
+    assert 0.0 in found
+    assert max(found) > 0.2
+    assert kept < all_of_them / 20  # of those who are not touched
+
+
+def test_the_closest_of_many_scenes_is_the_same_to_the_bit():
+    kept, found = 0, []
+    for seed in range(100, 150):
+        frames = driven(seed)
+        ours, theirs = ApproachMeter(["0"]), ApproachMeter(["0"])
+        for frame in frames:  # the second knows of the first
+            ours.measure([frame._replace(core=core)])
+            theirs.measure([frame])
+            assert ours.closest == theirs.closest
+        found.append(ours.closest)
+        parts = [(frame.columns, 0, frame.roster.lengths, frame.roster.widths, frame.roster.rows) for frame in frames]
+        numbers, _ = core.may_be_near(parts, 50.0, 10.0, math.inf, math.inf, 0.0, True)
+        kept += len(numbers) // 48
+    assert any(one.gap_m == 0 for one in found)
+    assert any(one.gap_m > 1 and one.time_to_collision_s < 5 for one in found)
+    assert any(one.required_deceleration > 1 for one in found)
+    assert kept < 50 * 8  # two rows are the least there can be: one for the agent, one for who is nearest
 
 
 def repr_of(seen):
