@@ -148,7 +148,7 @@ class Place:
 
 def asking(crashes: tuple[Outcome, ...]) -> tuple[Prober, Brancher]:
     """Return what asks copies of a trial, and raises `FoundError` at the first that crashes by disturbance."""
-    from crashhunt.episode import Brancher, Prober
+    from crashhunt.episode import BUDGET_BESIDE, Brancher, Prober
     from crashhunt.trial import in_turn
 
     class Probes(Prober):
@@ -166,7 +166,7 @@ def asking(crashes: tuple[Outcome, ...]) -> tuple[Prober, Brancher]:
             branch = self._branches.crashes[-1]
             raise FoundError("a branch", episode.steps, branch.disturbances, branch.outcome, branch.step)
 
-    return Probes(PROBE_S, crashes, lambda _: None), Branches(RATES, crashes, lambda _: None)
+    return Probes(PROBE_S, crashes, lambda _: None, BUDGET_BESIDE), Branches(RATES, crashes, lambda _: None)
 
 
 def measure(problem: str, first: int, last: int, most: int) -> None:

@@ -6,7 +6,13 @@ from ._nearness import Nearness as Nearness
 from ._observer import Observer as Observer
 from ._overruled import Braking as Braking, Keeping as Keeping, overruled_agent as overruled_agent
 from ._parts import Parts as Parts, require_origin as require_origin, seal as seal
-from ._probes import PROBED as PROBED, Probed as Probed, Prober as Prober
+from ._probes import (
+    BUDGET as BUDGET,
+    BUDGET_BESIDE as BUDGET_BESIDE,
+    PROBED as PROBED,
+    Probed as Probed,
+    Prober as Prober,
+)
 from ._recorder import Recorder as Recorder
 from ._run import (
     generators as generators,

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
-__all__ = ["BUDGET", "PROBED", "Probed", "Prober"]
+__all__ = ["BUDGET", "BUDGET_BESIDE", "PROBED", "Probed", "Prober"]
 
 BUDGET: Final = 4
 """Steps that copies may take for each step of their trial."""
+BUDGET_BESIDE: Final = 1
+"""The same where the trial branches as well, which finds crashes in fewer steps."""
 _HORIZON_S = 5.0  # of simulation time, for which a copy is followed
 _SHARES = 16  # of the worst, to which the mildest is found
 _HALF = _SHARES // 2
@@ -100,13 +102,17 @@ class Prober:
         every_s: how often, in s of simulation time.
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
+        budget: steps that copies may take for each step of their trial.
 
     Attributes:
         why_not: why copies cannot be asked any more, in words; empty where they can.
     """
 
-    def __init__(self, every_s: float, crash_on: Sequence[Outcome], delay: Callable[[float], None]) -> None:
+    def __init__(
+        self, every_s: float, crash_on: Sequence[Outcome], delay: Callable[[float], None], budget: int = BUDGET
+    ) -> None:
         self._every_s = every_s
+        self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
         self.why_not = ""
@@ -136,7 +142,7 @@ class Prober:
             self.why_not = error.message
 
     def _is_spent(self, episode: Episode) -> bool:
-        return self._stress.steps >= BUDGET * episode.steps
+        return self._stress.steps >= self._budget * episode.steps
 
     def _questions(self, episode: Episode) -> list[_Question]:
         """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""

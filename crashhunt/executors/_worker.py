@@ -25,6 +25,8 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.processes import adopt_orphans, end_descendants
 from crashhunt.episode import (
+    BUDGET,
+    BUDGET_BESIDE,
     Brancher,
     FirstCopy,
     Parts,
@@ -80,7 +82,8 @@ class Worker:
         self.used = False
         self._pid = os.getpid()
         self._is_copy = False
-        self._prober = Prober(settings.probe_s, settings.crash_on, self._delay) if settings.probe_s else None
+        budget = BUDGET_BESIDE if settings.branch else BUDGET
+        self._prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget) if settings.probe_s else None
         about = settings.branch, settings.crash_on, self._delay, self._notice
         self._brancher = Brancher(*about) if settings.branch else None
         self._first_copy = FirstCopy(self._no_copies) if settings.probe_s or settings.branch else None

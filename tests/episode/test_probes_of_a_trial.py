@@ -9,7 +9,7 @@ import pytest
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import members
-from crashhunt.episode import Prober
+from crashhunt.episode import BUDGET_BESIDE, Prober
 from crashhunt.simulators import Disturbs
 from crashhunt.trial import CRASHES, Disturbance, Outcome, TrialResult, TrialSpec
 
@@ -192,6 +192,10 @@ def test_copies_take_four_times_the_steps_of_their_trial_and_others_are_left_out
     asker.ask(road)
     assert [one.what for one in road.asked] == ["stop", "late_action"]
     assert stress_of(asker).left_out == 3 + 3
+    beside = Prober(2.0, CRASHES, lambda _: None, BUDGET_BESIDE)  # of a trial that branches as well
+    road.asked.clear()
+    beside.ask(road)
+    assert [one.what for one in road.asked] == ["brake"]
     # The next trial has a budget of its own, and begins with the first kind.
     road.asked.clear()
     road.steps = 13  # 52 steps
