@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,8 @@ SAME_WAY = math.radians(45)
 _LATELY_S = 1.5
 _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
+_STRAIGHT = math.radians(10)
+_DRIFTS_M = 0.1
 _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 
 
@@ -185,6 +188,21 @@ class Case:
             found = float(self.times[back])
         return found
 
+    def turns_off_s(self, leader: str) -> float | None:
+        """How long before the contact a leader left the way of a follower that drove straight on; None if it did not.
+
+        It had been in its way before, as long as is known.
+        """
+        lead, follow = self.way(leader), self.way(self.partner(leader))
+        straight = bool(np.ptp(follow.headings) < _STRAIGHT) and self.ahead_m(leader) > 0
+        before = abs(math.remainder(lead.headings[0] - follow.headings[0], math.tau))
+        if not straight or before >= _STRAIGHT or self.turn < _STRAIGHT:
+            return None
+        asides = [abs(self.aside_m(leader, back)) for back in range(len(self.before))]
+        left = next((back for back, aside in enumerate(asides) if aside > _BESIDE_M), len(asides))
+        parting = all(after > before - _DRIFTS_M for before, after in pairwise(asides[max(0, left - 1) :]))
+        return float(self.times[left - 1]) if left > 0 and parting else None
+
     def changed_s(self, actor: str) -> float | None:
         """How long before the contact an actor last came from one lane into the next, or was about to; None if not."""
         return self._changes[actor]
@@ -221,6 +239,20 @@ class Case:
             abs(self.aside_m(actor, place)) > _BESIDE_M
             for place in range(back + 1)
             if self.times[place] - self.times[back] <= _BEFORE_S
+        )
+
+    def is_between_junctions(self, *actors: str) -> bool:
+        """Whether all of them were on roads of SUMO's, in none of its junctions, in the last seconds."""
+        lanes = {
+            actor: [
+                scene.lanes[scene.roster.index[actor]]
+                for scene in self.scenes
+                if scene.lanes and actor in scene.roster.index and scene.time_s >= self.time_s - _WINDOW_S
+            ]
+            for actor in actors
+        }
+        return all(
+            bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes.values()
         )
 
     def slowed(self, actor: str, since_s: float) -> float:

@@ -37,6 +37,9 @@ _AT_ONCE_S = 1.5  # nobody who drives behind can do anything about what comes so
 _TOGETHER_S = 0.5  # of each other: neither was there first
 _STANDS = 0.1  # m/s
 _STANDS_S = 1.0
+_STEP_M = 1.0  # beside a car; who is nearer walks in its way
+_OFF_M = 2.5  # beside the middle of a car; who is nearer may be on the road
+_WALKS = 3.0  # m/s; whoever drives so slowly can stop for anybody
 _RED_S = 8.0  # after a red light, a junction is left by then
 _EARLY_S = 1.0  # what crashes so soon was put there
 
@@ -116,6 +119,8 @@ def _lane_change(case: Case) -> Finding | None:
     if case.follower == changer:
         if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
             return None
+        if case.turn >= _MERGES or not case.was_beside(changer, int(np.argmin(np.abs(case.times - before)))):
+            return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
         return Finding("lane change", _who(case, changer), words, source)
     return _cut_in(case, changer, before, source)
@@ -156,6 +161,45 @@ def _rear_end(case: Case) -> Finding | None:
     return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
 
 
+def _turns_off(case: Case) -> Finding | None:
+    """Who drove straight on into the back of somebody who had been ahead for long, and was turning off."""
+    if _rear_end(case) is not None:
+        return None  # it says the same
+    for leader in (case.agent, case.other):
+        follower = case.partner(leader)
+        if case.follower == leader or is_person(leader) or is_person(follower) or case.times[0] < _FOLLOWS_S:
+            continue
+        left_s = case.turns_off_s(leader)
+        if left_s is None or left_s > _AT_ONCE_S:
+            continue
+        lead = case.way(leader)
+        if case.hardest_braking(leader) > _IMPOSSIBLE or float(lead.speeds.min()) < -_STANDS:
+            continue
+        words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
+        words += " and was turning off"
+        return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1)")
+    return None
+
+
+def _steps_out(case: Case) -> Finding | None:
+    """A person who came onto the road so late that nobody could have stopped; not at junctions and their crossings."""
+    person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
+    if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
+        return None
+    asides = [abs(case.aside_m(person, back)) for back in range(len(case.before))]
+    way, reach = case.way(driver), case.way(driver).width / 2 + _STEP_M
+    inside = next((back for back in range(len(asides) - 1, -1, -1) if asides[back] > reach), -1) + 1
+    if not 0 < inside < len(asides) or max(asides[:inside]) < _OFF_M or case.times[inside] > _AT_ONCE_S:
+        return None  # it was there all the time, walked along the edge of the road, or is beside still
+    speed, gap = float(way.speeds[inside]), case.gap_m(person, inside)
+    stops = speed * _RESPONSE_S + speed * speed / (2 * _BRAKES_HARD)
+    if gap >= stops or speed < _WALKS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
+        return None
+    words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
+    words += f", which needs {stops:.1f} m to stop"
+    return Finding("steps out", _who(case, person), words, "Vienna, article 20 (6); StVO § 25 (3)")
+
+
 def _standing(case: Case) -> Finding | None:
     """Who drove into somebody who had stood for longer than stopping takes."""
     for actor in (case.agent, case.other):
@@ -193,7 +237,7 @@ def _right_of_way(case: Case) -> Finding | None:
 
 
 RULES: tuple[Callable[[Case], Finding | None], ...] = (
-    _red_light, _wrong_way, _lane_change, _rear_end, _standing, _right_of_way,
+    _red_light, _wrong_way, _lane_change, _rear_end, _turns_off, _steps_out, _standing, _right_of_way,
 )  # fmt: skip
 """All rules. Where two of them blame different parties, nobody can tell, but that a red light and the wrong way come
 before the right of way."""
