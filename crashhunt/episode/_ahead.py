@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.episode._observer import Observer
     from crashhunt.oracles import Oracle
-    from crashhunt.recording import BlackBox
     from crashhunt.simulators import AtOnce, Simulator
 
 __all__ = ["Ahead", "goes_ahead"]
@@ -45,16 +44,17 @@ class Ahead:
 
     Args:
         at_once: the simulator's.
-        box: the recorder's.
+        recorder: of the episode.
         agent: the only one of the episode.
         encode: encodes its actions.
     """
 
     def __init__(
-        self, at_once: AtOnce, box: BlackBox, agent: str, encode: Callable[[object], NDArray[np.generic]]
+        self, at_once: AtOnce, recorder: Recorder, agent: str, encode: Callable[[object], NDArray[np.generic]]
     ) -> None:
         self.at_once = at_once
-        self._box, self._agent, self._encode = box, agent, encode
+        self._recorder, self._agent, self._encode = recorder, agent, encode
+        at_once.core.listen(at_once.enter, self._record_roster)
 
     def go_on_from(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
         """Return what a step has come to in the end, and what the agent answered; None where it was not asked.
@@ -76,9 +76,15 @@ class Ahead:
         return come, {self._agent: action}
 
     def _resume(self) -> bool:
-        """Have the core go on from where simulator and black box are; False where that has to wait."""
-        scene = self.at_once.resume()
-        return scene is not None and self._box.lend(self.at_once.core, scene.roster)
+        """Have the core go on from where the simulator is; False where that has to wait."""
+        if self.at_once.resume() is None:
+            return False
+        self._record_roster()
+        return True
+
+    def _record_roster(self) -> None:
+        """Have the core record steps of those who are in sight."""
+        self._recorder.lend(self.at_once.core, self.at_once.roster)
 
 
 def goes_ahead(
@@ -111,4 +117,4 @@ def goes_ahead(
     always = always or any(type(one) is not Overlap and type(one) not in _FIND_NOTHING for one in oracles)
     overlaps = any(type(one) is Overlap for one in oracles)
     simulator.at_once.core.judge(overlaps, HARDEST, always, max_steps, Nearness.EVERY)
-    return Ahead(simulator.at_once, first.box, simulator.agents[0], encoders[0])
+    return Ahead(simulator.at_once, first, simulator.agents[0], encoders[0])

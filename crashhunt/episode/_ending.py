@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from crashhunt.base.errors import RecorderError
 from crashhunt.episode._failures import failure_of, is_emptied
 from crashhunt.trial import Outcome, TrialResult
 
@@ -68,6 +69,8 @@ class Ending:
         """End with an exception that has come through the core."""
         assert self._ahead is not None
         at_once = self._ahead.at_once
+        if at_once.core.simulating and isinstance(error, RecorderError):
+            raise error
         if not at_once.core.simulating:
             return self._fail(Outcome.AGENT_ERROR, error, self.names[0])
         return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, at_once.explained(error))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
+    from crashhunt.native import UsualSteps
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Disturbance, TrialResult
     from crashhunt.world import Actor, Roster, Scene
@@ -62,10 +63,11 @@ class Recorder(Observer):
         self.observation = box.observation  # type: ignore[assignment, method-assign]
         self.action = box.action  # type: ignore[assignment, method-assign]
 
-    @property
-    def box(self) -> BlackBox:
-        """What it writes into."""
-        return self._box
+    def lend(self, steps: UsualSteps, roster: Roster) -> None:
+        """Have the core record steps of these actors, who are recorded here."""
+        if roster is not self._roster:
+            self._note_roster(roster)
+        self._box.lend(steps, roster)
 
     def begin(self, episode: Episode) -> None:
         """Record who takes part."""

@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 __all__ = [
     "ANSWERED",
@@ -26,7 +26,7 @@ __all__ = [
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 6
+_INTERFACE = 7
 """Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
@@ -95,6 +95,19 @@ class UsualSteps(Protocol):
     def heed(self, limits: dict[str, float], limit: float, stood: dict[str, int], standstill: int, /) -> None:
         """Take what is counted besides: of hard braking (m/s², 0 for each vehicle's own), of standing (steps)."""
 
+    def listen(
+        self,
+        enter: Callable[[tuple[str, ...]], tuple[_Vehicles, tuple[str, ...], int, dict[str, object]] | None],
+        record_roster: Callable[[], object],
+        /,
+    ) -> None:
+        """Take who is called where others than before are in sight.
+
+        Args:
+            enter: with their ids; returns who they are, as `resume` takes it, or None where that is not all about them.
+            record_roster: when they are recorded: then it borrows anew.
+        """
+
     def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
         """Take when somebody has to be asked about a step.
 
@@ -143,8 +156,10 @@ class UsualSteps(Protocol):
     def stop(self) -> None:
         """Take no further steps; what has been done is still told."""
 
-    def told(self) -> tuple[int, object, float, str, tuple[float, str], tuple[float, str]] | None:
-        """Return step, observation, reward, follower, and of this scene and the one before time (s) and lanes."""
+    def told(
+        self,
+    ) -> tuple[int, object, float, str, tuple[_Vehicles, float, str], tuple[_Vehicles, float, str]] | None:
+        """Return step, observation, reward, follower; of this scene and the one before vehicles, time (s), lanes."""
 
     def columns(self, back: bool, /) -> Columns | None:
         """Return the numbers of the scene, or of the one before."""

@@ -715,10 +715,20 @@ struct Moved {
     double x, y, aside;
 };
 
+// The row of each actor in the scene before; -1 of who was not in it. Empty where all are the same.
+typedef std::vector<long> Earlier;
+
+long earlier_row(const Earlier &earlier, size_t row) { return earlier.empty() ? static_cast<long>(row) : earlier[row]; }
+
 // As _moved of crashhunt/oracles/_crashes.py.
-Moved moved(const Scene &previous, const Scene &present, size_t row) {
-    const double heading = previous.headings[row];
-    const double dx = present.x(row) - previous.x(row), dy = present.y(row) - previous.y(row);
+Moved moved(const Scene &previous, const Scene &present, size_t row, const Earlier &earlier) {
+    const long found = earlier_row(earlier, row);
+    if (found < 0) {
+        return {0.0, 0.0, 0.0};
+    }
+    const size_t was = static_cast<size_t>(found);
+    const double heading = previous.headings[was];
+    const double dx = present.x(row) - previous.x(was), dy = present.y(row) - previous.y(was);
     double aside = 2 * fabs(dy * cos(heading) - dx * sin(heading));
     const double turn = present.headings[row] - heading;
     if (turn != 0.0) {
@@ -727,9 +737,9 @@ Moved moved(const Scene &previous, const Scene &present, size_t row) {
     return {dx, dy, aside};
 }
 
-// As _within_reach of crashhunt/oracles/_crashes.py, of two scenes of the same actors; false where that is Python's to do.
+// As _within_reach of crashhunt/oracles/_crashes.py, of two scenes; false where that is Python's to do.
 bool reach(const Scene &present, const Scene &previous, size_t row, double step_s, double hardest,
-           std::vector<size_t> &found) {
+           std::vector<size_t> &found, const Earlier &earlier = Earlier()) {
     const std::vector<double> &reaches = present.roster->reaches;
     const double further = 2 * (1.5 * (fastest(present) + hardest * step_s) * step_s + 1.0); // as reachable_m has it
     const double most = 2 * *std::max_element(reaches.begin(), reaches.end()) + further;
@@ -740,23 +750,26 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
     if (nearest.empty()) {
         return true;
     }
-    const Moved mine = moved(previous, present, row);
-    const Rectangle own = outline(present, row), own_before = outline(previous, row);
+    const Moved mine = moved(previous, present, row, earlier);
+    const long was = earlier_row(earlier, row);
+    const Rectangle own = outline(present, row), own_before = was < 0 ? own : outline(previous, static_cast<size_t>(was));
     for (const Near &near : nearest) {
         const size_t other = near.second;
         const double reach = reaches[row] + reaches[other];
         if (near.first >= (reach + further) * (reach + further)) {
             continue;
         }
-        const Moved theirs = moved(previous, present, other);
+        const Moved theirs = moved(previous, present, other, earlier);
         const double rx = mine.x - theirs.x, ry = mine.y - theirs.y;
         const double margin = sqrt(rx * rx + ry * ry) + mine.aside + theirs.aside;
         if (!(near.first < (reach + margin) * (reach + margin))) {
             continue;
         }
         const Rectangle two = outline(present, other);
+        const long before = earlier_row(earlier, other);
         if (overlap(own, two, margin) &&
-            (overlap(own, two, margin / 2) || overlap(own_before, outline(previous, other), margin / 2))) {
+            (overlap(own, two, margin / 2) || was < 0 || before < 0 ||
+             overlap(own_before, outline(previous, static_cast<size_t>(before)), margin / 2))) {
             found.push_back(other);
         }
     }

@@ -26,6 +26,11 @@ PyObject *text_of(const std::string &text) {
     return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
 }
 
+void keep(PyObject *&place, PyObject *value) {
+    Py_INCREF(value);
+    Py_XSETREF(place, value);
+}
+
 struct Steps {
     // of the episode
     std::string agent;
@@ -41,12 +46,17 @@ struct Steps {
     long standstill = 0;
     int always_ask = 0, overlaps = 0;
     long long last = 0, now_and_then = 0;
+    PyObject *enter = nullptr, *record_roster = nullptr; // called with who is in sight now, and when that is recorded
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
-    Vehicles *vehicles = nullptr;
-    PyObject *ids = nullptr;
-    std::vector<char> controlled;
-    size_t row = 0;
+    struct Sight {
+        Vehicles *vehicles = nullptr;
+        PyObject *ids = nullptr;
+        std::vector<char> controlled;
+        size_t row = 0;
+    } sight, entered;
+    Vehicles *before_vehicles = nullptr;
+    Earlier earlier;
     long long step = 0;
     Moment now, before, next;
     std::string road, lane, follower, next_follower;
@@ -64,7 +74,10 @@ struct Steps {
     Steps(const Steps &) = delete;
     ~Steps() {
         for (PyObject *one : {name, libsumo, array, shape, dtype, act, simulate, reinterpret_cast<PyObject *>(eyes),
-                              limits, stood, reinterpret_cast<PyObject *>(vehicles), ids, observation, answer, tape}) {
+                              limits, stood, reinterpret_cast<PyObject *>(sight.vehicles), sight.ids,
+                              reinterpret_cast<PyObject *>(entered.vehicles), entered.ids,
+                              reinterpret_cast<PyObject *>(before_vehicles), enter, record_roster, observation, answer,
+                              tape}) {
             Py_XDECREF(one);
         }
     }
@@ -112,11 +125,11 @@ struct Steps {
     }
 
     // Which way it drives, where it is asked; false where that may be an event.
-    bool is_going_along(const Scene &present, const Scene &last) const {
+    bool is_going_along(const Scene &present, const Scene &last, size_t row) const {
         if (lane.empty() || lane[0] == ':') {
             return true;
         }
-        const double dx = present.x(row) - last.x(row), dy = present.y(row) - last.y(row);
+        const double dx = present.x(row) - last.x(sight.row), dy = present.y(row) - last.y(sight.row);
         const double driven = std::hypot(dx, dy);
         if (driven < STANDING * step_s) {
             return true;
@@ -126,24 +139,33 @@ struct Steps {
     }
 
     // Whether somebody braked harder than its limit; -1 where Python has to say.
-    int is_braking_hard(const Scene &present, const Scene &last) {
-        const double least = least_of(last, present);
-        if (std::isnan(least)) {
-            return -1;
-        }
-        if (least > -LOOKED_INTO * step_s) {
-            return 0;
+    int is_braking_hard(const Scene &present, const Scene &last, const Sight &who) {
+        if (earlier.empty()) {
+            const double least = least_of(last, present);
+            if (std::isnan(least)) {
+                return -1;
+            }
+            if (least > -LOOKED_INTO * step_s) {
+                return 0;
+            }
         }
         for (size_t actor = 0; actor < present.size; actor++) {
-            const double deceleration = (last.speeds[actor] - present.speeds[actor]) / step_s;
-            if (deceleration < LOOKED_INTO || controlled[actor]) {
+            const long was = earlier_row(earlier, actor);
+            if (was < 0) {
                 continue;
             }
-            PyObject *id = PyTuple_GET_ITEM(ids, static_cast<Py_ssize_t>(actor));
+            const double deceleration = (last.speeds[was] - present.speeds[actor]) / step_s;
+            if (deceleration < LOOKED_INTO || who.controlled[actor]) {
+                continue;
+            }
+            if (std::isnan(deceleration)) {
+                return -1;
+            }
+            PyObject *id = PyTuple_GET_ITEM(who.ids, static_cast<Py_ssize_t>(actor));
             PyObject *known = PyDict_GetItemWithError(limits, id); // borrowed
             double most = known ? PyFloat_AsDouble(known) : limit;
             if (!known && !PyErr_Occurred()) {
-                most = limit ? limit : sumo.decel(vehicles->roster->ids[actor]);
+                most = limit ? limit : sumo.decel(who.vehicles->roster->ids[actor]);
                 PyObject *value = PyFloat_FromDouble(most);
                 if (value) {
                     PyDict_SetItem(limits, id, value);
@@ -181,9 +203,9 @@ struct Steps {
     }
 
     // The lanes of everybody, as a record has them; false where they are not plain text.
-    bool note_lanes(std::string &text) const {
+    static bool note_lanes(std::string &text, const Roster &roster) {
         text.clear();
-        for (const std::string &id : vehicles->roster->ids) {
+        for (const std::string &id : roster.ids) {
             const std::string where = sumo.lane(id);
             for (unsigned char letter : where) {
                 if (letter >= 128 || letter == '\n') {
@@ -199,7 +221,7 @@ struct Steps {
     }
 
     // What the agent will be shown; null with or without an exception.
-    PyObject *shown(const Scene &present) const {
+    PyObject *shown(const Scene &present, size_t row) const {
         double right = from_left, drift = 0.0;
         const double distance = sumo.driven(agent) - start_m;
         if (lateral) {
@@ -213,8 +235,72 @@ struct Steps {
         return found;
     }
 
-    // What has come of a step that has been simulated. Everything is read before anything is noted.
-    Come look() {
+    // Who is controlled, of those in sight; false with an exception.
+    static bool set_sight(Sight &place, PyObject *vehicles, PyObject *ids, Py_ssize_t row, PyObject *controlled) {
+        place.controlled.clear();
+        for (Py_ssize_t actor = 0; actor < PyTuple_GET_SIZE(ids); actor++) {
+            const int known = PyDict_Contains(controlled, PyTuple_GET_ITEM(ids, actor));
+            if (known < 0) {
+                return false;
+            }
+            place.controlled.push_back(known != 0);
+        }
+        const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
+        const size_t size = roster.ids.size();
+        if (roster.lengths.size() != size || place.controlled.size() != size || row < 0 ||
+            static_cast<size_t>(row) >= size) {
+            PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
+            return false;
+        }
+        keep(reinterpret_cast<PyObject *&>(place.vehicles), vehicles);
+        keep(place.ids, ids);
+        place.row = static_cast<size_t>(row);
+        return true;
+    }
+
+    // Lets others than before be in sight; false where that is Python's to do.
+    bool let_in() {
+        PyObject *names = enter && enter != Py_None ? near_names() : nullptr;
+        PyObject *found = names ? PyObject_CallOneArg(enter, names) : nullptr;
+        Py_XDECREF(names);
+        PyObject *vehicles, *ids, *controlled;
+        Py_ssize_t row;
+        const bool known = found && found != Py_None &&
+                           PyArg_ParseTuple(found, "OO!nO!", &vehicles, &PyTuple_Type, &ids, &row, &PyDict_Type,
+                                            &controlled) &&
+                           vehicles_of(vehicles) && set_sight(entered, vehicles, ids, row, controlled);
+        PyErr_Clear(); // it is said again
+        Py_XDECREF(found);
+        if (!known) {
+            return false;
+        }
+        // Most are where they were in the list.
+        const std::vector<std::string> &were = sight.vehicles->roster->ids, &are = entered.vehicles->roster->ids;
+        size_t from = 0;
+        for (const std::string &id : are) {
+            long row_before = -1;
+            for (size_t tried = 0; tried < were.size() && row_before < 0; tried++) {
+                const size_t at = (from + tried) % were.size();
+                if (were[at] == id) {
+                    row_before = static_cast<long>(at);
+                    from = at + 1;
+                }
+            }
+            earlier.push_back(row_before);
+        }
+        return true;
+    }
+
+    // What has come of a step that has been simulated; negative with an exception. Everything is read before anything
+    // is noted.
+    int look() {
+        earlier.clear();
+        const int come = look_around();
+        earlier.clear();
+        return come;
+    }
+
+    int look_around() {
         const long long number = step + 1;
         PyObject *seen = nullptr;
         bool near = false;
@@ -224,10 +310,13 @@ struct Steps {
             }
             if (number % every == 0 || sumo.departed() || sumo.arrived() || sumo.appearing()) {
                 around.look(*eyes->roster, within);
-                if (!around.same(*vehicles->roster)) {
+                if (!around.same(*sight.vehicles->roster) && !let_in()) {
                     return SIMULATED;
                 }
             }
+            const bool others = !earlier.empty();
+            const Sight &who = others ? entered : sight;
+            const Roster &roster = *who.vehicles->roster;
             if (sumo.lane_index(agent) != lane_index || sumo.road(agent) != road) {
                 return SIMULATED;
             }
@@ -235,28 +324,40 @@ struct Steps {
             next.time_s = sumo.time();
             const bool still = known && !sumo.arrived() && fabs(next.time_s - now.time_s - step_s) < step_s / 2;
             known = false;
-            read_into(*vehicles->roster, next.values, still);
+            read_into(roster, next.values, still && !others);
             known = true;
             next.lanes.clear();
-            const Scene present(next.values, vehicles->roster), last(now.values, vehicles->roster);
-            if ((number % LANES_EVERY == 0 && !note_lanes(next.lanes)) ||
-                (number % DIRECTION_EVERY == 0 && !is_going_along(present, last)) || is_braking_hard(present, last)) {
+            const Scene present(next.values, &roster), last(now.values, sight.vehicles->roster);
+            if ((number % LANES_EVERY == 0 && !note_lanes(next.lanes, roster)) ||
+                (number % DIRECTION_EVERY == 0 && !is_going_along(present, last, who.row)) ||
+                is_braking_hard(present, last, who)) {
                 return SIMULATED;
             }
             next_follower = sumo.follower(agent, 0.0).first;
             if (overlaps) {
-                near = !reach(present, last, row, next.time_s - now.time_s, hardest, reached) || !reached.empty();
+                near = !reach(present, last, who.row, next.time_s - now.time_s, hardest, reached, earlier) ||
+                       !reached.empty();
+            }
+            if (others) {
+                PyObject *done = PyObject_CallNoArgs(record_roster);
+                if (!done) {
+                    return -1; // such as a disk that is full
+                }
+                Py_DECREF(done);
+                if (!able()) {
+                    return SIMULATED;
+                }
             }
             const size_t records = 8 * (2 + 1 + next.values.size()) + next.lanes.size() + 64;
             if (offset + records > reserved) {
                 return SIMULATED;
             }
-            seen = shown(present);
+            seen = shown(present, who.row);
             if (!seen) {
                 PyErr_Clear(); // Python says it again
                 return SIMULATED;
             }
-            if (!stands_on(present.speeds[row])) {
+            if (!stands_on(present.speeds[who.row])) {
                 Py_DECREF(seen);
                 return SIMULATED;
             }
@@ -265,7 +366,13 @@ struct Steps {
             return SIMULATED;
         }
         Py_XSETREF(observation, seen);
-        reward = next.values[3 * (next.values.size() / 4) + row] * step_s;
+        if (before_vehicles != sight.vehicles) {
+            keep(reinterpret_cast<PyObject *&>(before_vehicles), reinterpret_cast<PyObject *>(sight.vehicles));
+        }
+        if (!earlier.empty()) {
+            std::swap(sight, entered);
+        }
+        reward = next.values[3 * (next.values.size() / 4) + sight.row] * step_s;
         std::swap(before, now);
         std::swap(now, next);
         std::swap(follower, next_follower);
@@ -304,7 +411,8 @@ struct Steps {
             return nullptr;
         }
         Py_DECREF(done);
-        return PyLong_FromLong(quiet && able() ? look() : SIMULATED);
+        const int come = quiet && able() ? look() : static_cast<int>(SIMULATED);
+        return come < 0 ? nullptr : PyLong_FromLong(come);
     }
 };
 
@@ -313,11 +421,6 @@ struct UsualSteps {
 };
 
 Steps &steps_of(PyObject *object) { return *reinterpret_cast<UsualSteps *>(object)->steps; }
-
-void keep(PyObject *&place, PyObject *value) {
-    Py_INCREF(value);
-    Py_XSETREF(place, value);
-}
 
 // UsualSteps(agent, libsumo, (array, shape, dtype), others, step_s, lateral, takes_speed, (eyes, every, within), start_m)
 PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
@@ -386,6 +489,17 @@ PyObject *usual_heed(PyObject *object, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
+// listen(enter, record_roster): who is called where others than before are in sight
+PyObject *usual_listen(PyObject *object, PyObject *arguments) {
+    PyObject *enter, *record_roster;
+    if (!PyArg_ParseTuple(arguments, "OO", &enter, &record_roster)) {
+        return nullptr;
+    }
+    keep(steps_of(object).enter, enter);
+    keep(steps_of(object).record_roster, record_roster);
+    Py_RETURN_NONE;
+}
+
 // judge(overlaps, hardest, always_ask, last, now_and_then): when somebody has to be asked about a step
 PyObject *usual_judge(PyObject *object, PyObject *arguments) {
     Steps &steps = steps_of(object);
@@ -416,24 +530,15 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     }
     const Scene scene(reinterpret_cast<Columns *>(columns));
     const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
-    if (!steps.limits || !steps.stood || roster.ids.size() != scene.size || roster.lengths.size() != scene.size ||
-        PyTuple_GET_SIZE(ids) != static_cast<Py_ssize_t>(scene.size) || row < 0 ||
-        static_cast<size_t>(row) >= scene.size) {
+    if (!steps.limits || !steps.stood || roster.ids.size() != scene.size) {
         PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
         return nullptr;
     }
-    keep(reinterpret_cast<PyObject *&>(steps.vehicles), vehicles);
-    keep(steps.ids, ids);
-    keep(steps.observation, observation);
-    steps.controlled.clear();
-    for (Py_ssize_t actor = 0; actor < PyTuple_GET_SIZE(ids); actor++) {
-        const int known = PyDict_Contains(controlled, PyTuple_GET_ITEM(ids, actor));
-        if (known < 0) {
-            return nullptr;
-        }
-        steps.controlled.push_back(known != 0);
+    if (!Steps::set_sight(steps.sight, vehicles, ids, row, controlled)) {
+        return nullptr;
     }
-    steps.row = static_cast<size_t>(row);
+    keep(reinterpret_cast<PyObject *&>(steps.before_vehicles), vehicles);
+    keep(steps.observation, observation);
     steps.now.values = *reinterpret_cast<Columns *>(columns)->values;
     steps.now.time_s = time_s;
     steps.now.lanes = lanes;
@@ -557,24 +662,26 @@ PyObject *usual_stop(PyObject *object, PyObject *) {
     Py_RETURN_NONE;
 }
 
-// told() -> (step, observation, reward, follower, (time_s, lanes), the same of the step before)
+// told() -> (step, observation, reward, follower, (vehicles, time_s, lanes), the same of the step before)
 PyObject *usual_told(PyObject *object, PyObject *) {
     const Steps &steps = steps_of(object);
     if (!steps.ready) {
         Py_RETURN_NONE;
     }
-    return Py_BuildValue("(LOdN(dN)(dN))", steps.step, steps.observation, steps.reward, text_of(steps.follower),
-                         steps.now.time_s, text_of(steps.now.lanes), steps.before.time_s, text_of(steps.before.lanes));
+    return Py_BuildValue("(LOdN(OdN)(OdN))", steps.step, steps.observation, steps.reward, text_of(steps.follower),
+                         steps.sight.vehicles, steps.now.time_s, text_of(steps.now.lanes), steps.before_vehicles,
+                         steps.before.time_s, text_of(steps.before.lanes));
 }
 
 // columns(back) -> Columns, of the step that is complete or, where it is true, of the one before
 PyObject *usual_columns(PyObject *object, PyObject *back) {
     const Steps &steps = steps_of(object);
     const Moment &moment = back == Py_True ? steps.before : steps.now;
-    if (!steps.ready || moment.values.size() != 4 * steps.vehicles->roster->ids.size()) {
+    Vehicles *vehicles = back == Py_True ? steps.before_vehicles : steps.sight.vehicles;
+    if (!steps.ready || moment.values.size() != 4 * vehicles->roster->ids.size()) {
         Py_RETURN_NONE;
     }
-    return reinterpret_cast<PyObject *>(new_columns(steps.vehicles, std::vector<double>(moment.values)));
+    return reinterpret_cast<PyObject *>(new_columns(vehicles, std::vector<double>(moment.values)));
 }
 
 // reads(vehicles) -> what libsumo says of them and of the agent, by the functions that are used here alone
@@ -616,6 +723,7 @@ PyMethodDef usual_methods[] = {
     {"note", usual_note, METH_O, "Record an action; return whether that could be done."},
     {"go_on", usual_go_on, METH_O, "Simulate, and look where nothing has happened yet; return what has come of it."},
     {"heed", usual_heed, METH_VARARGS, "Take what is counted of braking and of standing."},
+    {"listen", usual_listen, METH_VARARGS, "Take who is called where others than before are in sight."},
     {"judge", usual_judge, METH_VARARGS, "Take when somebody has to be asked about a step."},
     {"resume", usual_resume, METH_VARARGS, "Go on from a step that is complete."},
     {"borrow", usual_borrow, METH_VARARGS, "Record into a buffer from now on."},

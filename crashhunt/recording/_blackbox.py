@@ -166,18 +166,17 @@ class BlackBox:
         """Record what an agent answered."""
         self._raw(_ACTION, agent, array, _SIMULATE)
 
-    def lend(self, steps: UsualSteps, roster: Roster) -> bool:
-        """Have the core record steps of a roster by itself, until anything else is asked of this black box.
+    def lend(self, steps: UsualSteps, roster: Roster) -> None:
+        """Have the core record steps of one agent by itself, until anything else is asked of this black box.
 
-        Returns:
-            False where the last step was of others, or none has been recorded.
+        Args:
+            steps: of the core.
+            roster: who the steps are of; it must have been recorded.
         """
         self._take_back()
-        if self._roster is not roster or self._agents != 1:
-            return False
+        self._roster = roster
         steps.borrow(self._map, self._offset, self._reserved, _LENT)
         self._lent = steps
-        return True
 
     def _take_back(self) -> None:
         if self._lent is not None:

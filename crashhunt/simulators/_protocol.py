@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import numpy as np
     from gymnasium import Space
 
-    from crashhunt.native import UsualSteps
+    from crashhunt.native import UsualSteps, Vehicles
     from crashhunt.trial import Disturbance, Value
-    from crashhunt.world import Lane, Paths, Scene
+    from crashhunt.world import Lane, Paths, Roster, Scene
 
 __all__ = [
     "FACULTIES",
@@ -338,6 +338,13 @@ class AtOnce(Protocol):
 
     def stands_for(self, simulator: Simulator, /) -> bool:
         """Whether it does what a simulator does: not where somebody has wrapped that, or a method of it."""
+
+    @property
+    def roster(self) -> Roster:
+        """Who is in sight, or will be after the step that `core` takes."""
+
+    def enter(self, ids: tuple[str, ...], /) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
+        """Take note of who is in sight; what it returns is for `core`, None where it cannot go on with them."""
 
     def resume(self) -> Scene | None:
         """Have `core` go on from where the simulator is; return its scene, None where that has to wait."""

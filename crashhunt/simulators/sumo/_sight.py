@@ -154,6 +154,15 @@ class Sight:
             return None
         return self._plain, self._ids
 
+    @property
+    def roster(self) -> Roster:
+        """Who is in sight."""
+        return self._roster
+
+    def see(self, ids: tuple[str, ...]) -> None:
+        """Take note of who is in sight, and that there is no person."""
+        self._see(ids, ())
+
     def reads_right(self) -> bool:
         """Whether the core reads what libsumo's getters return, to the bit."""
         if self.core is None or self._vehicles is None:

@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.native import Core
+    from crashhunt.native import Core, Vehicles
     from crashhunt.simulators._kinematics import Kinematics
     from crashhunt.simulators._protocol import Observations, Simulator, StepResult
     from crashhunt.simulators.sumo._sight import Sight
     from crashhunt.simulators.sumo._traffic_events import SumoEvents
+    from crashhunt.world import Roster
 
 __all__ = ["Present", "UsualSteps"]
 
+_ROSTERS = 3  # of the last scene and the one before; that of the next may not come to be
 _OBSERVED = np.dtype("<f4")
 
 
@@ -96,6 +98,7 @@ class UsualSteps:
         )  # fmt: skip
         self._edge, self._instead_of = edge, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
+        self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that may be asked for
 
     def stands_for(self, simulator: Simulator) -> bool:
         """Whether nothing that it does is somebody else's in a simulator, such as in a wrapper around this one."""
@@ -104,6 +107,23 @@ class UsualSteps:
     def begin(self) -> None:
         """Take what is counted in this episode, which is about to begin."""
         self.core.heed(*self._events.counted)
+        self._controlled = self._events.controlled
+
+    @property
+    def roster(self) -> Roster:
+        """Who is in sight, or will be after the step that the core takes."""
+        return self._sight.roster
+
+    def enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
+        """Take note of who is in sight; None where there is more about them than the core knows."""
+        self._sight.see(ids)
+        seen, row = self._sight.plain, self.roster.index.get(self._agent)
+        if seen is None or row is None:
+            return None
+        while len(self._rosters) > _ROSTERS:
+            del self._rosters[next(iter(self._rosters))]
+        self._rosters[seen[0]] = self.roster
+        return *seen, row, self._controlled
 
     def resume(self) -> Scene | None:
         """Have the core go on from here; return the scene, None where that has to wait."""
@@ -117,10 +137,11 @@ class UsualSteps:
         lanes, width = self._edge(edge)
         from_left = (lanes - 1 - int(number)) * width
         where = edge, int(number), lane, from_left
-        row, others = scene.roster.index[agent], self._events.controlled
+        row = scene.roster.index[agent]
+        self._rosters = {vehicles: scene.roster}
         self.core.resume(
-            (vehicles, ids, row, others), observations[agent], columns, scene.time_s, "\n".join(scene.lanes), where,
-            self._events.followers[agent], steps,
+            (vehicles, ids, row, self._controlled), observations[agent], columns, scene.time_s,
+            "\n".join(scene.lanes), where, self._events.followers[agent], steps,
         )  # fmt: skip
         return scene
 
@@ -164,10 +185,10 @@ class UsualSteps:
         )
         return repr(self.core.reads(vehicles)) == repr(read)
 
-    def _scene(self, like: Scene, back: bool, time_s: float, lanes: str) -> Scene:
+    def _scene(self, like: Scene, back: bool, vehicles: Vehicles, time_s: float, lanes: str) -> Scene:
         scene = Scene(
-            time_s, like.roster, lanes=tuple(lanes.split("\n")) if lanes else (), swept=True, core=self._core,
-            columns=self.core.columns(back),
+            time_s, self._rosters[vehicles], lanes=tuple(lanes.split("\n")) if lanes else (), swept=True,
+            core=self._core, columns=self.core.columns(back),
         )  # fmt: skip
         scene.agent_lanes = dict(like.agent_lanes)
         return scene
