@@ -255,6 +255,19 @@ class Case:
             bool(found) and not any(lane.startswith(":") or not lane for lane in found) for found in lanes.values()
         )
 
+    def was_in_junction(self, actor: str, before_s: float) -> bool:
+        """Whether an actor was in a junction of SUMO's so many s before the contact."""
+        lanes = [
+            scene.lanes[scene.roster.index[actor]]
+            for scene in self.scenes
+            if scene.lanes and actor in scene.roster.index and scene.time_s <= self.time_s - before_s
+        ]
+        return bool(lanes) and lanes[-1].startswith(":")
+
+    def speed_mps(self, actor: str, before_s: float) -> float:
+        """How fast an actor was so many s before the contact, or as long before as is known."""
+        return float(self.way(actor).speeds[int(np.argmin(np.abs(self.times - before_s)))])
+
     def slowed(self, actor: str, since_s: float) -> float:
         """How hard an actor braked on average, from so many s before the contact on, in m/s²."""
         way = self.way(actor)

@@ -40,6 +40,7 @@ _STANDS_S = 1.0
 _STEP_M = 1.0  # beside a car; who is nearer walks in its way
 _OFF_M = 2.5  # beside the middle of a car; who is nearer may be on the road
 _WALKS = 3.0  # m/s; whoever drives so slowly can stop for anybody
+_CLEARS_S = 3.0
 _RED_S = 8.0  # after a red light, a junction is left by then
 _EARLY_S = 1.0  # what crashes so soon was put there
 
@@ -232,6 +233,8 @@ def _right_of_way(case: Case) -> Finding | None:
     yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
     if float(case.way(goes).speeds.min()) < _STANDS or case.drifted(yields) or case.drifted(goes):
         return None  # who had stood in the junction may have been let through
+    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
+        return None  # who starts off while somebody is in the junction has to let it out
     words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
     return Finding("right of way", _who(case, yields), words, "the map of the scenario; Vienna, article 18; StVO § 8")
 

@@ -280,6 +280,15 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
     assert said({(0, 1)}, ways) == "ego"
     assert said({(0, 1), (1, 0)}, ways) == "nobody can tell"
     assert said({(1, 0)}, ways, ("", "s")) == "nobody can tell"
+
+    def inside_before(speed):
+        rights = RightOfWay(tuple(ways), frozenset({(1, 0)}))
+        case = drive(straight(speed), crossing(2), right_of_way=rights)
+        case.scenes[-40].lanes, case.scenes[-10].lanes = ("w", ":c_1"), ("w", "s")
+        return verdict(case)
+
+    # Who starts off while somebody is in the junction has to let it out; who drives along has not.
+    assert (inside_before(2.0), inside_before(10.0)) == ("nobody can tell", "the other")
     lights = [Link(*(ways[0].junction, "w", "e"), ways[0].inside, signalised=True, shape=ways[0].shape), ways[1]]
     assert said({(1, 0)}, lights) == "nobody can tell"
 
