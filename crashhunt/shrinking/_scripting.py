@@ -54,6 +54,9 @@ class Scripting:
         self._spec = rerun.spec
         self._step_s = recorded.prologue.step_length_s
         self._paths = paths_of(recorded.scenes(), recorded.agents)
+        escape = rerun.bundle.result.escape
+        # An agent that cannot avoid it any more is not tested: however it is mended, it crashes.
+        self._latest = recorded.steps if escape is None or escape.step is None else escape.step
         self.whole = Part(recorded.agents, self._paths.names)
 
     @property
@@ -77,12 +80,12 @@ class Scripting:
         )
 
     def begins(self, agents: Sequence[str]) -> list[int]:
-        """Return with which later steps it could begin, the last one first."""
+        """Return with which later steps it could begin, the last one first: none after which braking helps no more."""
         known = [{step for step, _ in path.lanes} for path in self._paths.agents if path.actor.id in agents]
         steps = sorted(set.intersection(*known)) if known else []
         found = []
         for before_s in _BEFORE_S:
-            latest = self.steps - round(before_s / self._step_s)
+            latest = min(self._latest, self.steps - round(before_s / self._step_s))
             found += [step for step in steps if 0 < step <= latest][-1:]
         return list(dict.fromkeys(found))
 

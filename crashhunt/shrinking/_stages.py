@@ -69,7 +69,7 @@ class Search:
                 title = self._rerun.worker.scenario.backend.title or "its simulator"
                 return "done", f"{title} cannot move others along recorded ways, or not in the version of the snapshot"
             if self._scripting is None:
-                self._until_nothing_helps(self._fewer_others)
+                self._smaller_traffic()
             else:
                 self._smaller_in_either_form(self._scripting)
         except StoppedError as error:
@@ -83,6 +83,13 @@ class Search:
                 raise
             return "error", str(error)
         return "done", ""
+
+    def _smaller_traffic(self) -> None:
+        """Plain arguments first: few trials make a crash that can be read, and leaving out others may take hundreds."""
+        self._everybody = self._runs.entered(replace(self.best, only=(EVERYBODY,)))  # of the crash as it was
+        self._left_out = bool(self._everybody)
+        self._plainer_arguments()
+        self._until_nothing_helps(self._fewer_others)
 
     def _smaller_in_either_form(self, scripting: Scripting) -> None:
         if self._form == "either":

@@ -15,14 +15,14 @@ from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.plans import HuntOptions, plan, request_of
 from crashhunt.shrinking import shrink
-from crashhunt.trial import Outcome, TrialSpec
+from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import Driver, Spec
-    from crashhunt.trial import TrialResult, Value
+    from crashhunt.trial import DisturbanceData, TrialResult, Value
 
 __all__ = ["Example", "assert_survives"]
 
@@ -35,12 +35,14 @@ class Example(TypedDict, total=False):
         arguments: of the agents, by their ids.
         scenario_arguments: of the scenario.
         only: which of the others take part; all where it is missing.
+        disturbances: who errs, when and how, as `crash.json` has it; nobody where it is missing.
     """
 
     seed: int
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     only: Sequence[str]
+    disturbances: Sequence[DisturbanceData]
 
 
 def assert_survives(
@@ -108,8 +110,8 @@ def assert_survives(
 def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
     if budget < 1:
         return bundle
-    try:
-        return shrink(bundle, budget=budget, parallel=parallel).small or bundle
+    try:  # the others go on driving: those that are moved as recorded cannot be written down in a line
+        return shrink(bundle, budget=budget, parallel=parallel, form="traffic").small or bundle
     except CrashhuntError:  # it is told as it is
         return bundle
 
@@ -124,6 +126,7 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
         example.get("scenario_arguments", {}),
         max_steps,
         only=None if only is None else tuple(only),
+        disturbances=tuple(map(Disturbance.from_json, example.get("disturbances", ()))),
     )
     with tempfile.TemporaryDirectory(prefix="crashhunt-survives-") as folder:
         worker = WorkerSettings(
@@ -153,6 +156,8 @@ def _told(result: TrialResult, call: str, look: str) -> str:
     }
     if spec.only is not None:
         example["only"] = list(spec.only)
+    if spec.disturbances:
+        example["disturbances"] = [one.to_json() for one in spec.disturbances]
     lines = [
         "",
         result.summary,

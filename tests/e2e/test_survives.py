@@ -25,3 +25,32 @@ def test_what_crashes_fails_and_what_is_printed_can_be_pasted(toy, monkeypatch):
     assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
     with pytest.raises(CrashhuntError, match="not one trial was valid"):
         assert_survives("keep-lane", "toy", trials=1, scenario_arguments={"fail_reset": True}, **words)
+
+
+@pytest.mark.nightly
+def test_what_is_printed_of_a_crash_in_traffic_is_small_and_can_be_pasted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = {"trials": 6, "max_steps": 300, "arguments": {"speed": "17:25"}}
+    with pytest.raises(AssertionError, match="ego drove into left") as raised:
+        assert_survives("crashhunt.agents:KeepLaneWithSpeed", "loop", **words)
+    (call,) = re.findall(r"^    (assert_survives\(.*\))$", str(raised.value), re.MULTILINE)
+    assert "'only': [" in call  # the others drive: whoever is moved as recorded could not be pasted
+    with pytest.raises(AssertionError) as again:
+        exec(call, {"assert_survives": assert_survives})
+    assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
+
+
+def test_an_example_may_have_disturbances(toy, monkeypatch):
+    monkeypatch.chdir(toy.folder)
+    (toy.folder / "erring").mkdir()
+    text = (toy.folder / "toy" / "scenario.toml").read_text(encoding="utf-8")
+    (toy.folder / "erring" / "scenario.toml").write_text(f"{text}\n[disturbances]\nbrake = 2.0\n", encoding="utf-8")
+    with pytest.raises(AssertionError) as raised:
+        assert_survives(
+            "keep-lane", "erring", trials=3, max_steps=80, arguments={"speed": "8:10"}, budget=0, parallel=1
+        )
+    (call,) = re.findall(r"^    (assert_survives\(.*\))$", str(raised.value), re.MULTILINE)
+    assert "'disturbances': [{" in call
+    with pytest.raises(AssertionError) as again:
+        exec(call, {"assert_survives": assert_survives})
+    assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, strategies as st
 
-from crashhunt.shrinking import _stages, fewest, plainest
+from crashhunt.shrinking import _scripting, _stages, fewest, plainest
 from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part
-from crashhunt.trial import TrialSpec
+from crashhunt.trial import Escape, TrialSpec
+from crashhunt.world import Actor, Roster, Scene
 
 
 def first(good, seen):
@@ -131,3 +132,72 @@ def test_time_that_runs_out_while_others_are_moved_takes_nothing_away(monkeypatc
     assert search.run(lambda: False)[0] in ("time", "done")
     assert search.best == replace(spec, only=("a", "b", "c"))
     assert search.smaller[-1] == search.best
+
+
+class FromLaterOn(Scripting):
+    """From step 60 on it takes two others, and of all that are there; from the start on, four."""
+
+    def begins(self, agents):
+        return [90, 60]
+
+    def spec(self, part):
+        return replace(super().spec(part), max_steps=part.begin or 1)
+
+
+class LaterRuns(Runs):
+    """In traffic nobody can be left out.
+
+    Args:
+        pair: who is enough from step 60 on.
+    """
+
+    def __init__(self, pair):
+        super().__init__(10**6)
+        self.pair = pair
+
+    def first(self, specs, *, again=False):
+        for place, spec in enumerate(specs):
+            script = spec.script
+            if script is None:
+                good = spec.only is None
+            else:
+                good = {*(self.pair if spec.max_steps == 60 else "abcd")} <= {*script.names} and spec.max_steps != 90
+            if good:
+                return place
+        return None
+
+
+@pytest.mark.parametrize("pair", ["ah", "gh"])
+def test_fewer_are_enough_where_it_begins_later(monkeypatch, pair):
+    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
+    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
+    rerun = SimpleNamespace(
+        spec=TrialSpec(0, 1, {"ego": {}}, {}, 300),
+        defaults={},
+        recorded=SimpleNamespace(agents=("ego",), prologue=SimpleNamespace(step_length_s=0.1)),
+        bundle=SimpleNamespace(
+            confirmed=True, driver="ego", result=SimpleNamespace(collision=SimpleNamespace(other="a"), event=None)
+        ),
+    )
+    search = _stages.Search(rerun, LaterRuns(pair), "either")
+    search._scripting = FromLaterOn()
+    assert search.run(lambda: False)[0] == "done"
+    assert (set(search.best.script.names), search.best.max_steps) == ({*pair}, 60)
+
+
+@pytest.mark.parametrize(("escape", "begins"), [(None, [39, 29, 19, 9]), (25, [25, 19, 9]), (0, [])])
+def test_it_begins_while_the_agent_can_still_avoid_it(escape, begins):
+    ego = Actor("ego", "passenger", 5.0, 1.8)
+    scenes = [
+        Scene(step / 10, Roster((ego,)), [(float(step), 0.0)], [0.0], [10.0], lanes=("road_0",)) for step in range(50)
+    ]
+    rerun = SimpleNamespace(
+        spec=TrialSpec(0, 1, {"ego": {}}, {}, 300),
+        bundle=SimpleNamespace(
+            result=SimpleNamespace(escape=None if escape is None else Escape(escape, escape + 1, 8.0, ""))
+        ),
+        recorded=SimpleNamespace(
+            agents=("ego",), steps=49, prologue=SimpleNamespace(step_length_s=0.1), scenes=lambda: scenes
+        ),
+    )
+    assert _scripting.Scripting(rerun).begins(("ego",)) == begins
