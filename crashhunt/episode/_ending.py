@@ -73,4 +73,4 @@ class Ending:
             raise error
         if not at_once.core.simulating:
             return self._fail(Outcome.AGENT_ERROR, error, self.names[0])
-        return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, at_once.explained(error))
+        return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, error)

@@ -85,6 +85,7 @@ struct Sumo {
     ValueOf turned, drives;
     Conversion degrees;
     Singleton net;
+    const long long *made; // how many vehicles SUMO has made
     const char *vehicle_table; // that of the virtual functions of MSVehicle, and of nothing derived from it
     bool bound;
 };
@@ -143,6 +144,7 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZNK9MSVehicle8getSpeedEv", found.drives) &&
                  find(library, "_ZN10GeomHelper10naviDegreeEd", found.degrees) &&
                  find(library, "_ZN5MSNet11getInstanceEv", found.net) &&
+                 find(library, "_ZN13MSBaseVehicle23myCurrentNumericalIndexE", found.made) &&
                  find(library, "_ZTV9MSVehicle", found.vehicle_table);
     dlclose(library); // Python keeps it loaded
     if (!whole) {

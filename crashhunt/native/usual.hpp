@@ -49,6 +49,7 @@ struct Steps {
     PyObject *enter = nullptr, *record_roster = nullptr; // called with who is in sight now, and when that is recorded
     // of the present roster, and of the step that is complete
     bool ready = false, stopped = false, known = false; // whether the vehicles were found in the step before
+    long long made = 0; // by SUMO so far when they were, vehicles of this and other runs
     struct Sight {
         Vehicles *vehicles = nullptr;
         PyObject *ids = nullptr;
@@ -322,10 +323,13 @@ struct Steps {
             }
             // A vehicle that goes is told of in the step in which it does, if it is one step that has been taken.
             next.time_s = sumo.time();
-            const bool still = known && !sumo.arrived() && fabs(next.time_s - now.time_s - step_s) < step_s / 2;
+            const bool one_step = !sumo.arrived() && fabs(next.time_s - now.time_s - step_s) < step_s / 2;
+            // An agent may go back to a state that it has saved: the same vehicles, and all of them made anew.
+            const bool still = known && one_step && made == *sumo.made;
             known = false;
             read_into(roster, next.values, still && !others);
             known = true;
+            made = *sumo.made;
             next.lanes.clear();
             const Scene present(next.values, &roster), last(now.values, sight.vehicles->roster);
             if ((number % LANES_EVERY == 0 && !note_lanes(next.lanes, roster)) ||

@@ -358,9 +358,6 @@ class AtOnce(Protocol):
     def finish(self, actions: Mapping[str, NDArray[np.generic]], /) -> StepResult:
         """Do what is left of a step that has been simulated."""
 
-    def explained(self, error: BaseException, /) -> BaseException:
-        """Return what a step raises in place of an exception of the simulation."""
-
 
 class StepsAtOnce(Protocol):
     """A simulator of which most steps may be taken in one call, by the compiled core."""

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 __all__ = ["Frame", "own_frames"]
 
 _CALLERS = (
+    ("crashhunt", "episode", "_ahead.py"),
     ("crashhunt", "episode", "_episode.py"),
     ("crashhunt", "episode.py"),
-)  # of agents, simulators and oracles; the second one in earlier versions
+)  # of agents, simulators and oracles; the last one in earlier versions
 _FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
 _LIBRARIES = re.compile(r"(site|dist)-packages|python3\.\d+")
 

@@ -18,6 +18,7 @@ from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, Too
 from crashhunt.recording import BlackBox, Tag
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import SpeedAndLaneChange
+from crashhunt.triage import own_frames
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
@@ -91,8 +92,11 @@ class Street:
             while episode.result is None:
                 episode.step()
             failure = episode.result.failure
+            calls = [(one.file.name, one.function) for one in own_frames(failure)] if failure else []
+            calls = [call for call in calls if call[1] not in ("taken", "breaks")]
             result = replace(episode.result, failure=failure and replace(failure, traceback=""))
-        return repr(result), bytes(self.box.committed()), bytes(self.box._map[32:56])
+        # By the calls, two faults are told to be the same.
+        return repr(result), bytes(self.box.committed()), bytes(self.box._map[32:56]), repr(calls)
 
     def both(self, answer, **options):
         """The same with the core's own steps, without them, and without the core."""
@@ -124,6 +128,7 @@ ANSWERS = {
     "not a number": lambda step, _: (8.0, 0) if step < 30 else (float("nan"), 0),
     "true": lambda step, _: (8.0, 0) if step < 30 else (8.0, True),
     "raises": lambda step, _: (8.0, 0) if step < 30 else 1 / 0,
+    "raises at once": lambda *_: 1 / 0,
 }
 
 
@@ -131,7 +136,7 @@ ANSWERS = {
 def test_an_episode_is_the_same_to_the_bit(street, how):
     street.both(ANSWERS[how])
     street.both(ANSWERS[how], crash_on=[*CRASHES, Outcome("not_moving"), Outcome("hard_braking")], oracles=[RedLight()])
-    assert street.comes[DONE] + street.comes[ANSWERED] > 20
+    assert street.comes[DONE] + street.comes[ANSWERED] > 20 or how == "raises at once"
 
 
 def test_most_steps_are_taken_at_once(street):
@@ -411,9 +416,10 @@ def test_what_sumo_raises_is_told(street, monkeypatch):
         step()
 
     monkeypatch.setattr(libsumo, "simulationStep", breaks)
-    result, *_ = street.both(ANSWERS["steady"])
+    result, *_, calls = street.both(ANSWERS["steady"])
     assert "SUMO gave up: no more" in result
     assert "kind='simulator error'" in result
+    assert calls == "[('_simulator.py', 'step')]"
 
 
 MEDDLING = {
@@ -421,20 +427,29 @@ MEDDLING = {
     "takes somebody away": lambda libsumo: libsumo.vehicle.remove("behind"),
     "simulates": lambda libsumo: [libsumo.vehicle.remove("behind"), libsumo.simulationStep()],
     "simulates for long": lambda libsumo: [libsumo.simulationStep() for _ in range(9)],
+    "looks ahead": lambda libsumo: [
+        libsumo.simulation.saveState("ahead.xml"),
+        libsumo.simulationStep(),
+        libsumo.simulation.loadState("ahead.xml"),
+    ],
     "moves somebody": lambda libsumo: libsumo.vehicle.moveTo("behind", "west_0", 5.0),
 }
 
 
 @pytest.mark.parametrize("what", MEDDLING)
-def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what):
+def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what, tmp_path, monkeypatch):
     import libsumo
 
+    monkeypatch.chdir(tmp_path)
+
     def meddle(step, _):
-        if step == 22:
+        if step == 22 or (step > 22 and what == "looks ahead" and step % 3 == 0):
             MEDDLING[what](libsumo)
         return 8.0, 0
 
-    street.both(meddle)
+    *_, calls = street.both(meddle)
+    if what == "goes":
+        assert calls == "[('_simulator.py', 'step')]"
     assert street.comes[DONE] > 10
 
 

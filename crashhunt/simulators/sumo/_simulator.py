@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from functools import cache
 from types import MethodType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import libsumo
 
@@ -34,7 +34,7 @@ from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -51,6 +51,8 @@ _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _SEEN_M = 150.0  # of the network, in a window that follows a vehicle
 _KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
 _DISTRUSTED = "the compiled core says something else than libsumo's own getters, and is not used"
+P = ParamSpec("P")
+T = TypeVar("T")
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
 _keep_xml_ready = cache(keep_xml_ready)  # once a process
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
@@ -183,31 +185,28 @@ class SumoSimulator:
                 if not self._driving.apply(agent, action):
                     self._off_road.append(agent)
             libsumo.simulationStep()
+            return self._finish(actions)
         except _TRACI_ERRORS as error:
             raise _gave_up(error) from error
-        return self._finish(actions)
 
     def _finish(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """See what has come of a step that has been simulated."""
         if self.at_once is not None:
             self.at_once.core.pause()
-        try:
-            if self._taking_part is not None:
-                self._taking_part.remove()
-            self._steps += 1
-            self._look()
-            scene, present = self._scene, self._scene.roster.index
-            observations: Observations = {}
-            rewards: dict[str, float] = {}
-            terminations: dict[str, bool] = {}
-            for agent in actions:
-                row = present.get(agent)
-                observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
-                rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
-                terminations[agent] = row is None
-            scene.events = self._events.look(scene, tuple(actions))
-        except _TRACI_ERRORS as error:
-            raise _gave_up(error) from error
+        if self._taking_part is not None:
+            self._taking_part.remove()
+        self._steps += 1
+        self._look()
+        scene, present = self._scene, self._scene.roster.index
+        observations: Observations = {}
+        rewards: dict[str, float] = {}
+        terminations: dict[str, bool] = {}
+        for agent in actions:
+            row = present.get(agent)
+            observations[agent] = self._kinematics.blank() if row is None else self._observe(agent, row)
+            rewards[agent] = 0.0 if row is None else scene.speed(row) * self.step_length_s
+            terminations[agent] = row is None
+        scene.events = self._events.look(scene, tuple(actions))
         self._shown = observations
         if scene.contacts or self._off_road:
             hit = {name for contact in scene.contacts for name in (contact.collider, contact.victim)}
@@ -311,11 +310,11 @@ class SumoSimulator:
             self._sight,
             self._events,
             self._kinematics,
+            simulate=_simulating(),
             present=lambda: Present(self._scene, self._shown, self._steps),
             arrive=self._arrive,
-            apply=self._apply_alone,
-            finish=self._finish,
-            explained=_explained,
+            apply=_part(self._apply_alone),
+            finish=_part(self._finish),
             edge=self._driving.edge,
             start_m=self._start[agent],
             step_length_s=self.step_length_s,
@@ -369,13 +368,26 @@ class SumoSimulator:
         )
 
 
-def _explained(error: BaseException) -> BaseException:
-    """What a step raises in place of an exception of SUMO's."""
-    if not isinstance(error, _TRACI_ERRORS):
-        return error
-    found = _gave_up(error)
-    found.__cause__ = error
-    return found
+# By the calls that a fault has come through it is told from others: a part of a step is in a frame called as that of a
+# whole one is.
+def _part(do: Callable[P, T]) -> Callable[P, T]:
+    def step(*given: P.args, **named: P.kwargs) -> T:
+        try:
+            return do(*given, **named)
+        except _TRACI_ERRORS as error:
+            raise _gave_up(error) from error
+
+    return step
+
+
+def _simulating() -> Callable[[], None]:
+    def step() -> None:
+        try:
+            libsumo.simulationStep()
+        except _TRACI_ERRORS as error:
+            raise _gave_up(error) from error
+
+    return step
 
 
 def _gave_up(error: BaseException) -> SimulatorError:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
-import libsumo
 import numpy as np
 from libsumo import _libsumo as sumo
 
@@ -54,11 +54,11 @@ class UsualSteps:
         sight: what scenes are read by.
         events: what looks for events.
         kinematics: what observations are made by.
+        simulate: simulates a step.
         present: returns where the simulator is.
         arrive: called with where the core has come to.
         apply: applies an action; returns whether there is nothing about it to look into.
         finish: does what is left of a step that has been simulated.
-        explained: returns what the simulator raises in place of an exception of SUMO's.
         edge: returns the number of lanes of an edge, and the width of its first.
         start_m: how far the agent had driven at the start, in m.
         step_length_s: in s.
@@ -75,11 +75,11 @@ class UsualSteps:
         events: SumoEvents,
         kinematics: Kinematics,
         *,
+        simulate: Callable[[], None],
         present: Callable[[], Present],
         arrive: Callable[[Present], None],
         apply: Callable[[str, NDArray[np.generic]], bool],
         finish: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
-        explained: Callable[[BaseException], BaseException],
         edge: Callable[[str], tuple[int, float]],
         start_m: float,
         step_length_s: float,
@@ -90,11 +90,11 @@ class UsualSteps:
         self._core, self._agent = core, agent
         self._sight, self._events, self._kinematics = sight, events, kinematics
         self._present, self._arrive = present, arrive
-        self.apply, self.finish, self.explained = apply, finish, explained
+        self.apply, self.finish = apply, finish
         shape = kinematics.shape
         self.core = core.UsualSteps(
-            agent, libsumo, (np.ndarray, shape, _OBSERVED), shape[0] - 1, step_length_s, lateral, takes_speed,
-            sight.around, start_m,
+            agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _OBSERVED), shape[0] - 1,
+            step_length_s, lateral, takes_speed, sight.around, start_m,
         )  # fmt: skip
         self._edge, self._instead_of = edge, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
