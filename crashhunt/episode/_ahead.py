@@ -47,6 +47,9 @@ class Ahead:
         recorder: of the episode.
         agent: the only one of the episode.
         encode: encodes its actions.
+
+    Attributes:
+        cannot_record: whether recording is what has failed, where something has.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class Ahead:
     ) -> None:
         self.at_once = at_once
         self._recorder, self._agent, self._encode = recorder, agent, encode
+        self.cannot_record = False
         at_once.core.listen(at_once.enter, self._record_roster)
 
     def go_on_from(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
@@ -84,7 +88,9 @@ class Ahead:
 
     def _record_roster(self) -> None:
         """Have the core record steps of those who are in sight."""
+        self.cannot_record = True
         self._recorder.lend(self.at_once.core, self.at_once.roster)
+        self.cannot_record = False
 
 
 def goes_ahead(

@@ -68,9 +68,10 @@ class Ending:
     def _fail_at_once(self, error: BaseException) -> TrialResult:
         """End with an exception that has come through the core."""
         assert self._ahead is not None
-        at_once = self._ahead.at_once
-        if at_once.core.simulating and isinstance(error, RecorderError):
+        if self._ahead.cannot_record and isinstance(error, RecorderError):
             raise error
-        if not at_once.core.simulating:
+        if self._ahead.cannot_record:
+            return self._break(error)
+        if not self._ahead.at_once.core.simulating:
             return self._fail(Outcome.AGENT_ERROR, error, self.names[0])
         return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, error)

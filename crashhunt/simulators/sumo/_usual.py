@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 from libsumo import _libsumo as sumo
@@ -26,6 +26,17 @@ __all__ = ["Present", "UsualSteps"]
 
 _ROSTERS = 3  # of the last scene and the one before; that of the next may not come to be
 _OBSERVED = np.dtype("<f4")
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class MakesPart(Protocol):
+    """Makes of what does a part of a step one that raises what a step does."""
+
+    def __call__(self, do: Callable[P, T], /) -> Callable[P, T]:
+        """Return it."""
 
 
 class Present(NamedTuple):
@@ -55,6 +66,7 @@ class UsualSteps:
         events: what looks for events.
         kinematics: what observations are made by.
         simulate: simulates a step.
+        part: makes of what does a part of a step one that raises what a step does.
         present: returns where the simulator is.
         arrive: called with where the core has come to.
         apply: applies an action; returns whether there is nothing about it to look into.
@@ -76,6 +88,7 @@ class UsualSteps:
         kinematics: Kinematics,
         *,
         simulate: Callable[[], None],
+        part: MakesPart,
         present: Callable[[], Present],
         arrive: Callable[[Present], None],
         apply: Callable[[str, NDArray[np.generic]], bool],
@@ -90,7 +103,7 @@ class UsualSteps:
         self._core, self._agent = core, agent
         self._sight, self._events, self._kinematics = sight, events, kinematics
         self._present, self._arrive = present, arrive
-        self.apply, self.finish = apply, finish
+        self.apply, self.finish, self.enter = part(apply), part(finish), part(self._enter)
         shape = kinematics.shape
         self.core = core.UsualSteps(
             agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _OBSERVED), shape[0] - 1,
@@ -114,7 +127,7 @@ class UsualSteps:
         """Who is in sight, or will be after the step that the core takes."""
         return self._sight.roster
 
-    def enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
+    def _enter(self, ids: tuple[str, ...]) -> tuple[Vehicles, tuple[str, ...], int, dict[str, object]] | None:
         """Take note of who is in sight; None where there is more about them than the core knows."""
         self._sight.see(ids)
         seen, row = self._sight.plain, self.roster.index.get(self._agent)
