@@ -255,6 +255,10 @@ def test_pytest_chooses_repeats_and_spreads_cases(kept):
     assert "1 failed" in pytest_run(kept, "kept crashes", "--lf").stdout
     drive(kept, MENDED)
     assert "1 passed" in pytest_run(kept, "kept crashes", "--lf").stdout
+    (kept.folder / "driver.py").unlink()
+    said = pytest_run(kept, "kept crashes").stdout
+    assert said.count("cannot be imported") == 2
+    assert "look at it" not in said  # nothing is kept of what cannot run
 
 
 def test_pytests_start_imports_the_thin_module_only():
