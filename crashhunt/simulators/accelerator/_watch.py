@@ -60,7 +60,8 @@ class Watch:
     @classmethod
     def of_observations(cls, but: Iterable[str]) -> Watch:
         """Watch what the observations that are sped up are made of."""
-        wanted = ("ObservationType", "KinematicObservation", "KinematicsGoalObservation", "OccupancyGridObservation")
+        kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
+        wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
         places = [(name, space) for name, space in _classes(observation) if name in wanted]
         return cls([(observation.__name__, vars(observation)), *places], but)
 

@@ -9,6 +9,7 @@ import logging
 import math
 import warnings
 from collections import Counter
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.simulators.highway._lean import highway_env  # before anything else imports it
@@ -31,7 +32,7 @@ from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, n
 from crashhunt.simulators._kinematics import Kinematics
 from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
-from crashhunt.simulators.accelerator import Onlooker, switch_off, switch_on
+from crashhunt.simulators.accelerator import Onlooker, Unasked, switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
 from crashhunt.simulators.highway._hidden import Hidden
@@ -139,7 +140,8 @@ class HighwaySimulator:
             for agent in self._possible
         ]
         self._contacts = []
-        shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
+        with self._unasked:
+            shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
         self._steps += 1
         if self._taking_part is not None:
             self._taking_part.remove()
@@ -246,6 +248,7 @@ class HighwaySimulator:
     def _adopt(self, env: AbstractEnv) -> None:
         """Take an environment over: its vehicles, and how its observations and actions are written."""
         self._env = env
+        self._unasked = Unasked(env) if self._kinematics is not None else nullcontext()
         rate = env.config["simulation_frequency"]
         self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # as long as it simulates
         chosen = self._setup.off_road
