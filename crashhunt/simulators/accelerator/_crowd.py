@@ -45,6 +45,7 @@ class Crowd:
         places: shape (things, 2), in m.
         headings: in rad.
         speeds: in m/s.
+        lanes: the numbers of the lanes on which vehicles are, once `move` has found them.
         idm: the rows of vehicles that decide by themselves.
         controlled: the rows of vehicles that keep to a speed and a lane.
         sliding: the rows of vehicles that move by the dynamic model.
@@ -72,6 +73,7 @@ class Crowd:
         self.headings, self.speeds = np.array(poses, float).reshape(-1, 2).T.copy()
         self.idm = [row for row, how in enumerate(self.how) if how == "idm"]
         self.controlled = [row for row, how in enumerate(self.how) if how == "controlled"]
+        self.lanes: NDArray[np.intp] | None = None
         self.sliding = [row for row, kind in enumerate(kinds[:count]) if kind.slides]
         self.timed = [vehicle for vehicle, kind in zip(self.vehicles, kinds, strict=False) if kind.times]
 

@@ -54,7 +54,8 @@ class _Decisions:
         vehicles, index, number = crowd.vehicles, self.network.index, self.network.number
         self.idm = [row for row in crowd.idm if not vehicles[row].crashed]
         self.rows = sorted(crowd.controlled + self.idm) if crowd.controlled else self.idm
-        self.lanes = np.array([number.get(id(vehicle.lane), -1) for vehicle in vehicles])
+        lanes = crowd.lanes
+        self.lanes = np.array([number.get(id(v.lane), -1) for v in vehicles]) if lanes is None else lanes
         targets = [index.get(vehicles[row].target_lane_index, -1) for row in self.rows]
         self.wanted = [getattr(vehicle, "target_speed", 0) for vehicle in vehicles]
         timers = [vehicles[row].timer for row in self.idm]

@@ -71,13 +71,15 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) 
     crowd.places, crowd.headings[:count], crowd.speeds[:count] = places, turned, faster
     frame = Frame(network, crowd.road, places, frame)
     if not np.isfinite(places).all() or not np.isfinite(turned).all():
+        crowd.lanes = None
         for vehicle in vehicles:
             vehicle.on_state_update()
         return frame
-    keys, lanes = network.keys, network.lanes
-    for vehicle, lane in zip(vehicles, _closest(frame, turned), strict=True):
+    keys, lanes, closest = network.keys, network.lanes, _closest(frame, turned)
+    for vehicle, lane in zip(vehicles, closest, strict=True):
         vehicle.lane_index = keys[lane]
         vehicle.lane = lanes[lane]
+    crowd.lanes = np.array(closest)
     return frame
 
 
@@ -137,17 +139,18 @@ def _closest(frame: Frame, heading: NDArray[np.float64]) -> list[int]:
     """`RoadNetwork.get_closest_lane_index` of every vehicle."""
     network = frame.network
     count = len(heading)
-    best, nearest = [math.inf] * count, [-1] * count
+    best = [math.inf] * count
+    nearest: list[int] = [-1] * count
     if len(network.axis):
         s, r = frame.on_axis
         s, r = s[:count], r[:count]
-        angle = np.abs(wrap_to_pi(heading[:, None] - network.heading))
+        angle = np.abs(wrap_to_pi(heading[:, None] - network.headings))
         distance = np.abs(r) + np.maximum(s - network.length, 0) + np.maximum(0 - s, 0) + 1.0 * angle
         columns = distance.argmin(axis=1)
-        best = distance[np.arange(count), columns].tolist()
         nearest = network.axis[columns].tolist()
-    if not network.others:
-        return nearest
+        if not network.others:
+            return nearest
+        best = distance[np.arange(count), columns].tolist()
     headings, boxes = heading.tolist(), frame.boxes[:count]
     vehicles = frame.road.vehicles
     for row in range(count):

@@ -74,6 +74,8 @@ class Network:
         table = np.array(columns, float).reshape(-1, 8).T
         self.start_x, self.start_y, self.along_x, self.along_y, self.across_x, self.across_y = table[:6]
         self.length, self.heading = table[6:]
+        # One for all of them where they run in parallel.
+        self.headings = self.heading[:1] if len(set(self.heading.tolist())) == 1 else self.heading
         self.every_length = np.array([lane.length for lane in self.lanes], float)
         self.lengths = [float(lane.length) for lane in self.lanes]
         self.half_widths = [float(lane.width) / 2 + _ON_LANE_MARGIN for lane in self.lanes]

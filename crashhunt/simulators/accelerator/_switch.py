@@ -104,8 +104,11 @@ def _act(self: Road) -> None:
 
 
 def _step(self: Road, dt: float) -> None:
+    if len(self.vehicles) + len(self.objects) < 2:
+        originals["Road.step"](self, dt)
+        return
     everybody = take(self)
-    if everybody is None and (len(self.vehicles) + len(self.objects) < 2 or not is_known(self)):
+    if everybody is None and not is_known(self):
         originals["Road.step"](self, dt)
         return
     found, crowd, before = everybody or (prepared(self, known=True), Crowd(self), None)
@@ -121,7 +124,10 @@ def _step(self: Road, dt: float) -> None:
 
 
 def _simulate(self: AbstractEnv, action: object = None) -> None:
-    simulate(self, action, _OF_ROADS)
+    if self.road is None or len(self.road.vehicles) < 2:
+        originals["AbstractEnv._simulate"](self, action)
+    else:
+        simulate(self, action, _OF_ROADS)
 
 
 def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
