@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import UsageError
+from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
@@ -33,6 +33,7 @@ __all__ = ["Shrunk", "ShrunkData", "shrink", "shrunk_name"]
 
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
 _TRIES = 3  # of what is left of a flaky crash
+_WRITE_AGAIN = "free some space and run the same command again: what came of the trials is remembered"
 
 
 class ShrunkData(TypedDict):
@@ -182,7 +183,13 @@ def shrink(
             runs.close()
     small = None
     if search.reproduced and search.best != rerun.spec:
-        small = _written(rerun, search, signature)
+        try:
+            small = _written(rerun, search, signature)
+        except OSError as error:
+            message = f"{shrunk_name(bundle.id)!r} cannot be written: {error.strerror or error}"
+            raise BundleError(message, fix=_WRITE_AGAIN, where=str(bundle.path.parent)) from None
+        finally:  # what was begun is of no use to anybody
+            shutil.rmtree(bundle.path.with_name(f".{shrunk_name(bundle.id)}.part"), ignore_errors=True)
         if small is None:
             why = "what was left did not do the same in a fresh process"
     if not search.reproduced:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import signal
 import time
 
 import pytest
 
-from crashhunt.crashes import find_bundle, list_bundles
+from crashhunt.crashes import find_bundle, list_bundles, write_bundle
 from crashhunt.errors import BundleError, UsageError
 from crashhunt.shrinking import shrink
 from crashhunt.triage import signature_of
@@ -75,6 +77,88 @@ def test_a_crash_that_does_not_come_again_is_told(hunt, monkeypatch):
     (bundle.path / "log.mcap").unlink()
     with pytest.raises(BundleError):
         shrink(bundle)
+
+
+def test_a_full_disk_is_told_and_what_came_of_the_trials_is_remembered(hunt, monkeypatch):
+    bundle = find_bundle(hunt.folder / "h")
+    folder = bundle.path.parent
+
+    def full(hunt_folder, result, trial, **how):
+        if "name" in how:  # of what is left; what is written to be looked at is elsewhere
+            (folder / f".{how['name']}.part").mkdir()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write_bundle(hunt_folder, result, trial, **how)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("crashhunt.shrinking._shrink.write_bundle", full)
+        with pytest.raises(BundleError, match=r"small' cannot be written: No space left") as raised:
+            shrink(bundle, parallel=1)
+    assert "run the same command again" in raised.value.fix
+    (memory,) = folder.glob(".*")
+    assert memory.stat().st_size > 0
+    run_again = []
+    monkeypatch.setattr("crashhunt.shrinking._runs.Runs._remember", lambda _, spec, ran: run_again.append(spec))
+    found = shrink(bundle, parallel=1)
+    assert (found.verdict, found.ended, run_again) == ("shrunk", "done", [])
+    assert not list(folder.glob(".*"))
+
+
+BAD = """
+import os
+
+class Dies:
+    def __init__(self, speed: float = 12.0):
+        self.speed = speed
+
+    def reset(self, seed):
+        self.steps = 0
+
+    def act(self, observation):
+        self.steps += 1
+        if self.steps > 20 and self.speed > 5:
+            os._exit(7)
+        return self.speed, 0
+
+class Flaky(Dies):
+    def act(self, observation):
+        self.steps += 1
+        if self.steps == 6 and os.urandom(1)[0] < 160:
+            raise ValueError("now and then")
+        return min(self.speed, 6.0), 0
+"""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("agent", "words", "confirmed"), [("Dies", (), True), ("Dies", ("--no-snapshot",), True), ("Flaky", (), None)]
+)
+def test_a_dead_process_a_flaky_crash_and_one_without_a_snapshot_become_smaller(toy, agent, words, confirmed):
+    (toy.folder / "bad.py").write_text(BAD, encoding="utf-8")
+    given = ("--scenario", "toy", "--agent", f"bad:{agent}", "--arg", "speed=6.1234:14", "--seed", "1", *words)
+    toy.crashhunt("run", "h", "1", "30", "60", *given)
+    told = toy.crashhunt("shrink", "h", "--json", expect=None).json
+    if confirmed is None and told["verdict"] == "not_reproduced":  # by chance, three or ten times
+        assert "did not come again" in told["why"]
+        return
+    assert told["verdict"] == "shrunk"
+    small = find_bundle(toy.folder / "h", f"{told['crash']}.small")
+    assert small.result.outcome is find_bundle(toy.folder / "h").result.outcome
+    if confirmed is not None:
+        assert told["confirmed"] is confirmed
+        assert toy.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
+    assert any("--no-snapshot" in note for note in told["notes"]) is bool(words)
+
+
+@pytest.mark.nightly
+def test_of_several_agents_one_is_left_in_traffic(shell):
+    words = ("--scenario", "loop-two-agents", "--seed", "1", "--keep-going")
+    shell.crashhunt("run", "h", "2", "10", "600", *words)
+    told = shell.crashhunt("shrink", "h", "--json").json
+    small = find_bundle(shell.folder / "h", f"{told['crash']}.small")
+    assert (told["confirmed"], told["actors_after"] <= 3) == (True, True)
+    assert list(small.result.spec.arguments) == [path.actor.id for path in small.result.spec.script.agents]
+    assert len(small.result.spec.arguments) == 1
+    assert shell.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
 
 
 @pytest.mark.nightly
