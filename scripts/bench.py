@@ -88,7 +88,7 @@ def child_step(scenario: str) -> dict[str, float]:
     from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.simulators.sumo import SumoSimulator
+    from crashhunt.simulators.sumo import SumoSimulator, UsualSteps
     from crashhunt.trial import TrialSpec
     from crashhunt.world import ApproachMeter, DangerMeter
 
@@ -97,18 +97,20 @@ def child_step(scenario: str) -> dict[str, float]:
     chosen = load_scenario(scenario)
     agents = list(chosen.agents)
     spent: dict[str, float] = {}
+    within = [0.0]  # what has been spent in parts of the part that is going on, and of those around it
 
-    def timed(owner: object, name: str, label: str) -> None:
-        inner = getattr(owner, name)
-
+    def timed(inner: Callable[..., object], label: str) -> Callable[..., object]:
         def outer(*arguments: object, **options: object) -> object:
+            within.append(0.0)
             began = clock()
             try:
                 return inner(*arguments, **options)
             finally:
-                spent[label] = spent.get(label, 0.0) + clock() - began
+                took = clock() - began
+                spent[label] = spent.get(label, 0.0) + took - within.pop()
+                within[-1] += took
 
-        setattr(owner, name, outer)
+        return outer
 
     with folder() as stage:
         simulator = SumoSimulator(chosen, stage)
@@ -116,7 +118,7 @@ def child_step(scenario: str) -> dict[str, float]:
         arguments = argument_values(chosen)
         spec = TrialSpec(0, 1, {}, arguments, max_steps=steps)
 
-        def whole() -> float:
+        def whole(*, parts: bool = False) -> float:
             box.begin(pid=os.getpid(), trial=0, started=time.monotonic())
             with Episode(
                 spec,
@@ -127,6 +129,8 @@ def child_step(scenario: str) -> dict[str, float]:
                 observers=[Recorder(box, simulator), Nearness(box.take_frames)],
             ) as episode:
                 result = episode.start()
+                if parts and episode._take is not None:
+                    episode._take = timed(episode._take, "core")  # type: ignore[assignment]
                 spent.clear()  # the warm-up is no part of a step
                 began = clock()
                 while result is None:
@@ -150,16 +154,18 @@ def child_step(scenario: str) -> dict[str, float]:
         rounds = [(whole(), *bare()) for _ in range(7)]
         for owner, name, label in (
             (libsumo, "simulationStep", "simulate"),
-            (SumoSimulator, "_look", "look"),
-            (SumoSimulator, "_observe", "observe"),
-            (Episode, "_find", "oracles"),
-            (Recorder, "scene", "record"),
             (KeepLaneWithSpeed, "act", "agent"),
+            (UsualSteps, "enter", "others in sight"),
+            (Recorder, "lend", "others recorded"),
+            (Episode, "_step", "steps in Python"),
+            (Episode, "_look_into", "oracles asked"),
+            (Nearness, "_take_in", "frames"),
             (ApproachMeter, "measure", "closest approach"),
             (DangerMeter, "_summed", "danger"),
+            (Recorder, "end", "digest"),
         ):
-            timed(owner, name, label)
-        total = whole() * steps
+            setattr(owner, name, timed(getattr(owner, name), label))
+        total = whole(parts=True) * steps
     found = {f"part {label}": 1e6 * seconds / steps for label, seconds in spent.items()}
     found["part everything else"] = 1e6 * total / steps - sum(found.values())
     return {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import struct
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -116,15 +116,17 @@ class Recorder(Observer):
         # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
         numbers = list(map(self._same.get, map(id, actors)))
         if None in numbers:
-            others = [actor for actor, number in zip(actors, numbers, strict=True) if number is None]
-            fresh = [actor for actor in others if actor not in self._numbers]
+            fresh, known = [], self._numbers
+            for row, number in enumerate(numbers):
+                if number is None:
+                    actor, free = actors[row], len(known)
+                    numbers[row] = self._same[id(actor)] = known.setdefault(actor, free)
+                    self._kept.append(actor)  # so that nobody else gets its identity
+                    if len(known) > free:
+                        fresh.append(actor)
             if fresh:
-                self._numbers.update(zip(fresh, itertools.count(len(self._numbers)), strict=False))
                 self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
-            self._same.update({id(actor): self._numbers[actor] for actor in others})
-            self._kept += others  # so that nobody else gets their identities
-            numbers = [self._same[id(actor)] for actor in actors]
-        self._box.append(Tag.ROSTER, 0, np.array(numbers, "<u4").tobytes())
+        self._box.append(Tag.ROSTER, 0, struct.pack(f"<{len(numbers)}I", *numbers))
         self._roster = roster
 
     def copied(self) -> None:

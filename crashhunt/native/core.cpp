@@ -261,6 +261,13 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     }
     Roster *roster = self->roster = new Roster();
     for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(names); row++) {
+        Py_ssize_t size;
+        const char *known = PyUnicode_AsUTF8AndSize(PyTuple_GET_ITEM(names, row), &size);
+        if (known) {
+            roster->ids.emplace_back(known, static_cast<size_t>(size));
+            continue;
+        }
+        PyErr_Clear();
         // As libsumo's own getters take names.
         PyObject *text = PyUnicode_AsEncodedString(PyTuple_GET_ITEM(names, row), "utf-8", "surrogateescape");
         if (!text) {

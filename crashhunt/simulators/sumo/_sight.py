@@ -186,7 +186,9 @@ class Sight:
 
     def _see(self, ids: tuple[str, ...], persons: tuple[str, ...]) -> None:
         self._ids, self._persons = ids, persons
-        self._roster = roster = Roster((*map(self._actor, ids), *map(self._person, persons)))
+        known, actor = self._known.get, self._actor
+        actors = [known(vehicle) or actor(vehicle) for vehicle in ids]
+        self._roster = roster = Roster((*actors, *map(self._person, persons)) if persons else tuple(actors))
         self._long = []
         if self._articulated:
             self._long = [row for row, vehicle in enumerate(ids) if vehicle in self._articulated]
