@@ -209,8 +209,14 @@ REAL = {
          "arguments": {"blind_spot_m": "0:12", "desired_speed": "18:32", "patience_s": "1:4"},
          "scenario_arguments": {"motorway_demand": "2200:3000"}}, warmup_s=12.0, held_out=True,
     ),
+    "motorway-blind": Real(
+        "lane changes with a long blind spot on a full motorway of SUMO", 1 / 10,
+        {"scenario": "motorway", "agents": {"": "lane-changer"}, "max_steps": 140,
+         "arguments": {"blind_spot_m": "4:14", "desired_speed": "24:34", "patience_s": "0.5:3"},
+         "scenario_arguments": {"demand": "3000:4500"}}, warmup_s=8.0,
+    ),
     "highway-calm": Real(
-        "car following with a short delay and a fair headway on highway-env", 1 / 200,
+        "car following with a short delay and a fair headway on highway-env", 1 / 150,
         {"scenario": "highway", "agents": {"": "car-following"}, "max_steps": 15,
          "arguments": {"delay_s": "0.2:0.8", "headway_s": "0.4:2"}, "scenario_arguments": {"vehicles_count": "6:12"}},
         held_out=True,

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from peers import PEERS
 from problems import PROBLEMS, REAL
+from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, table, write_plot
 
 from crashhunt.episode import WorkerSettings
@@ -282,6 +283,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a few hunts, in seconds: shows only that nothing broke")
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
+    parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     options = parser.parse_args(words)
@@ -289,6 +291,10 @@ def main(words: Sequence[str] | None = None) -> int:
         options.samplers, options.problems, options.repetitions = "random,halton,guided", "easy,blind,motorway", 2
     seeds = range(options.first_seed, options.first_seed + options.repetitions)
     samplers, names = options.samplers.split(","), options.problems.split(",")
+    if options.kinds:
+        write_kinds(options.store, names, samplers, seeds, options.kinds, options.parallel)
+        print(kinds_table(options.store))
+        return 0
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
     known = () if options.again else (*runs,)
     for found in (

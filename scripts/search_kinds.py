@@ -1,0 +1,116 @@
+"""How many kinds of crashes samplers find within a number of trials: ``scripts/search --kinds TRIALS``.
+
+Kinds are those that ``crashhunt crashes`` tells apart, of the recordings; samplers are told no more than results.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from peers import PEERS
+from problems import REAL
+
+from crashhunt.crashes import write_bundle
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import PoolExecutor, read_map
+from crashhunt.hunts import spec_of
+from crashhunt.plans import Request, plan, sampler_of, with_settings
+from crashhunt.triage import signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import TrialResult
+
+__all__ = ["kinds_table", "write_kinds"]
+
+_LAG = 4
+
+
+class _Kinds:
+    """Trials on a simulator, and the kinds of their crashes."""
+
+    def __init__(self, pool: PoolExecutor, folder: Path) -> None:
+        self._pool, self._folder = pool, folder
+
+    def hunt(self, settings: HuntSettings, trials: int) -> list[str]:
+        """Return the kind of each crash, in the order of trials."""
+        sampler = sampler_of(settings)
+        results: dict[int, TrialResult] = {}
+        found: dict[int, str] = {}
+        asked = told = 0
+        while len(results) < trials:
+            if asked < trials and told >= asked - _LAG + 1:
+                self._pool.submit(spec_of(asked, settings, sampler))
+                asked += 1
+                continue
+            for result in self._pool.completed(1.0):
+                results[result.spec.number] = result
+                if result.outcome in settings.crash_on:
+                    found[result.spec.number] = self._kind(result)
+            while told in results and told <= asked - _LAG:
+                if sampler.learns:
+                    sampler.tell(results[told])
+                told += 1
+        return [found[number] for number in sorted(found)]
+
+    def _kind(self, result: TrialResult) -> str:
+        trial = scratch_of(self._folder, result.spec.number)
+        lanes = read_map(self._folder, trial)
+        with tempfile.TemporaryDirectory(dir=self._folder) as place:
+            return str(signature_of(write_bundle(Path(place), result, trial, hunt_seed=0, snapshot="", lanes=lanes)))
+
+
+def kinds_of(
+    name: str, samplers: Sequence[str], seeds: Sequence[int], trials: int, parallel: int
+) -> Iterator[tuple[str, int, list[str]]]:
+    """Yield, for each hunt on a problem, its sampler, its seed and the kinds of its crashes."""
+    problem = REAL[name]
+    with tempfile.TemporaryDirectory(prefix="crashhunt-kinds-") as folder:
+        scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
+        if problem.warmup_s is not None:
+            scenario = replace(scenario, warmup_s=problem.warmup_s)
+        working = WorkerSettings(
+            scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
+            scratch=Path(folder),
+        )  # fmt: skip
+        pool = PoolExecutor(working, parallel=parallel)
+        try:
+            for seed in seeds:
+                for sampler in samplers:
+                    asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
+                    yield sampler, seed, _Kinds(pool, Path(folder)).hunt(plan(asked)[1], trials)
+        finally:
+            pool.close()
+
+
+def write_kinds(
+    path: Path, names: Sequence[str], samplers: Sequence[str], seeds: Sequence[int], trials: int, parallel: int
+) -> None:
+    """Hunt, and add to a file of JSON: problem to sampler to seed to the kinds of crashes, in order."""
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    for name in names:
+        row = found.setdefault(name, {"trials": trials})
+        left = [seed for seed in seeds if any(str(seed) not in row.get(sampler, {}) for sampler in samplers)]
+        for sampler, seed, kinds in kinds_of(name, samplers, left, trials, parallel) if left else ():
+            row.setdefault(sampler, {})[str(seed)] = kinds
+            path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def kinds_table(path: Path) -> str:
+    """Return it as Markdown: the mean numbers of kinds and of crashes in a hunt."""
+    lines = ["| problem | trials | hunts | sampler | kinds | crashes |", "| --- | ---: | ---: | --- | ---: | ---: |"]
+    for name, row in json.loads(path.read_text(encoding="utf-8")).items():
+        for sampler, hunts in row.items():
+            if sampler != "trials":
+                many, kinds = len(hunts), sum(len({*of}) for of in hunts.values())
+                crashes = sum(len(of) for of in hunts.values())
+                lines.append(
+                    f"| {name} | {row['trials']} | {many} | {sampler} | {kinds / many:.1f} | {crashes / many:.1f} |"
+                )
+    return "\n".join(lines)
