@@ -59,6 +59,22 @@ JAM = EGO.replace("10", "80", 1) + (
     + '<vehicle id="jammed" depart="0" departPos="180" departSpeed="0"><route edges="wc ce"/></vehicle>'
     + "".join(STAND.format(f"full{row}", 43 + 48 * row, "ce", "ce_0", 6, "tram") for row in range(4))
 )
+# The same with lorries, of whom the first drives into a lay-by and the others stay: whom SUMO has taken out comes back
+# in a step in which nobody else comes or goes.
+LAY_BY = '<stop lane="ce_0" endPos="11.5" duration="6"/><stop lane="ce_0" endPos="13" duration="999" parking="true"/>'
+BACK = EGO.replace("10", "80", 1) + (
+    '<vType id="lorry" length="11"/>'
+    + STAND.format("stopped", 190, "wc ce", "wc_0", 999, "DEFAULT_VEHTYPE")
+    + '<vehicle id="jammed" depart="0" departPos="180" departSpeed="0"><route edges="wc ce"/></vehicle>'
+    + '<vehicle id="full" type="lorry" depart="0" departPos="11.5" departSpeed="0"><route edges="ce"/>'
+    + f"{LAY_BY}</vehicle>"
+    + "".join(STAND.format(f"full{row}", 27 + 14.9 * row, "ce", "ce_0", 999, "lorry") for row in range(12))
+)
+# The trams of before, which the core leaves to Python, and one lay-by for them.
+BACK_TO_TRAMS = JAM.replace('duration="6"', 'duration="999"').replace(
+    '<stop lane="ce_0" endPos="43" duration="999"/>',
+    '<stop lane="ce_0" endPos="43" duration="6"/><stop lane="ce_0" endPos="45" duration="999" parking="true"/>',
+)
 WORLDS = {
     "crash": ("street", CRASH, 0.1, 80),
     "come and go": ("street", COME_AND_GO, 0.1, 75),
@@ -67,6 +83,8 @@ WORLDS = {
     "bridge": ("bridge", BRIDGE, 0.1, 60),
     "bend": ("rail", BEND, 0.1, 120),
     "jam": ("street", JAM, 0.1, 110),
+    "back": ("street", BACK, 0.1, 110),
+    "back to trams": ("street", BACK_TO_TRAMS, 0.1, 110),
 }
 
 
