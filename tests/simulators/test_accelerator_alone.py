@@ -261,6 +261,24 @@ def test_a_lane_that_somebody_says_a_vehicle_is_on():
     assert slow == fast
 
 
+class Splitting(behavior.IDMVehicle):
+    def step(self, dt):
+        super().step(dt)
+        if len(self.road.vehicles) == 1:
+            self.road.vehicles.append(behavior.IDMVehicle(self.road, np.add(self.position, (3.0, 0.1)), 0.0, 5.0))
+
+
+@pytest.mark.parametrize("kind", [behavior.IDMVehicle, Splitting])
+def test_a_vehicle_that_is_the_only_one_when_the_road_begins_to_move(kind):
+    def make():
+        place = two_roads([([20.0, 0.0], 0.3, {})])
+        place.vehicles[0].__class__ = kind
+        return place
+
+    slow, fast = both(make, lambda place: stepped(place, 4))
+    assert slow == fast
+
+
 def test_vehicles_in_the_very_same_place():
     def make():
         poses = [([3.0 + 7 * (number // 2), 4.0 * (number % 3 == 0)], 0.08 * number, SLOW) for number in range(28)]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     Path = tuple[list[NDArray[np.float64]], list[float]]  # positions and headings that are predicted
 
-__all__ = ["collide", "enforce", "move"]
+__all__ = ["collide", "collide_one_by_one", "enforce", "move"]
 
 _DICTS, _FLOATS = frozenset((dict,)), frozenset((float,))
 _MARGIN = 1e-6  # m; what is nearer than this is left to the exact test
@@ -178,11 +178,7 @@ def collide(road: Road, dt: float, crowd: Crowd) -> bool:
     """
     pairs = crowd.pairs if crowd.collides else None
     if pairs is None:
-        for number, vehicle in enumerate(road.vehicles):
-            for other in road.vehicles[number + 1 :]:
-                vehicle.handle_collisions(other, dt)
-            for other in road.objects:
-                vehicle.handle_collisions(other, dt)
+        collide_one_by_one(road, dt)
         return False
     asked, apart = pairs
     (x, y), count = crowd.places.T, len(crowd.vehicles)
@@ -198,6 +194,15 @@ def collide(road: Road, dt: float, crowd: Crowd) -> bool:
             if not _stay_apart(one, two, dt):
                 one.handle_collisions(two, dt)
     return True
+
+
+def collide_one_by_one(road: Road, dt: float) -> None:
+    """Let everybody collide with everybody, in highway-env's own words."""
+    for number, vehicle in enumerate(road.vehicles):
+        for other in road.vehicles[number + 1 :]:
+            vehicle.handle_collisions(other, dt)
+        for other in road.objects:
+            vehicle.handle_collisions(other, dt)
 
 
 def _stay_apart(one: RoadObject, two: RoadObject, dt: float) -> bool:

@@ -21,7 +21,7 @@ from crashhunt.simulators.accelerator._alone import can_run_alone, simulate
 from crashhunt.simulators.accelerator._crowd import Crowd
 from crashhunt.simulators.accelerator._drive import decide
 from crashhunt.simulators.accelerator._known import left_alone, originals, reason_against
-from crashhunt.simulators.accelerator._move import collide, enforce, move
+from crashhunt.simulators.accelerator._move import collide, collide_one_by_one, enforce, move
 from crashhunt.simulators.accelerator._observe import close_objects, fill_lanes, observe, observe_goal
 from crashhunt.simulators.accelerator._roads import (
     forget,
@@ -104,8 +104,11 @@ def _act(self: Road) -> None:
 
 
 def _step(self: Road, dt: float) -> None:
-    if len(self.vehicles) + len(self.objects) < 2:
-        originals["Road.step"](self, dt)
+    if len(self.vehicles) + len(self.objects) < 2:  # nothing to gain: cheaper than the original, which looks for pairs
+        for vehicle in self.vehicles:
+            vehicle.step(dt)
+        if len(self.vehicles) + len(self.objects) > 1:
+            collide_one_by_one(self, dt)
         return
     everybody = take(self)
     if everybody is None and not is_known(self):
