@@ -20,7 +20,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +35,8 @@ from crashhunt.triage import fault_of
 from crashhunt.trial import KINDS, Disturbance, Outcome
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from crashhunt.crashes import Bundle
     from crashhunt.trial import TrialResult
 
@@ -78,11 +79,9 @@ def main() -> int:
     for name in given.scenarios or (TOWNS if given.towns else _SCENARIOS):
         hunt = _hunted(name, given, folder)
         collisions = sorted(_collisions(hunt), key=lambda one: one.result.steps)
-        for bundle in collisions[: given.crashes]:
-            began = time.monotonic()
-            told = {"scenario": name, "of": len(collisions), **_judged(bundle, only_put=given.put)}
-            told["wall_s"] = round(time.monotonic() - began, 2)
-            found.append(told)
+        chosen = collisions[: given.crashes]
+        for judged in _put(chosen) if given.put else map(_judged, chosen):
+            found.append(told := {"scenario": name, "of": len(collisions), **judged})
             with (folder / "judged.jsonl").open("a", encoding="utf-8") as file:
                 file.write(f"{json.dumps(told)}\n")
         print(_about_scenario(name, len(collisions), [each for each in found if each["scenario"] == name]), flush=True)
@@ -114,7 +113,23 @@ def _collisions(hunt: Path) -> list[Bundle]:
     ]
 
 
-def _judged(bundle: Bundle, *, only_put: bool) -> dict[str, Any]:
+def _put(bundles: list[Bundle]) -> Iterator[dict[str, Any]]:
+    """Whether the agent was put into its crash, of each of a hunt, by the same workers; a run or three for each."""
+    if not bundles:
+        return
+    reruns = [prepare(bundle, ReplayOptions(force=True)) for bundle in bundles]
+    with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
+        runs = Reruns(reruns[0], Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
+        try:
+            for bundle, rerun in zip(bundles, reruns, strict=True):
+                first = _overruled(rerun, runs, 0, ("brake",))
+                more = _overruled(rerun, runs, 0, ("left", "right")) if first == ["hit"] else []
+                yield {"crash": bundle.id, "step": bundle.result.steps, "first": [*first, *more]}
+        finally:
+            runs.close()
+
+
+def _judged(bundle: Bundle) -> dict[str, Any]:
     rerun = prepare(bundle, ReplayOptions(force=True))
     hit = bundle.result.collision
     assert hit is not None
@@ -122,10 +137,6 @@ def _judged(bundle: Bundle, *, only_put: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="crashhunt-judged-") as scratch:
         runs = Reruns(rerun, Path(scratch), parallel=len(os.sched_getaffinity(0)), stopped=lambda: False)
         try:
-            if only_put:
-                first = _overruled(rerun, runs, 0, ("brake",))
-                more = _overruled(rerun, runs, 0, ("left", "right")) if first == ["hit"] else []
-                return {**told, "first": [*first, *more]}
             fault = fault_of(bundle, rerun.recorded)
             told |= {"verdict": fault.verdict, "rules": [one.rule for one in fault.findings]}
             told["first"] = _overruled(rerun, runs, 0)

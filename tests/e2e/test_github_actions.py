@@ -64,7 +64,7 @@ class Runner:
 
     def worked_out(self, expression):
         expression = re.sub(
-            r"steps\.(\w+)\.outputs\.([\w-]+)", lambda found: repr(self.steps[found[1]].get(found[2], "")), expression
+            r"steps\.(\w+)\.outputs\.([\w-]+)", lambda found: repr(self.steps.get(found[1], {}).get(found[2], "")), expression
         )
         expression = re.sub(r"inputs\.([\w-]+)", lambda found: repr(self.inputs[found[1]]), expression)
         expression = expression.replace("&&", " and ").replace("||", " or ")
