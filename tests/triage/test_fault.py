@@ -204,8 +204,9 @@ def test_who_steps_out_so_late_that_nobody_could_have_stopped():
     assert "m ahead of ego, which needs 21.0 m to stop" in found.findings[0].words
     silent = [
         drive(straight(12), walks(1.2)),  # no person
-        drive(straight(12), walks(5.5, speed=0.8), name="person 1"),  # there was time
-        drive(straight(2.5), walks(1.2), name="person 1"),  # who drives so slowly can stop
+        drive(straight(25), walks(4.5, speed=0.8), name="person 1"),  # it had been on the road for 2 s
+        drive(straight(4), walks(1.95), name="person 1"),  # it came far enough ahead to stop
+        drive(straight(2.9), walks(1.5, ahead=2.5), name="person 1"),  # who drives so slowly can stop
         drive(straight(12), walks(9.0, speed=0.0, ahead=4.0), name="person 1"),  # it walks nowhere
     ]
     assert not any(finding.rule == "steps out" for case in silent for finding in fault_in(between(case)).findings)
