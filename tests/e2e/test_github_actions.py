@@ -63,9 +63,10 @@ class Runner:
         return re.sub(r"\$\{\{(.*?)\}\}", lambda found: str(self.worked_out(found[1])), str(text))
 
     def worked_out(self, expression):
-        expression = re.sub(
-            r"steps\.(\w+)\.outputs\.([\w-]+)", lambda found: repr(self.steps.get(found[1], {}).get(found[2], "")), expression
-        )
+        def told(found):
+            return repr(self.steps.get(found[1], {}).get(found[2], ""))
+
+        expression = re.sub(r"steps\.(\w+)\.outputs\.([\w-]+)", told, expression)
         expression = re.sub(r"inputs\.([\w-]+)", lambda found: repr(self.inputs[found[1]]), expression)
         expression = expression.replace("&&", " and ").replace("||", " or ")
         return eval(expression.strip(), {"__builtins__": {}}, {"failure": lambda: self.failed, "always": lambda: True})
