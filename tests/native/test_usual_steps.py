@@ -453,6 +453,20 @@ def test_an_agent_that_meddles_with_sumo_sees_the_same(street, what, tmp_path, m
     assert street.comes[DONE] > 10
 
 
+def test_what_sumo_does_not_report_is_seen_by_the_oracle(street):
+    import libsumo
+
+    def meddle(step, _):
+        if step >= 30:  # beside the road, where SUMO looks at nobody, and aslant into the agent
+            x, y = libsumo.vehicle.getPosition("ego")
+            libsumo.vehicle.moveToXY("behind", "", 0, x + 0.4, y + 2.0, 60.0, 2)
+        return 8.0, 0
+
+    result, *_ = street.both(meddle)
+    assert "seen_by=('overlap',)" in result
+    assert street.comes[ASK]
+
+
 @pytest.mark.parametrize("place", range(13))
 def test_what_reads_something_else_takes_no_steps(street, place):
     class Lying:
