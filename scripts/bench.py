@@ -88,7 +88,7 @@ def child_step(scenario: str) -> dict[str, float]:
     from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
     from crashhunt.recording import BlackBox
     from crashhunt.scenario import argument_values, load_scenario
-    from crashhunt.simulators.sumo import SumoSimulator, UsualSteps
+    from crashhunt.simulators.sumo import Sight, SumoSimulator
     from crashhunt.trial import TrialSpec
     from crashhunt.world import ApproachMeter, DangerMeter
 
@@ -155,7 +155,7 @@ def child_step(scenario: str) -> dict[str, float]:
         for owner, name, label in (
             (libsumo, "simulationStep", "simulate"),
             (KeepLaneWithSpeed, "act", "agent"),
-            (UsualSteps, "enter", "others in sight"),
+            (Sight, "see", "others in sight"),
             (Recorder, "lend", "others recorded"),
             (Episode, "_step", "steps in Python"),
             (Episode, "_look_into", "oracles asked"),
