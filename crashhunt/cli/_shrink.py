@@ -90,8 +90,10 @@ def _told(found: Shrunk) -> str:
     was, small = found.bundle.result, found.small
     lines = [f"{found.bundle.id}: {was.summary}"]
     if small is None:
-        what = "it cannot be made smaller" if found.verdict == "not_reproduced" else "nothing could be taken away"
-        lines.append(f"  {what}: {found.why}" if found.why else f"  {what}")
+        what = "nothing had been taken away yet" if _early(found) else "nothing could be taken away"
+        what = "it cannot be made smaller" if found.verdict == "not_reproduced" else what
+        why = found.why or (found.ended if _early(found) else "")
+        lines.append(f"  {what}: {why}" if why else f"  {what}")
         lines += [f"  note: {note}" for note in found.notes]
         return in_lines(lines)
     (before, after), result = found.actors, small.result

@@ -196,18 +196,18 @@ def shrink(
         verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
         return Shrunk(
             bundle, verdict, ended, None, why, search.actors(None), runs.count, runs.steps,
-            notes=rerun.warnings,
+            notes=(*rerun.warnings, *search.notes),
         )  # fmt: skip
     if small is None:
         return Shrunk(
             bundle, "unchanged", ended, None, why, search.actors(None), runs.count, runs.steps,
-            notes=rerun.warnings,
+            notes=(*rerun.warnings, *search.notes),
         )  # fmt: skip
     if ended == "done":
         memory.unlink(missing_ok=True)
     return Shrunk(
         bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count, runs.steps,
-        search.removed(), search.changed(), search.steps_cut, rerun.warnings,
+        search.removed(), search.changed(), search.steps_cut, (*rerun.warnings, *search.notes),
     )  # fmt: skip
 
 

@@ -45,12 +45,14 @@ class Search:
         best: the smallest that did it.
         smaller: all that did it and are smaller, one after another.
         reproduced: whether the crash itself came again.
+        notes: what could not be tried, in words.
     """
 
     def __init__(self, rerun: Rerun, runs: Runs, form: Form) -> None:
         self.best = rerun.spec
         self.smaller: list[TrialSpec] = []
         self.reproduced = False
+        self.notes: list[str] = []
         self._rerun, self._runs, self._form = rerun, runs, form
         self._everybody: tuple[str, ...] = ()
         self._left_out = True
@@ -88,6 +90,8 @@ class Search:
         """Plain arguments first: few trials make a crash that can be read, and leaving out others may take hundreds."""
         self._everybody = self._runs.entered(replace(self.best, only=(EVERYBODY,)))  # of the crash as it was
         self._left_out = bool(self._everybody)
+        if not self._left_out and _actors(self._rerun.recorded) > len(self._rerun.recorded.agents):
+            self.notes.append("all others stay: the simulator, or the crashhunt of the snapshot, can leave nobody out")
         self._plainer_arguments()
         self._until_nothing_helps(self._fewer_others)
 

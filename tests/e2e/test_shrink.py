@@ -40,6 +40,7 @@ def test_arguments_become_plain_and_the_rest_stays(hunt):
         len(str(small.result.spec.arguments["ego"]["speed"])) <= 4 < len(str(was.result.spec.arguments["ego"]["speed"]))
     )
     assert small.added["shrunk"]["changed"] == told["changed"] != {}
+    assert any("can leave nobody out" in note for note in told["notes"])
     assert hunt.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
     assert f"{was.id} made smaller" in hunt.crashhunt("show", "h", "--crash", small.id).out
 
