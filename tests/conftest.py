@@ -6,6 +6,8 @@ import atexit
 import fcntl
 import functools
 import gc
+import importlib
+import importlib.util
 import json
 import os
 import shutil
@@ -22,6 +24,7 @@ import pytest
 from commands import CRASHHUNT, Commands
 
 from crashhunt.base.integrity import describe_files, digest_of_data
+from crashhunt.native import _core
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
@@ -179,6 +182,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         rest = each * (worker + 1) - len(items) if worker + 1 < workers else len(others)
         items += others[: max(rest, 0)]
         del others[: max(rest, 0)]
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A compiled core that was built from other sources than those that are tested is told in one line."""
+    if item.path.parent.name == "native" and importlib.util.find_spec(_core._MODULE) is not None:
+        built, wanted = importlib.import_module(_core._MODULE).INTERFACE, _core._INTERFACE
+        if built != wanted:
+            what = f"the compiled core of this environment is of another version ({built} instead of {wanted})"
+            pytest.fail(f"{what}: build it again with `pip install --no-deps --editable .`", pytrace=False)
 
 
 @pytest.fixture(autouse=True)

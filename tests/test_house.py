@@ -137,6 +137,12 @@ def test_no_module_is_longer_than_four_hundred_lines():
     assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
 
 
+def test_there_is_one_conftest():
+    # Tests import from it, and a second one would be found in its place, or not, by the order of collection.
+    tests = Path(__file__).parent
+    assert [*tests.rglob("conftest.py")] == [tests / "conftest.py"]
+
+
 def test_test_files_have_names_of_their_own():
     # pytest imports two of the same name as one module, and collects neither.
     names = [file.name for file in Path(__file__).parent.rglob("test_*.py")]
