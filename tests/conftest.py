@@ -11,9 +11,11 @@ import importlib.util
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,6 +63,11 @@ def _tidy(folder: Path, pid: int) -> None:
 
 _ROOM = 4 << 30  # bytes; a session needs a tenth of it
 _write_to_memory()
+
+# In the background of a shell, or under nohup, these are ignored, and so they would be by what tests start and stop.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, lambda *_: None)):
+    if signal.getsignal(number) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+        signal.signal(number, handler)
 
 # A loaded machine takes longer than Hypothesis' 200 ms now and then, and nothing is wrong.
 # The examples are others at every run, so that many runs see what few examples do not.
