@@ -55,14 +55,16 @@ class Copied:
         """
         return self._copied(Asleep, work, observed=False)
 
-    def _copied(self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], **how: bool) -> C:
+    def _copied(
+        self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], *, observed: bool
+    ) -> C:
         if not self._goes_on():
             raise RuntimeError("an episode has copies only while it goes on")
 
         def go_on(*asked: Plain) -> Plain:
-            for tell in self._on_copied if how["observed"] else ():
+            for tell in self._on_copied if observed else ():
                 tell()
-            if not how["observed"]:
+            if not observed:
                 self._look_away()
             return work(self, *asked)
 
