@@ -13,7 +13,6 @@ import argparse
 import json
 import math
 import sys
-import tempfile
 import time
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
@@ -26,17 +25,17 @@ from peers import PEERS
 from problems import PROBLEMS, REAL
 from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, table, write_plot
+from search_pool import trials_on
 
-from crashhunt.episode import WorkerSettings
-from crashhunt.executors import PoolExecutor
 from crashhunt.hunts import spec_of
-from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of, with_settings
+from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
     from problems import Problem, Real
+    from search_pool import Trials
 
     from crashhunt.trial import TrialSpec
 
@@ -73,7 +72,9 @@ class Run:
 class Place(Protocol):
     """Where trials end."""
 
-    warmup_steps: int
+    @property
+    def warmup_steps(self) -> int:
+        """Of each trial."""
 
     def confirmed(self, crash: TrialResult) -> bool:
         """Whether it comes again."""
@@ -115,39 +116,49 @@ class Workers:
     """Trials on a simulator, of which none runs twice, unless it is to be confirmed.
 
     Args:
-        pool: where they run.
-        warmup_steps: of each.
+        trials: where they run.
         known: what has run in other hunts.
     """
 
-    pool: PoolExecutor
-    warmup_steps: int = 0
+    trials: Trials
     known: dict[str, TrialResult] = field(default_factory=dict)
     waiting: deque[TrialResult] = field(default_factory=deque)
+
+    @property
+    def warmup_steps(self) -> int:
+        """Of each."""
+        return self.trials.warmup_steps
 
     def submit(self, spec: TrialSpec) -> None:
         """Hand it over, or look it up."""
         known = self.known.get(_what(spec))
         if known is None:
-            self.pool.submit(spec)
+            self.trials.submit(spec)
         else:
             self.waiting.append(replace(known, spec=spec))
 
     def ended(self) -> list[TrialResult]:
-        """Wait for one or more."""
+        """Wait for one or more.
+
+        Raises:
+            RuntimeError: one is invalid, which says nothing about a sampler.
+        """
         found = [*self.waiting]
         self.waiting.clear()
         while not found:
-            found = list(self.pool.completed(1.0))
+            found = [result for result, _ in self.trials.completed()]
             self.known |= {_what(result.spec): result for result in found}
+        for result in found:
+            if result.outcome is Outcome.INVALID:
+                raise RuntimeError(f"{result.failure}")
         return found
 
     def confirmed(self, crash: TrialResult) -> bool:
         """Run it again, and say whether it came out the same to the bit."""
-        self.pool.submit(crash.spec)
-        while not (found := list(self.pool.completed(1.0))):
+        self.trials.submit(crash.spec)
+        while not (found := list(self.trials.completed())):
             pass
-        return found[0].digest == crash.digest
+        return found[0][0].digest == crash.digest
 
 
 def _what(spec: TrialSpec) -> str:
@@ -209,27 +220,14 @@ def real_runs(
     if all((name, sampler, seed) in known for sampler in samplers for seed in seeds):
         return
     most = math.ceil(GIVE_UP / problem.rate)
-    with tempfile.TemporaryDirectory(prefix="crashhunt-search-") as folder:
-        scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
-        warmup_steps = 0
-        if problem.warmup_s is not None:
-            scenario = replace(scenario, warmup_s=problem.warmup_s)
-            warmup_steps = round(problem.warmup_s / scenario.step_length_s)
-        working = WorkerSettings(
-            scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
-            scratch=Path(folder),
-        )  # fmt: skip
-        pool = PoolExecutor(working, parallel=parallel)
-        place = Workers(pool, warmup_steps)
-        try:
-            for seed in seeds:
-                for sampler in samplers:
-                    if (name, sampler, seed) in known:
-                        continue
-                    asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
-                    yield replace(hunted(plan(asked)[1], place, most, name), sampler=sampler)
-        finally:
-            pool.close()
+    with trials_on(problem, parallel) as trials:
+        place = Workers(trials)
+        for seed in seeds:
+            for sampler in samplers:
+                if (name, sampler, seed) in known:
+                    continue
+                asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
+                yield replace(hunted(plan(asked)[1], place, most, name), sampler=sampler)
 
 
 def all_runs(

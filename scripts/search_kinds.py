@@ -7,22 +7,22 @@ from __future__ import annotations
 
 import json
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from peers import PEERS
 from problems import REAL
+from search_pool import trials_on
 
 from crashhunt.crashes import write_bundle
-from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import PoolExecutor, read_map
 from crashhunt.hunts import spec_of
-from crashhunt.plans import Request, plan, sampler_of, with_settings
+from crashhunt.plans import Request, plan, sampler_of
 from crashhunt.triage import signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
+    from search_pool import Trials
 
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import TrialResult
@@ -35,8 +35,8 @@ _LAG = 4
 class _Kinds:
     """Trials on a simulator, and the kinds of their crashes."""
 
-    def __init__(self, pool: PoolExecutor, folder: Path) -> None:
-        self._pool, self._folder = pool, folder
+    def __init__(self, trials: Trials, folder: Path) -> None:
+        self._trials, self._folder = trials, folder
 
     def hunt(self, settings: HuntSettings, trials: int) -> list[str]:
         """Return the kind of each crash, in the order of trials."""
@@ -46,24 +46,23 @@ class _Kinds:
         asked = told = 0
         while len(results) < trials:
             if asked < trials and told >= asked - _LAG + 1:
-                self._pool.submit(spec_of(asked, settings, sampler))
+                self._trials.submit(spec_of(asked, settings, sampler))
                 asked += 1
                 continue
-            for result in self._pool.completed(1.0):
+            for result, recorded in self._trials.completed():
                 results[result.spec.number] = result
                 if result.outcome in settings.crash_on:
-                    found[result.spec.number] = self._kind(result)
+                    found[result.spec.number] = self._kind(result, recorded)
             while told in results and told <= asked - _LAG:
                 if sampler.learns:
                     sampler.tell(results[told])
                 told += 1
         return [found[number] for number in sorted(found)]
 
-    def _kind(self, result: TrialResult) -> str:
-        trial = scratch_of(self._folder, result.spec.number)
-        lanes = read_map(self._folder, trial)
+    def _kind(self, result: TrialResult, recorded: Path) -> str:
+        lanes = self._trials.lanes(recorded)
         with tempfile.TemporaryDirectory(dir=self._folder) as place:
-            return str(signature_of(write_bundle(Path(place), result, trial, hunt_seed=0, snapshot="", lanes=lanes)))
+            return str(signature_of(write_bundle(Path(place), result, recorded, hunt_seed=0, snapshot="", lanes=lanes)))
 
 
 def kinds_of(
@@ -71,22 +70,11 @@ def kinds_of(
 ) -> Iterator[tuple[str, int, list[str]]]:
     """Yield, for each hunt on a problem, its sampler, its seed and the kinds of its crashes."""
     problem = REAL[name]
-    with tempfile.TemporaryDirectory(prefix="crashhunt-kinds-") as folder:
-        scenario, settings = plan(Request(trials=1, seed=1, **problem.request))
-        if problem.warmup_s is not None:
-            scenario = replace(scenario, warmup_s=problem.warmup_s)
-        working = WorkerSettings(
-            scenario=with_settings(scenario, settings), oracles=settings.oracles, crash_on=settings.crash_on,
-            scratch=Path(folder),
-        )  # fmt: skip
-        pool = PoolExecutor(working, parallel=parallel)
-        try:
-            for seed in seeds:
-                for sampler in samplers:
-                    asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
-                    yield sampler, seed, _Kinds(pool, Path(folder)).hunt(plan(asked)[1], trials)
-        finally:
-            pool.close()
+    with trials_on(problem, parallel) as running, tempfile.TemporaryDirectory(prefix="crashhunt-kinds-") as folder:
+        for seed in seeds:
+            for sampler in samplers:
+                asked = Request(trials=1, seed=seed, sampler=PEERS.get(sampler, sampler), **problem.request)
+                yield sampler, seed, _Kinds(running, Path(folder)).hunt(plan(asked)[1], trials)
 
 
 def write_kinds(

@@ -38,7 +38,7 @@ class Executor(Protocol):
         """
 
     def submit(self, spec: TrialSpec) -> None:
-        """Queue a trial."""
+        """Queue a trial. No number may come twice, as a worker may still have the folder of the first."""
 
     def completed(self, timeout_s: float) -> Iterator[TrialResult]:
         """Yield the trials that have ended since the last call, waiting so long for a first one.
