@@ -73,7 +73,8 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         return NO_VALID_TRIAL
     if report.stopped_because == "interrupted":
         return INTERRUPTED
-    return THE_ANSWER_IS_NO if report.crashes and options.fail_on_crash else DONE
+    found = report.crashes or report.copied is not None
+    return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
 
 
 def _leave_at_once(*, as_json: bool) -> NoReturn:

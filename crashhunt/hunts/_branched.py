@@ -13,9 +13,9 @@ from crashhunt.trial import Branches
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._from_the_start import FromTheStart
-    from crashhunt.trial import Branch
+    from crashhunt.trial import Branch, TrialResult
 
-__all__ = ["BranchReport", "BranchReportData", "look_at_branches"]
+__all__ = ["BranchReport", "BranchReportData", "likeliest", "look_at_branches"]
 
 _LIKELIEST = 10  # trials; each takes two processes of its own
 
@@ -99,15 +99,28 @@ def look_at_branches(copies: FromTheStart) -> BranchReport | None:
         sums = [sum(pair) for pair in zip(sums, counts, strict=True)]
         if one.crashes:
             found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
+    kept = copies.kept.get(layout.BRANCHES, {})
     specs = [
-        Found(replace(result.spec, disturbances=branch.disturbances, origin="branch"), branch.outcome, branch.step)
-        for number, branch in sorted(found, key=lambda pair: -_likely(pair[1]))[:_LIKELIEST]
+        _specification(result, branch)
+        for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_likely(pair[1])))[:_LIKELIEST]
         if (result := ledger.result(number)) is not None
     ]
     crashes = copies.crashes(specs, layout.BRANCHES)
     trials, moments, branches, steps, left_out, crashed = sums
     run_again = 0 if copies.is_stopped else len(specs)
     return BranchReport(trials, moments, branches, steps, left_out, crashed, len(found), run_again, crashes)
+
+
+def likeliest(result: TrialResult) -> Found | None:
+    """Return the likeliest branch of a trial that crashed, as it is from the start; None where none did."""
+    if result.branches is None or not result.branches.crashes:
+        return None
+    return _specification(result, max(result.branches.crashes, key=_likely))
+
+
+def _specification(result: TrialResult, branch: Branch) -> Found:
+    spec = replace(result.spec, disturbances=branch.disturbances, origin="branch")
+    return Found(spec, branch.outcome, branch.step)
 
 
 def _likely(branch: Branch) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
@@ -43,10 +43,12 @@ class FromTheStart:
     Args:
         again: runs trials of the hunt again.
         disturber: knows how likely disturbances are; None where the hunt has no models.
+        kept: by folder and trial, what has been run already, and is not run again.
     """
 
     again: RunsAgain
     disturber: Disturber | None
+    kept: dict[str, dict[int, Bundle]] = field(default_factory=dict)
 
     @property
     def is_stopped(self) -> bool:
@@ -58,11 +60,32 @@ class FromTheStart:
 
         Args:
             found: of different trials.
-            folder: of the hunt, for the bundles; what it had before is gone, unless somebody wants to stop.
+            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. Where somebody wants
+                to stop, it stays.
         """
         if self.is_stopped:
             return ()
-        shutil.rmtree(self.again.place.path / folder, ignore_errors=True)
+        place, kept = self.again.place.path / folder, self.kept.get(folder, {})
+        stay = {bundle.path.name for bundle in kept.values()}
+        for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
+            shutil.rmtree(path, ignore_errors=True)
+        crashed = kept | self._run([one for one in found if one.spec.number not in kept], folder)
+        return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed)
+
+    def crash(self, found: Found, folder: str) -> Bundle | None:
+        """Return one that crashed in the same way at the same step, and once more to the bit; it is kept.
+
+        Args:
+            found: how a copy crashed.
+            folder: of the hunt, for its bundle.
+        """
+        if self.is_stopped:
+            return None
+        crashed = self._run([found], folder)
+        self.kept.setdefault(folder, {}).update(crashed)
+        return crashed.get(found.spec.number)
+
+    def _run(self, found: Sequence[Found], folder: str) -> dict[int, Bundle]:
         wanted = {one.spec.number: one for one in found}
         bundles: dict[int, Bundle] = {}
         try:
@@ -76,8 +99,8 @@ class FromTheStart:
         except CrashhuntError as error:
             self.again.notes.append(f"what copies have found could not be run from the start: {error}")
         with ThreadPoolExecutor(self.again.parallel) as threads:  # which only wait for their process
-            confirmed = list(threads.map(self._confirmed, (bundles[number] for number in wanted if number in bundles)))
-        return tuple(bundle for bundle in confirmed if bundle is not None)
+            confirmed = list(threads.map(self._confirmed, bundles.values()))
+        return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}
 
     def _confirmed(self, bundle: Bundle) -> Bundle | None:
         found = confirm(bundle, lambda: self.is_stopped)

@@ -19,6 +19,7 @@ from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
 from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._copied_crashes import CopiedCrashes
 from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._from_the_start import FromTheStart
@@ -26,7 +27,7 @@ from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._look_at_copies import look_at_copies
 from crashhunt.hunts._near_misses import keep_near_misses
 from crashhunt.hunts._next_trials import LAG, Trials
-from crashhunt.hunts._preflight import Heard, Preflight, why_invalid
+from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
 
 _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
-_INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
 
 
@@ -167,16 +167,16 @@ class Hunt:
             copies=copies_to_come(settings),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        stopped: StoppedBecause
-        if progress.is_done:
-            stopped = "distinct" if settings.run.keep_going else "crash"
-        else:
+        again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
+        copies = FromTheStart(again, self._disturber)
+        self._copied = CopiedCrashes(copies, progress)
+        self._copied.resume()
+        stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
+        if not progress.is_done:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         self._confirm(progress)
-        again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
-        copies = FromTheStart(again, self._disturber)
         near, (probes, branches) = keep_near_misses(again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
@@ -201,6 +201,7 @@ class Hunt:
             probes,
             progress.kinds.at_fault if progress.kinds is not None else None,
             branches,
+            progress.ended_by_copy,
         )
 
     def _hunt(
@@ -237,16 +238,15 @@ class Hunt:
                         in_flight.discard(result.spec.number)
                         for known in preflight.sift(audit.add(result)):
                             self._take(known, ledger, snapshot, trials, progress)
-                        wanted = progress.last_wanted
-                        if wanted is not None:
-                            above = wanted if run.deterministic else -1
-                            executor.cancel(above=above)
-                            in_flight = {number for number in in_flight if number <= above}
+                        if progress.last_wanted is not None:
+                            in_flight = self._cancelled(executor, in_flight, progress.last_wanted)
                             if not run.deterministic:
                                 break
+                if self._copied.look(lambda: watch(self._status(progress, "confirming"))):
+                    in_flight = self._cancelled(executor, in_flight, min(progress.copied))
                 if self._stops:
                     break
-                if self._hopeless(progress, finished):
+                if not finished and is_hopeless(settings, progress.outcomes):
                     return "no_valid_trial"
                 self._listen(executor, audit, ledger, progress)
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
@@ -256,10 +256,9 @@ class Hunt:
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
-            if progress.found:
+            if (crash := progress.unsaved) is not None:
                 watch(self._status(progress, "saving"))
-                lowest = min(progress.found)
-                self._save(progress.found[lowest], ledger, snapshot, progress)
+                self._save(crash, ledger, snapshot, progress)
             executor.close()
             audit.parallel = self._parallel_here
             while audit.waiting and not bool(self._stops):
@@ -280,6 +279,12 @@ class Hunt:
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"
+
+    def _cancelled(self, executor: Executor, in_flight: set[int], wanted: int) -> set[int]:
+        """Cancel trials that are not waited for, as one is what the hunt is after; return those under way that are."""
+        above = wanted if self.settings.run.deterministic else -1
+        executor.cancel(above=above)
+        return {number for number in in_flight if number <= above}
 
     def _lag(self, before: Facts) -> int:
         """By how many trials a sampler that learns is told late."""
@@ -330,6 +335,7 @@ class Hunt:
             progress.last_invalid = result
         else:
             progress.take(result)
+            self._copied.add(result)
         if result.kept:
             write_trial(self.directory, result, scratch_of(self._place.scratch, result.spec.number))
         ledger.record(result, snapshot=snapshot.digest)
@@ -364,11 +370,6 @@ class Hunt:
     def _parallel_here(self) -> int:
         """How many trials at a time this machine runs again, whatever else the executor has."""
         return self.settings.run.parallel or len(os.sched_getaffinity(0))
-
-    def _hopeless(self, progress: Progress, finished: set[int]) -> bool:
-        enough = min(self.settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * self.settings.run.parallel))
-        invalid = progress.outcomes[str(Outcome.INVALID)]
-        return not finished and invalid >= enough and invalid == sum(progress.outcomes.values())
 
     def _status(
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["Heard", "Preflight", "why_invalid"]
+__all__ = ["Heard", "Preflight", "is_hopeless", "why_invalid"]
 
+_INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _ENOUGH = 4
 """Trials; one that fails by chance would do so as often as this only rarely."""
 
@@ -145,6 +146,18 @@ class Heard:
         agents = ", ".join(dict.fromkeys(chosen.agent for chosen in self._settings.agents.values()))
         fix = f"mend {agents}, or leave {flags} out"
         return UsageError(f"{flags}: trials with {agents} cannot be copied: {why}", fix=fix)
+
+
+def is_hopeless(settings: HuntSettings, outcomes: Mapping[str, int]) -> bool:
+    """Whether so many trials could not be set up, and none could, that no other will be.
+
+    Args:
+        settings: of the hunt.
+        outcomes: of its trials, with how many.
+    """
+    enough = min(settings.most_trials, max(_INVALID_BEFORE_GIVING_UP, 2 * settings.run.parallel))
+    invalid = outcomes.get(str(Outcome.INVALID), 0)
+    return invalid >= enough and invalid == sum(outcomes.values())
 
 
 def why_invalid(result: TrialResult, scenario: Scenario) -> str:

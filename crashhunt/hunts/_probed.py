@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
@@ -14,9 +13,9 @@ from crashhunt.trial import Stress, in_turn
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._from_the_start import FromTheStart
-    from crashhunt.trial import TrialResult, TrialSpec
+    from crashhunt.trial import TrialResult
 
-__all__ = ["ProbeData", "ProbeReport", "look_at_probes"]
+__all__ = ["ProbeData", "ProbeReport", "look_at_probes", "mildest"]
 
 _MILDEST = 3  # trials; each takes two processes of its own
 
@@ -84,7 +83,7 @@ def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
         return None
     margins: list[float] = []
     sums = [0] * 3
-    found: list[tuple[float, int, Stress]] = []
+    found: list[tuple[float, int]] = []
     for plain in ledger.plain_results():
         if not (data := plain.get("stress")):
             continue
@@ -92,18 +91,22 @@ def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
         margins.append(stress.margin)
         sums = [sum(pair) for pair in zip(sums, (stress.probes, stress.steps, stress.left_out), strict=True)]
         if stress.disturbance is not None:
-            found.append((stress.margin, plain["spec"]["number"], stress))
-    mildest = [
-        Found(_specification(result, stress), stress.outcome, stress.step)
-        for _, number, stress in sorted(found, key=itemgetter(0))[:_MILDEST]
-        if (result := ledger.result(number)) is not None
+            found.append((stress.margin, plain["spec"]["number"]))
+    kept = copies.kept.get(layout.PROBES, {})
+    specs = [
+        one
+        for _, number in sorted(found, key=lambda pair: (pair[1] not in kept, pair[0]))[:_MILDEST]
+        if (result := ledger.result(number)) is not None and (one := mildest(result)) is not None
     ]
-    crashes = copies.crashes(mildest, layout.PROBES)
+    crashes = copies.crashes(specs, layout.PROBES)
     probes, steps, left_out = sums
-    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(mildest), crashes)
+    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(specs), crashes)
 
 
-def _specification(result: TrialResult, stress: Stress) -> TrialSpec:
-    """The trial from the start, with what made its copy crash."""
-    assert stress.disturbance is not None
-    return replace(result.spec, disturbances=in_turn([*result.spec.disturbances, stress.disturbance]), origin="probe")
+def mildest(result: TrialResult) -> Found | None:
+    """Return a trial from the start, with the mildest that made a copy of it crash; None where nothing did."""
+    stress = result.stress
+    if stress is None or stress.disturbance is None:
+        return None
+    planned = in_turn([*result.spec.disturbances, stress.disturbance])
+    return Found(replace(result.spec, disturbances=planned, origin="probe"), stress.outcome, stress.step)

@@ -96,6 +96,7 @@ class Progress:
     steps_total: int = 0
     crashes: list[Bundle] = field(default_factory=list)
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
+    copied: dict[int, Bundle] = field(default_factory=dict)  # what copies of trials have found, run from the start
     nearest: TrialResult | None = None
     stressed: TrialResult | None = None
     branched: int = 0
@@ -149,19 +150,25 @@ class Progress:
     @property
     def last_wanted(self) -> int | None:
         """The number of the trial with which the hunt has found what it is after; None where it goes on."""
-        return min(self.found) if self.found else self.kinds.until if self.kinds is not None else None
+        found = self.found.keys() | self.copied.keys()
+        return min(found) if found else self.kinds.until if self.kinds is not None else None
+
+    @property
+    def ended_by_copy(self) -> Bundle | None:
+        """What a copy has found that ends the hunt; None where it is a trial that does, or nothing."""
+        return self.copied.get(self.last_wanted) if self.last_wanted is not None else None
 
     @property
     def is_done(self) -> bool:
         """Whether the hunt had found what it is after before it began."""
-        return bool(self.crashes) if self.kinds is None else self.kinds.until is not None
+        return bool(self.crashes or self.copied) if self.kinds is None else self.kinds.until is not None
 
     @property
     def unsaved(self) -> TrialResult | None:
         """The crash that ends the hunt, until it is saved."""
-        if not self.found:
+        lowest = self.last_wanted
+        if lowest is None or lowest not in self.found:
             return None
-        lowest = min(self.found)
         return None if any(lowest == one.result.spec.number for one in self.crashes) else self.found[lowest]
 
     @property

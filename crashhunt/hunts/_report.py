@@ -49,6 +49,7 @@ class HuntReportData(TypedDict):
     probes: NotRequired[ProbeData]
     branches: NotRequired[BranchReportData]
     at_fault: NotRequired[list[int]]
+    copied: NotRequired[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,7 @@ class HuntReport:
         probes: what came of asking copies of trials; None where nobody did.
         at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
         branches: what came of copies that went on with other disturbances; None where there were to be none.
+        copied: what a copy found, where that ended the hunt: it came again from the start.
     """
 
     directory: Path
@@ -90,6 +92,7 @@ class HuntReport:
     probes: ProbeReport | None = None
     at_fault: tuple[int, ...] | None = None
     branches: BranchReport | None = None
+    copied: Bundle | None = None
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -117,4 +120,6 @@ class HuntReport:
             found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
         if self.at_fault is not None:
             found["at_fault"] = list(self.at_fault)
+        if self.copied is not None:
+            found["copied"] = str(self.copied.path)
         return found

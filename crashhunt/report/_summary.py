@@ -45,6 +45,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.stopped_because == "distinct":
         found, wanted = len(report.kinds or ()), report.settings.run.distinct
         lines.append(f"{found} kinds of crashes were found, and {wanted} were wanted.")
+    if report.copied is not None:
+        number = report.copied.result.spec.number
+        lines.append(f"Trial {number} did not crash; a copy of it did, and from the start it crashed as well.")
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
@@ -69,6 +72,9 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if len(report.crashes) > _SHOWN:
         lines += ["", f"… and {len(report.crashes) - _SHOWN} more in {report.directory / 'crashes'}"]
     lines += _near_misses(report, program)
+    if report.copied is not None:
+        lines += ["", *_describe_crash(report.copied)]
+        lines += ["", f"Replay it:  {shlex.join([program, 'replay', str(report.copied.path)])}"]
     if report.crashes:
         first = crashes[0]
         command = [program, "replay", str(report.directory)]
