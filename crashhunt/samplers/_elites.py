@@ -34,14 +34,11 @@ class Elites:
     def __getitem__(self, place: int) -> Told:
         return self._kept[place][2]
 
-    def add(self, told: Told) -> bool:
-        """Take one in, if it is good enough; return whether it was."""
+    def add(self, told: Told) -> Told | None:
+        """Take one in; return the one that has to leave for it, which is itself where it is not good enough."""
         self._count += 1
-        if len(self._kept) == self._most and -told.score >= self._kept[-1][0]:
-            return False
         insort(self._kept, (-told.score, self._count, told))
-        del self._kept[self._most :]
-        return True
+        return self._kept.pop()[2] if len(self._kept) > self._most else None
 
     def best(self, many: int) -> list[Told]:
         """Return the best of them, at most so many."""

@@ -77,7 +77,7 @@ class Portfolio:
     def _begin(self) -> None:
         """Make the strategies anew, from everything that is not near to a crash that is known."""
         best, self._best = sorted(self._best, key=lambda told: told.number), Elites(_REMEMBERED)
-        kept = [told for told in best if not self._known.cover(told.point)]
+        kept = self._known.outside(best)
         self._model, mutation = Model(self._cube, like=self._model), Mutation(self._cube)
         self._model.remember(kept)
         self._strategies: dict[str, Strategy] = {_MODEL: self._model, _MUTATION: mutation}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from crashhunt.samplers._told import Told
@@ -21,16 +21,6 @@ _KINDS = 256  # that are remembered
 _AROUND = 0.1  # of a crash, times the square root of the dimensions: there, nothing more is looked for
 _JUST_THERE = 0.02  # likewise, of a kind that is new: the next crash there may be another
 _WIDER, _WIDEST = 1.5, 0.45  # so many times that, where all that is found is just outside; up to so much
-
-
-@dataclass(slots=True, eq=False)
-class _Crash:
-    point: NDArray[np.float64]
-    kind: str
-    radius: float
-
-    def away(self, point: NDArray[np.float64]) -> float:
-        return float(np.linalg.norm(self.point - point))
 
 
 class KnownCrashes:
@@ -46,15 +36,24 @@ class KnownCrashes:
 
     def __init__(self, dimensions: int) -> None:
         self._unit = math.sqrt(dimensions)
-        self._crashes: deque[_Crash] = deque(maxlen=_MOST)
+        self._points = np.empty((0, dimensions))
+        self._radii = np.empty(0)
         self._kinds: dict[str, None] = {}
 
     def __bool__(self) -> bool:
-        return bool(self._crashes)
+        return bool(len(self._radii))
 
     def cover(self, point: NDArray[np.float64]) -> bool:
         """Whether a crash is known near to it."""
-        return any(crash.away(point) < crash.radius for crash in self._crashes)
+        return bool((self._away(point) < self._radii).any())
+
+    def outside(self, trials: Sequence[Told]) -> list[Told]:
+        """Return the trials that no crash is known near to."""
+        if not trials:
+            return []
+        points = np.array([told.point for told in trials])
+        covered = np.any(self._away(points[:, None]) < self._radii, axis=1).tolist()
+        return [told for told, near in zip(trials, covered, strict=True) if not near]
 
     def add(self, told: Told) -> bool:
         """Take in a crash; return whether more or less is known by it than before."""
@@ -62,20 +61,28 @@ class KnownCrashes:
         self._kinds[told.kind] = None
         if len(self._kinds) > _KINDS:
             del self._kinds[next(iter(self._kinds))]
-        around = [crash for crash in self._crashes if crash.away(told.point) < crash.radius]
+        away = self._away(told.point)
+        around = away < self._radii
         if new:  # so there is more to find here than was thought
-            for crash in around:
-                crash.radius = min(crash.radius / _WIDER, crash.away(told.point))
-        elif around:
+            self._radii = np.where(around, np.minimum(self._radii / _WIDER, away), self._radii)
+        elif around.any():
             return False
-        self._crashes.append(_Crash(told.point, told.kind, (_JUST_THERE if new else _AROUND) * self._unit))
+        kept = self._radii > 0.0  # else it was at the very same point, as it is with choices and whole numbers
+        radius = (_JUST_THERE if new else _AROUND) * self._unit
+        self._points = np.vstack((self._points[kept], told.point))[-_MOST:]
+        self._radii = np.append(self._radii[kept], radius)[-_MOST:]
         return True
 
     def widen(self, top: NDArray[np.float64]) -> bool:
         """Keep further away from the nearest crash, if what is most dangerous is just beside it; return whether so."""
-        nearest = min(self._crashes, key=lambda crash: crash.away(top) / crash.radius)
-        if nearest.away(top) >= _WIDER * nearest.radius:
+        away = self._away(top)
+        nearest = int(np.argmin(away / self._radii))
+        if away[nearest] >= _WIDER * self._radii[nearest]:
             return False
-        wider = max(nearest.radius * _WIDER, _AROUND * self._unit)
-        nearest.radius = wider if wider < _WIDEST * self._unit else _AROUND * self._unit
+        wider = max(self._radii[nearest] * _WIDER, _AROUND * self._unit)
+        self._radii[nearest] = wider if wider < _WIDEST * self._unit else _AROUND * self._unit
         return True
+
+    def _away(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        away: NDArray[np.float64] = np.sqrt(((self._points - point) ** 2).sum(axis=-1))
+        return away

@@ -45,16 +45,18 @@ class Mutation:
 
     def tell(self, told: Told) -> None:
         """Take it into the corpus, if it is dangerous enough."""
-        kept = self._corpus.add(told)
+        gone = self._corpus.add(told)
         parent = told.parent
         if parent is not None and parent in self._children:
             gained = told.score > self._scores[parent]
             self._children[parent] = 0 if gained else self._children[parent] + 1
             self._energy = None
-        if kept:
-            self._children = {one.number: self._children.get(one.number, 0) for one in self._corpus}
-            self._scores = {one.number: one.score for one in self._corpus}
-            self._energy = None
+        if gone is told:
+            return
+        self._children[told.number], self._scores[told.number] = 0, told.score
+        if gone is not None:
+            del self._children[gone.number], self._scores[gone.number]
+        self._energy = None
 
     def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
         """Return a mutant."""

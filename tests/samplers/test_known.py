@@ -31,6 +31,9 @@ def test_without_manner_and_place_arguments_are_all_there_is():
     assert known
     assert known.cover(at(0.59))
     assert not known.cover(at(0.61))
+    trials = [crash(x) for x in (0.61, 0.59, 0.1)]
+    assert known.outside(trials) == [trials[0], trials[2]]
+    assert known.outside([]) == []
     assert not known.add(crash(0.55))  # nothing new
 
 
@@ -61,6 +64,25 @@ def test_what_is_most_dangerous_just_beside_a_crash_is_that_crash_still():
     for _ in range(20):
         known.widen(at(0.62))
         assert not known.cover(at(1.0))
+
+
+def test_several_kinds_at_the_very_same_arguments_keep_nothing_away_by_the_first_of_them():
+    """As it is with choices and whole numbers, where other traffic leads from the same values to another crash."""
+    known = KnownCrashes(4)
+    for kind in ("rear end", "side swipe", "off road"):
+        assert known.add(crash(0.5, kind))
+        assert known.cover(at(0.5))
+    assert known.widen(at(0.5))
+    assert not known.widen(at(0.9))
+    assert known.cover(at(0.59))
+
+
+def test_the_oldest_of_many_crashes_is_forgotten():
+    known = KnownCrashes(4)
+    for number in range(33):
+        assert known.add(crash(float(number)))
+    assert not known.cover(at(0.0))
+    assert all(known.cover(at(float(number))) for number in range(1, 33))
 
 
 def kind_of(**evidence):

@@ -22,7 +22,7 @@ from crashhunt.samplers import (
     RandomSampler,
 )
 from crashhunt.space import Choice, Range
-from crashhunt.trial import Outcome, TrialResult
+from crashhunt.trial import Collision, Outcome, TrialResult
 
 KINDS = [CrossEntropySampler, GuidedSampler, MutationSampler]
 KINDS += [CmaEsSampler] if importlib.util.find_spec("cmaes") else []
@@ -173,3 +173,21 @@ def test_learning_takes_at_most_a_millisecond_after_100_000_trials(kind):
         proposal = ask(sampler, number)
         sampler.tell(TrialResult(spec_of(number, proposal), Outcome.SURVIVED, danger=float(dangers.random()) * 0.99))
     assert time.process_time() - began < 1.0
+
+
+@pytest.mark.nightly
+def test_learning_takes_at_most_a_millisecond_where_every_third_trial_is_a_crash_of_another_kind():
+    """Each of them has strategies begin anew."""
+    space = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(10)}
+    sampler, luck, spent = GuidedSampler(space), np.random.default_rng(1), 0.0
+    for number in range(3000):
+        began = time.process_time()
+        spec = spec_of(number, ask(sampler, number))
+        spent += time.process_time() - began
+        hit = Collision("ego", "collider", "ego", lane=f"road{luck.integers(1000)}e_0") if luck.random() < 0.3 else None
+        outcome = Outcome.COLLISION if hit else Outcome.SURVIVED
+        result = TrialResult(spec, outcome, danger=float(luck.random()) * 0.99, collision=hit)
+        began = time.process_time()
+        sampler.tell(result)
+        spent += time.process_time() - began
+    assert spent < 3.0
