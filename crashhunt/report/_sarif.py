@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -12,7 +13,6 @@ from crashhunt.base.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from crashhunt.report._findings import Finding
 
@@ -63,8 +63,8 @@ def write_sarif(findings: Sequence[Finding], target: Path) -> None:
 
 
 def _result(finding: Finding, rule: int) -> dict[str, object]:
-    file = finding.file or (finding.group.shortest.hunt / layout.HUNT).as_posix().lstrip("/")
-    place = {"artifactLocation": {"uri": quote(file)}, "region": {"startLine": finding.line}}
+    uri = quote(finding.file) or _settings(finding.group.shortest.hunt)
+    place = {"artifactLocation": {"uri": uri}, "region": {"startLine": finding.line}}
     return {
         "ruleId": finding.rule,
         "ruleIndex": rule,
@@ -78,3 +78,9 @@ def _result(finding: Finding, rule: int) -> dict[str, object]:
         },
         "properties": {"crashes": finding.group.count, "fault": finding.group.fault, "known": finding.known},
     }
+
+
+def _settings(hunt: Path) -> str:
+    """Where the settings of a hunt are: from here, and as a whole where they are elsewhere."""
+    file, here = (hunt / layout.HUNT).resolve(), Path.cwd().resolve()
+    return quote(file.relative_to(here).as_posix()) if file.is_relative_to(here) else file.as_uri()

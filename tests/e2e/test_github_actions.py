@@ -142,6 +142,86 @@ def test_our_own_ci_uses_them_as_they_are():
     assert used == set(NAMES)
 
 
+STUB = """#!/usr/bin/env python3
+import json, os, pathlib, sys
+words = sys.argv[1:]
+with open("asked.jsonl", "a") as file:
+    file.write(json.dumps(words) + "\\n")
+if words[0] == "crashes":
+    print(json.dumps({"groups": [{"count": 1, "shortest": word} for word in json.loads(os.environ["FOUND_BY_STUB"])]}))
+elif words[0] == "shrink" and "000001" in words[1]:
+    os.mkdir(f"{words[1]}.small")
+elif words[0] == "export" and not os.path.isdir(words[1]):
+    sys.exit("it does not exist")
+elif words[0] in ("export", "report"):
+    pathlib.Path(words[-1]).write_text("")
+"""
+
+
+def stubbed(folder, *crashes, **inputs):
+    """The action `hunt`, with a command that finds these crashes and of the second cannot take anything away."""
+    runner = Runner("hunt", folder, **inputs)
+    (folder / "bin").mkdir()
+    stub = folder / "bin" / "crashhunt"
+    stub.write_text(STUB)
+    stub.chmod(0o755)
+    runner.environment |= {
+        "PATH": f"{stub.parent}{os.pathsep}{os.environ['PATH']}",
+        "FOUND_BY_STUB": json.dumps(crashes),
+    }
+    for crash in crashes:
+        (folder / crash).mkdir(parents=True)
+    return runner
+
+
+def asked(folder):
+    return [json.loads(line) for line in (folder / "asked.jsonl").read_text().splitlines()]
+
+
+def test_arguments_reach_the_hunt_as_a_shell_would_split_them_and_no_shell_does(tmp_path):
+    words = "--agent 'a b:C' --arg \"x=1|2\"\n--note $(touch\\ owned) `id` ;ü *"
+    runner = stubbed(tmp_path, arguments=words, directory="a $(touch owned)/ü//")
+    told = runner.run()
+    assert not runner.failed, runner.said
+    assert told["examples"] == "a $(touch owned)/ü-found"
+    assert (told["new"], runner.artifacts) == ("0", {})
+    assert asked(tmp_path)[0][1:] == [
+        "a $(touch owned)/ü//", "0", "0", "1500", "--for", "30m", "--keep-going", "--keep", "3",
+        "--agent", "a b:C", "--arg", "x=1|2", "--note", "$(touch owned)", "`id`", ";ü", "*",
+    ]  # fmt: skip
+    assert not (tmp_path / "owned").exists()
+
+
+def test_arguments_that_cannot_be_split_are_no_hunt(tmp_path):
+    runner = stubbed(tmp_path, arguments="--agent 'a:B")
+    runner.run()
+    assert runner.failed
+    assert "arguments: No closing quotation: --agent 'a:B" in runner.said
+    assert not (tmp_path / "asked.jsonl").exists()
+
+
+def test_a_crash_that_cannot_be_made_smaller_is_kept_as_it_is(tmp_path):
+    crashes = ["h/crashes/000000-collision", "h/crashes/000001-hang", "h/crashes/000002-hang"]
+    runner = stubbed(tmp_path, *crashes, directory="h", examples=2, known="my crashes")
+    runner.run()
+    assert runner.ran[-2:] == ["Keep them", "Something new"], runner.said
+    files = {file.name for file in runner.artifacts["crashes"].iterdir()}
+    exported = ["000000-collision.zip", "000001-hang.small.zip", "000001-hang.zip"]
+    assert files == {"crashes.json", "new.txt", "report.html", *exported}
+    lines = runner.summary.read_text().splitlines()
+    assert [line for line in lines if line.startswith("crashhunt replay")] == [
+        f"crashhunt replay {name} --trust" for name in exported
+    ]
+    assert "crashhunt corpus add 000001-hang.zip --to my\\ crashes --trust  # keep it" in lines
+
+
+def test_no_examples_are_wanted(tmp_path):
+    runner = stubbed(tmp_path, "h/crashes/000000-hang", directory="h", examples=0)
+    runner.run()
+    assert runner.ran[-1] == "Something new", runner.said
+    assert "zip" not in runner.summary.read_text()
+
+
 @pytest.mark.nightly  # a dozen processes, as a runner starts them
 def test_a_hunt_and_its_corpus_as_a_runner_does_it(toy):
     (toy.folder / "driver.py").write_text(AGENT)

@@ -121,6 +121,17 @@ def test_sarif_has_an_alert_a_kind_with_a_place_and_known_ones_are_notes(groups,
     assert all(one["partialFingerprints"]["primaryLocationLineHash"] for one in run["results"])
 
 
+def test_a_place_that_nobody_knows_is_the_hunt_however_it_was_given(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    signature, uris = Signature("collision", "collider", "rear end"), []
+    for hunt in (Path("a b"), tmp_path / "here" / "a b", Path("../here/a b"), tmp_path / "a b"):
+        write_sarif(findings_of([group(signature, hunt)]), tmp_path / "x.sarif")
+        (one,) = json.loads((tmp_path / "x.sarif").read_text())["runs"][0]["results"]
+        uris.append(one["locations"][0]["physicalLocation"]["artifactLocation"]["uri"])
+    assert uris == [*["a%20b/hunt.toml"] * 3, (tmp_path / "a b" / "hunt.toml").as_uri()]
+
+
 def test_a_corpus_knows_what_is_expected_to_crash_still(groups):
     signature = groups[0].signature
     case = Case(Path("kept/one"), "still", "", "", dict(signature.to_json()))
