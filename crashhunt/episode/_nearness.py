@@ -38,7 +38,7 @@ class Nearness(Observer):
         self._take_frames = take_frames
         self._meter = ApproachMeter(())
         self._dangers = DangerMeter((), 1.0)
-        self._names_it: NamesDanger | None = None
+        self._simulator: object = None
         self._waiting: list[Frame] = []  # for the closest approach, of which so many at a time cost least
 
     @property
@@ -51,7 +51,7 @@ class Nearness(Observer):
     def begin(self, episode: Episode) -> None:
         """Note who is controlled."""
         self._meter = ApproachMeter(episode.names)
-        self._names_it = episode.simulator if offers(episode.simulator, NamesDanger) else None
+        self._simulator = episode.simulator
         self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -70,8 +70,9 @@ class Nearness(Observer):
             return replace(result, closest=closest)
         touched = result.outcome.is_traffic_crash or closest.gap_m <= 0.0
         danger = 1.0 if touched else self._dangers.danger
-        if danger is None and self._names_it is not None:
-            danger = self._names_it.named_danger
+        # Asked at the end: before the first step it names none, which counts as one that never does.
+        if danger is None and offers(self._simulator, NamesDanger):
+            danger = self._simulator.named_danger
         return replace(result, closest=closest, danger=danger)
 
     def _take_in(self) -> None:

@@ -128,8 +128,10 @@ def test_whoever_has_touched_was_in_the_greatest_danger(nearness):
 
 def test_a_simulator_may_name_the_danger_where_there_are_no_others():
     named = Nearness(list)
-    simulator = SimpleNamespace(step_length_s=0.1, named_danger=0.25)
+    simulator = SimpleNamespace(step_length_s=0.1, named_danger=None)
     named.begin(SimpleNamespace(names=("ego",), simulator=simulator))
+    assert named.end(RESULT).danger is None
+    simulator.named_danger = 0.25  # as is known after the first step, and not when it begins
     assert named.end(RESULT).danger == 0.25
     assert named.end(replace(RESULT, outcome=Outcome.COLLISION)).danger == 1.0
     assert named.end(replace(RESULT, outcome=Outcome.INVALID)).danger is None

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+from crashhunt.episode import Nearness
 from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.oracles import ReportedCollision
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.scenario.backends.gym import BACKEND, CrashRule, GymSetup
 from crashhunt.simulators.gym import GymSimulator
 from crashhunt.testing import SimulatorContract
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
 class Tray(gymnasium.Env):
@@ -289,11 +292,15 @@ def test_where_no_scene_says_it_the_environment_names_its_danger(tmp_path, dange
     for _ in range(2):  # of an episode, nothing is left in the next
         simulator.reset(seed=1)
         assert simulator.named_danger is None
+        nearness = Nearness(list)
+        nearness.begin(SimpleNamespace(names=("ball",), simulator=simulator))
         simulator._env.unwrapped.ball[:] = 1.55
         for tilt in (1.0, -1.0, -1.0):
             action = simulator.actions["ball"].encode({"tilt": np.full(2, tilt, np.float32), "kick": 0})
             simulator.step({"ball": action})
         assert simulator.named_danger == (most and pytest.approx(most))
+        spec = TrialSpec(0, 1, {"ball": {}}, {}, max_steps=3)
+        assert nearness.end(TrialResult(spec, Outcome.SURVIVED)).danger == simulator.named_danger
 
 
 def test_a_danger_that_names_nothing_or_is_no_number_is_one_line(tmp_path):
