@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import TYPE_CHECKING
 
 # As in _simulator.py: the package's own functions cost twice as much.
@@ -33,6 +34,7 @@ class Driving:
         self._edges: dict[str, tuple[int, float]] = {}
         self._closed_lanes: dict[tuple[str, str], bool] = {}
         self._targets: dict[str, int] = {}
+        self._is_left_hand: bool | None = None
 
     def begin(self, agents: Iterable[str]) -> None:
         """Forget the last episode; the network is the same."""
@@ -67,7 +69,7 @@ class Driving:
         if edge.startswith(":"):
             return True  # inside a junction there is nothing to change to, and nothing to leave either
         lanes, _ = self.edge(edge)
-        target = sumo.vehicle_getLaneIndex(agent) + change
+        target = sumo.vehicle_getLaneIndex(agent) + (-change if self.left_hand else change)
         if not 0 <= target < lanes or self._is_closed(f"{edge}_{target}", sumo.vehicle_getVehicleClass(agent)):
             return False
         sumo.vehicle_changeLane(agent, target, self._step_length_s)
@@ -80,6 +82,24 @@ class Driving:
             found = self._edges[edge] = sumo.edge_getLaneNumber(edge), sumo.lane_getWidth(f"{edge}_0")
         return found
 
+    @property
+    def left_hand(self) -> bool:
+        """Whether traffic keeps to the left: SUMO has such a network mirrored, and counts its lanes from the left."""
+        if self._is_left_hand is None:
+            wide = (edge for edge in sumo.edge_getIDList() if edge[0] != ":" and sumo.edge_getLaneNumber(edge) > 1)
+            self._is_left_hand = any(_is_right_of(f"{edge}_1", f"{edge}_0") for edge in islice(wide, 1))
+        return self._is_left_hand
+
+    def from_left(self, edge: str, lane: int) -> float:
+        """Return how far right of the middle of the leftmost lane of an edge that of another one is, in m."""
+        lanes, width = self.edge(edge)
+        return (lane if self.left_hand else lanes - 1 - lane) * width
+
+    def aside(self, agent: str) -> tuple[float, float]:
+        """Return how far right of the middle of its lane a vehicle is, in m, and how fast it moves there, in m/s."""
+        sign = 1.0 if self.left_hand else -1.0
+        return sign * sumo.vehicle_getLateralLanePosition(agent), sign * sumo.vehicle_getLateralSpeed(agent)
+
     def _is_closed(self, lane: str, vehicle_class: str) -> bool:
         found = self._closed_lanes.get((lane, vehicle_class))
         if found is None:
@@ -87,3 +107,10 @@ class Driving:
             found = bool(allowed) and vehicle_class not in allowed and vehicle_class != "ignoring"
             self._closed_lanes[lane, vehicle_class] = found
         return found
+
+
+def _is_right_of(lane: str, other: str) -> bool:
+    """Whether a lane lies to the right of another one of its edge."""
+    (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
+    at_x, at_y = sumo.lane_getShape(lane)[0][:2]
+    return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))

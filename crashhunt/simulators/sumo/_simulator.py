@@ -298,6 +298,8 @@ class SumoSimulator:
         core, plain = self._sight.core, type(self) is SumoSimulator and not self.scripted and self._taking_part is None
         if core is None or not plain or len(self.agents) != 1 or not self._kinematics.usual:
             return None
+        if self._lateral and self._driving.left_hand:
+            return None  # the core has it the other way round
         (agent,) = self.agents
         # Not as attributes of this one, which somebody may have set.
         own = {
@@ -316,7 +318,7 @@ class SumoSimulator:
             arrive=self._arrive,
             apply=self._apply_alone,
             finish=self._finish,
-            edge=self._driving.edge,
+            from_left=self._driving.from_left,
             start_m=self._start[agent],
             step_length_s=self.step_length_s,
             lateral=self._lateral,
@@ -350,15 +352,12 @@ class SumoSimulator:
 
     def _observe(self, agent: str, row: int) -> NDArray[np.float32]:
         edge = sumo.vehicle_getRoadID(agent)
-        lanes, width = self._driving.edge(edge)
-        # To the right is positive; SUMO counts lanes from the right, and lateral positions to the left.
-        lane = sumo.vehicle_getLaneIndex(agent)
+        lanes, lane = self._driving.edge(edge)[0], sumo.vehicle_getLaneIndex(agent)
         self._scene.agent_lanes[agent] = f"{edge}_{lane}"
-        from_left = (lanes - 1 - lane) * width
-        lateral_speed = 0.0
+        from_left, lateral_speed = self._driving.from_left(edge, lane), 0.0
         if self._lateral:
-            from_left -= sumo.vehicle_getLateralLanePosition(agent)
-            lateral_speed = -sumo.vehicle_getLateralSpeed(agent)
+            aside, lateral_speed = self._driving.aside(agent)
+            from_left += aside
         return self._kinematics.observe(
             self._scene,
             row,

@@ -71,7 +71,7 @@ class UsualSteps:
         arrive: called with where the core has come to.
         apply: applies an action; returns whether there is nothing about it to look into.
         finish: does what is left of a step that has been simulated.
-        edge: returns the number of lanes of an edge, and the width of its first.
+        from_left: returns how far right of the middle of an edge's leftmost lane that of another one is, in m.
         start_m: how far the agent had driven at the start, in m.
         step_length_s: in s.
         lateral: whether vehicles may be elsewhere than in the middle of a lane.
@@ -93,7 +93,7 @@ class UsualSteps:
         arrive: Callable[[Present], None],
         apply: Callable[[str, NDArray[np.generic]], bool],
         finish: Callable[[Mapping[str, NDArray[np.generic]]], StepResult],
-        edge: Callable[[str], tuple[int, float]],
+        from_left: Callable[[str, int], float],
         start_m: float,
         step_length_s: float,
         lateral: bool,
@@ -109,7 +109,7 @@ class UsualSteps:
             agent, SimpleNamespace(simulationStep=simulate), (np.ndarray, shape, _OBSERVED), shape[0] - 1,
             step_length_s, lateral, takes_speed, sight.around, start_m,
         )  # fmt: skip
-        self._edge, self._instead_of = edge, instead_of
+        self._from_left, self._instead_of = from_left, instead_of
         self._last: StepResult = ({}, {}, {}, {}, {})
         self._rosters: dict[Vehicles, Roster] = {}  # of the scenes that may be asked for
 
@@ -147,9 +147,7 @@ class UsualSteps:
             return None
         vehicles, ids = seen
         edge, _, number = lane.rpartition("_")
-        lanes, width = self._edge(edge)
-        from_left = (lanes - 1 - int(number)) * width
-        where = edge, int(number), lane, from_left
+        where = edge, int(number), lane, self._from_left(edge, int(number))
         row = scene.roster.index[agent]
         self._rosters = {vehicles: scene.roster}
         self.core.resume(
