@@ -26,6 +26,7 @@ from problems import PROBLEMS, REAL
 from search_kinds import kinds_table, write_kinds
 from search_plot import GIVE_UP, table, write_plot
 from search_pool import trials_on
+from search_wall import wall_table
 
 from crashhunt.hunts import spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
@@ -282,6 +283,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--plot", type=Path, help="an SVG to write, of all hunts")
     parser.add_argument("--store", type=Path, help="a file of JSON to which hunts are added; the table is of all in it")
     parser.add_argument("--kinds", type=int, help="instead, hunts of so many trials that go on, for kinds of crashes")
+    parser.add_argument("--wall", action="store_true", help="instead, hunts of the product, for time by the clock")
     parser.add_argument("--again", action="store_true", help="hunts that are stored already, too")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     options = parser.parse_args(words)
@@ -292,6 +294,9 @@ def main(words: Sequence[str] | None = None) -> int:
     if options.kinds:
         write_kinds(options.store, names, samplers, seeds, options.kinds, options.parallel)
         print(kinds_table(options.store))
+        return 0
+    if options.wall:
+        print(wall_table(names, samplers, seeds, options.parallel))
         return 0
     runs = stored(options.store) if options.store is not None and options.store.exists() else {}
     known = () if options.again else (*runs,)
