@@ -19,7 +19,8 @@ __all__ = ["KnownCrashes"]
 _MOST = 32  # crashes around which nothing more is looked for
 _KINDS = 256  # that are remembered
 _AROUND = 0.1  # of a crash, times the square root of the dimensions: there, nothing more is looked for
-_JUST_THERE = 0.02  # likewise, of a kind that is new: the next crash there may be another
+_JUST_THERE = 0.02  # likewise, for as long as the next crash there may be of another kind
+_AGAIN = 3  # crashes in a row there that are of known kinds: then the next one is new in one of five, at most
 _WIDER, _WIDEST = 1.5, 0.45  # so many times that, where all that is found is just outside; up to so much
 
 
@@ -27,8 +28,8 @@ class KnownCrashes:
     """The places in the space of arguments that are not worth another trial.
 
     What a crash keeps others from depends on its kind. Where the result does not tell manner and place, arguments are
-    all there is, and nothing more is looked for around it. Where it does, the first crash of a kind keeps
-    next to nothing away, as the same arguments may lead to others; the next one of that kind does.
+    all there is, and nothing more is looked for around it. Where it does, a crash keeps next to nothing away, as the
+    same arguments may lead to others, until several in a row there were of known kinds.
 
     Args:
         dimensions: of the space.
@@ -39,6 +40,7 @@ class KnownCrashes:
         self._points = np.empty((0, dimensions))
         self._radii = np.empty(0)
         self._kinds: dict[str, None] = {}
+        self._again: list[NDArray[np.float64]] = []  # the latest crashes of known kinds, but where a new one followed
 
     def __bool__(self) -> bool:
         return bool(len(self._radii))
@@ -68,10 +70,19 @@ class KnownCrashes:
         elif around.any():
             return False
         kept = self._radii > 0.0  # else it was at the very same point, as it is with choices and whole numbers
-        radius = (_JUST_THERE if new else _AROUND) * self._unit
+        radius = (_JUST_THERE if told.kind and not self._is_worked_out(told.point, new) else _AROUND) * self._unit
         self._points = np.vstack((self._points[kept], told.point))[-_MOST:]
         self._radii = np.append(self._radii[kept], radius)[-_MOST:]
         return True
+
+    def _is_worked_out(self, point: NDArray[np.float64], new: bool) -> bool:
+        """Account for a crash, and say whether all that comes around it has been known for long."""
+        near = [float(np.linalg.norm(other - point)) < _AROUND * self._unit for other in self._again]
+        if new:
+            self._again = [other for other, is_near in zip(self._again, near, strict=True) if not is_near]
+            return False
+        self._again = [*self._again, point][-_MOST:]
+        return sum(near) + 1 >= _AGAIN
 
     def widen(self, top: NDArray[np.float64]) -> bool:
         """Keep further away from the nearest crash, if what is most dangerous is just beside it; return whether so."""
