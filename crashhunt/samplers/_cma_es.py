@@ -62,7 +62,7 @@ class CmaEs:
                 self._run = None
                 self._elites = Elites(_FIRST)
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return a draw from the distribution as it is now."""
         if self._run is None:
             return None

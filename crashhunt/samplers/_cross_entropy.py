@@ -46,7 +46,7 @@ class CrossEntropy:
         self._elites.add(told)
         self._points = None
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return a draw from the mixture."""
         if len(self._elites) < _LEAST:
             return None

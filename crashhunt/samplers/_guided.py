@@ -115,16 +115,16 @@ class Portfolio:
         if self._known and self._without_record >= self._patience and self._known.widen(self._top):
             self._begin()
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft:
         """Return what one of the strategies proposes, or the next point of the even search."""
         if len(self._unguided) >= _FIRST:
             for name in self._drawn(rng):
                 for _ in range(_TRIES):
                     strategy = self._niches if name == _NICHE else self._strategies[name]
-                    draft = strategy.propose(number, rng)
+                    draft = strategy.propose(place, rng)
                     if draft is not None and not self._known.cover(draft.point):
                         return Draft(draft.point, draft.seed, draft.parent, origin=name)
-        return Draft(self._even.point(number), origin=_EVEN)
+        return Draft(self._even.point(place), origin=_EVEN)
 
     def _drawn(self, rng: np.random.Generator) -> list[str]:
         """Return whose turn it is; that of none where it is the even search's."""

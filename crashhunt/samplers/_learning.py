@@ -55,7 +55,9 @@ class Learning:
         """Return a plain random trial, or what the strategy makes of what it was told."""
         if number % _PLAIN_EVERY == 0:
             return Proposal(self._random.ask(number, rng).arguments, origin=_PLAIN)
-        draft = self._strategy.propose(number, rng) if self._cube.dimensions else None
+        # Of its own trials alone: Halton's sequence without every fifth point has a hole, where an argument has base 5.
+        place = number - number // _PLAIN_EVERY - 1
+        draft = self._strategy.propose(place, rng) if self._cube.dimensions else None
         if draft is None:  # there is nothing to go by yet, or nothing to vary
             return Proposal(self._random.ask(number, rng).arguments, origin=_START)
         arguments = self._cube.arguments(draft.point)

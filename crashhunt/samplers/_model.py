@@ -83,7 +83,7 @@ class Model:
         if self._count >= _LEAST and self._count % max(1, self._count // _OFTEN) == 0:
             self._tune()
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return the best of many candidates."""
         if self._count < _LEAST:
             return None

@@ -58,7 +58,7 @@ class Mutation:
             del self._children[gone.number], self._scores[gone.number]
         self._energy = None
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return a mutant."""
         if len(self._corpus) < _LEAST:
             return None

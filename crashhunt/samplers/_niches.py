@@ -96,12 +96,12 @@ class Niches:
                 self._go(trials[place], float(reach[place]), trials)
                 return
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return what the model of this peak proposes; None where there is no other peak."""
         if self._foot is None:
             return None
         for _ in range(_TRIES):
-            draft = self._model.propose(number, rng)
+            draft = self._model.propose(place, rng)
             if draft is not None and float(np.linalg.norm(draft.point - self._foot.point)) < self._reach:
                 return draft
         size = len(self._foot.point)

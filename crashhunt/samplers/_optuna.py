@@ -154,10 +154,10 @@ class _Study:
             return
         self._add(told.point.tolist(), told.score, told.number)
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return what the study suggests."""
         if self._kind == "QMCSampler":
-            self._storage.count_from(number % _LONGEST)
+            self._storage.count_from(place % _LONGEST)
         with self._seeded(int(rng.integers(2**31))), self._storage.asking():
             params = self._study.ask(self._distributions).params
         shares = [

@@ -35,8 +35,8 @@ class Draft:
 class Strategy(Protocol):
     """Learns from what is told, and proposes on that alone: what it proposed before changes nothing."""
 
-    def propose(self, number: int, rng: np.random.Generator) -> Draft | None:
-        """Return a draft; None for as long as there is too little to go by."""
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
+        """Return a draft, the one at a place from 0 among all; None for as long as there is too little to go by."""
 
     def tell(self, told: Told) -> None:
         """Learn how a trial ended, whoever proposed it."""

@@ -100,6 +100,15 @@ def test_every_fifth_trial_is_the_random_one_of_that_number(kind):
             assert proposal.arguments == ask(plain, number).arguments
 
 
+def test_the_even_search_leaves_no_part_of_an_argument_out():
+    sampler = GuidedSampler(UNIT, hunt=HuntFacts(3))
+    asked = [ask(sampler, number) for number in range(125)]  # is told nothing
+    even = np.array([values(proposal) for proposal in asked if proposal.origin == "halton"])
+    assert len(even) == 100
+    for drawn in even.T:  # the third of which has base 5
+        assert np.histogram(drawn, bins=5, range=(0.0, 1.0))[0].min() >= 15
+
+
 def test_danger_that_says_nothing_gets_probes_only():
     luck = np.random.default_rng(1)
     asked, _ = hunt(GuidedSampler(UNIT), lambda _: luck.random() * 0.9, 800)
