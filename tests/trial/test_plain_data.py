@@ -36,7 +36,7 @@ ways = st.builds(
     Path,
     st.builds(Actor, st.text(), st.text(), finite, finite),
     st.integers(0, 99),
-    st.tuples(st.builds(State, *[finite] * 4)),
+    st.tuples(st.builds(State, *[finite] * 6)),  # a named tuple: what has a default would be any number, of any size
 )
 results = st.builds(
     TrialResult,
