@@ -165,8 +165,9 @@ class Forked:
 
 def _simulator_of(job: str) -> str:
     try:
-        simulator = json.loads(Path(job).read_text(encoding="utf-8"))["settings"]["scenario"]["simulator"]
-    except (OSError, ValueError, KeyError, TypeError):
+        scenario = json.loads(Path(job).read_text(encoding="utf-8"))["settings"]["scenario"]
+        simulator = scenario.get("simulator", "sumo")  # what is as it is without being said is not written
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return ""
     return simulator if simulator in _OF_SIMULATORS else ""
 
