@@ -39,6 +39,7 @@ __all__ = [
     "without_folder",
 ]
 
+_MOST_STEPS = 2**63 - 1  # NumPy's integers have 64 bits
 Value = bool | int | float | str
 Kind = Literal["float", "int", "bool", "str"]
 
@@ -127,7 +128,7 @@ class Range:
 
     def __post_init__(self) -> None:
         text = str(self)
-        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+        if not (_is_finite(self.low) and _is_finite(self.high)):
             raise ArgumentError(f"the range {text!r} has an end that is not finite", fix="give two finite numbers")
         if self.low > self.high:
             raise ArgumentError(
@@ -140,12 +141,20 @@ class Range:
             raise ArgumentError(f"the log range {text!r} must begin above 0", fix="give a positive lower end")
         if self.step is not None and not (math.isfinite(self.step) and self.step > 0):
             raise ArgumentError(f"the range {text!r} has the step {self.step!r}", fix="give a step above 0")
+        if not self.log and (self.integer or self.step is not None) and not self._steps < _MOST_STEPS:
+            raise ArgumentError(
+                f"the range {text!r} has {self._steps:.3g} values, more than can be drawn from",
+                fix="give a narrower range, or a greater step",
+            )
 
     @property
     def steps(self) -> int:
         """How many values a stepped or whole-number range has."""
-        step = self.step if self.step is not None else 1.0
-        return math.floor((self.high - self.low) / step * (1 + 1e-12) + 1e-9) + 1
+        return math.floor(self._steps) + 1
+
+    @property
+    def _steps(self) -> float:
+        return (self.high - self.low) / (self.step if self.step is not None else 1.0) * (1 + 1e-12) + 1e-9
 
     def _at(self, index: int) -> Value:
         value = min(self.low + index * (self.step if self.step is not None else 1.0), self.high)
@@ -337,6 +346,13 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _is_finite(number: float) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # a whole number that is too large for a float
+        return False
 
 
 def _number(value: float) -> str:

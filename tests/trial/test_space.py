@@ -113,6 +113,10 @@ def test_specifications(text, kind, expected):
         ("maybe", "bool", "true"),
         ("a|a", "str", "once"),
         ("fast", "float", "5:40"),
+        (f"0:1{'0' * 23}", "int", "give a narrower range"),
+        (f"0:1{'0' * 400}", "int", "give two finite numbers"),
+        ("0:9e18:0.1", "float", "or a greater step"),
+        ("0:1:1e-320", "float", "or a greater step"),
     ],
 )
 def test_mistakes_name_the_fix(text, kind, fix):
