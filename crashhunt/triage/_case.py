@@ -27,6 +27,7 @@ _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _SIDEWAYS_M = 0.3  # less is drifting
 _STRAIGHT = math.radians(10)
 _DRIFTS_M = 0.1
+_ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 _BESIDE_M = 1.2  # of the path that another one drives; less is in its way
 
 
@@ -263,6 +264,23 @@ class Case:
             if scene.lanes and actor in scene.roster.index and scene.time_s <= self.time_s - before_s
         ]
         return bool(lanes) and lanes[-1].startswith(":")
+
+    def is_past(self, event: Event, time_s: float) -> bool:
+        """Whether whoever an event happened to at a junction had gone on from there to somewhere else.
+
+        Args:
+            event: on the first of the junction's lanes.
+            time_s: when.
+        """
+        after = [scene for scene in self.scenes if scene.time_s >= time_s and event.agent in scene.roster.index]
+        points = [scene.points[scene.roster.index[event.agent]] for scene in after]
+        if sum(math.dist(a, b) for a, b in pairwise(points)) > _ACROSS_M:
+            return True
+        lanes = [event.lane, *(scene.lanes[scene.roster.index[event.agent]] for scene in after if scene.lanes)]
+        if event.agent == self.agent:
+            lanes.append(self.lane)
+        junctions = {lane.rsplit("_", 2)[0] for lane in lanes if lane.startswith(":")}
+        return len(junctions) > 1
 
     def speed_mps(self, actor: str, before_s: float) -> float:
         """How fast an actor was so many s before the contact, or as long before as is known."""

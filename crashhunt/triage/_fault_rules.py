@@ -74,14 +74,19 @@ def _who(case: Case, actor: str) -> Blame:
 
 
 def _red_light(case: Case) -> Finding | None:
-    """Who ran a red light and meets somebody who comes from another side."""
+    """Who ran a red light and meets somebody from another side, at the same junction; both, where both ran one."""
     if case.same_way:
         return None
-    for time_s, event in reversed(case.events):
-        if event.kind == "red_light" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
-            words = f"{event.what}, {case.time_s - time_s:.1f} s before"
-            return Finding("red light", _who(case, event.agent), words, "Vienna, article 23; StVO § 37")
-    return None
+    ran: dict[str, str] = {}
+    for time_s, event in case.events:
+        if event.kind != "red_light" or event.agent not in (case.agent, case.other) or case.time_s - time_s > _RED_S:
+            continue
+        if not case.is_past(event, time_s):
+            ran[event.agent] = f"{event.what}, {case.time_s - time_s:.1f} s before"
+    if not ran:
+        return None
+    blames = "both" if len(ran) == 2 else _who(case, *ran)
+    return Finding("red light", blames, ", and ".join(ran.values()), "Vienna, article 23; StVO § 37")
 
 
 def _wrong_way(case: Case) -> Finding | None:

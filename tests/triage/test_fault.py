@@ -251,6 +251,25 @@ def test_a_red_light_the_wrong_way_and_who_stands():
     assert verdict(drive(straight(15), lambda t: (5.0, 0.0, math.pi / 2, 0.0), seconds=3.0)) == "nobody can tell"
 
 
+def test_a_red_light_is_that_of_the_junction_where_they_meet():
+    """At the next one, somebody else may have ignored the light or the priority."""
+
+    def met(lanes, *, speed=10, end="", both=False, lane=":c_1_0"):
+        who = ("ego", "other") if both else ("ego",)
+        events = tuple((-3.0, Event("red_light", name, f"{name} ran a red light", lane=lane)) for name in who)
+        case = drive(straight(speed), crossing(8), events=events)
+        for back, on in lanes.items():
+            case.scenes[-back].lanes = (on, "s")
+        return verdict(replace(case, lane=end))
+
+    assert met({20: ":c_1_0", 10: "ce_0"}) == "ego"
+    assert met({20: ":c_1_0", 10: ":d_0_0"}) == "nobody can tell"
+    assert met({20: ":c_1_0"}, end=":d_0_0") == "nobody can tell"
+    assert met({}, speed=18) == "nobody can tell"  # it has come further than junctions are wide
+    assert met({}, lane="") == "ego"
+    assert met({}, both=True) == "both"
+
+
 def test_the_right_of_way_is_that_of_the_map():
     scenario = load_scenario("intersection")
     rights = scenario.backend.right_of_way(scenario)
