@@ -112,7 +112,7 @@ class DangerMeter:
             measured = _measured(self._frames, agent, self._dt, Reach(AHEAD_M, _BEHIND_M, _UNKNOWN_M))
             if measured is not None:
                 times, found, *_ = measured
-                fresh = (times > (self._done - 0.5) * self._dt) & (times < (until - 0.5) * self._dt)
+                fresh = (times >= (self._done - 0.5) * self._dt) & (times < (until - 0.5) * self._dt)
                 sums[agent] = (before or 0.0) + float(found[fresh].sum()) * spacing_s(self._dt)
         return sums
 

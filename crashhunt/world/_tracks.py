@@ -84,34 +84,11 @@ class Others(NamedTuple):
 
 
 def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Frame, Array]]:
-    """Yield scenes at regular instants, with the times of their rows, in s since the first.
-
-    Where steps are long, what was between two scenes of the same actors is put in, as if they had gone straight.
-    """
-    every, between = _every(step_length_s), _between_steps(step_length_s)
-    step, last = 0, None
+    """Yield the scenes that are looked at, not all where steps are short, and the times of their rows, in s."""
+    every, step = _every(step_length_s), 0
     for frame in frames:
-        count = len(frame.columns)
-        steps = np.arange(step, step + count)
-        step += count
-        if between > 1 and frame.spines is None:
-            joined = last is not None and last.roster is frame.roster and last.spines is None
-            columns, heights = frame.columns, frame.heights
-            if joined and last is not None:
-                steps = np.append(steps[0] - 1, steps)
-                columns = np.vstack((last.columns[-1:], columns))
-                if heights is not None and last.heights is not None:
-                    heights = np.vstack((last.heights[-1:], heights))
-            share = np.arange(int(joined), between * (len(steps) - 1) + 1) / between  # in steps since the first of them
-            turning = slice(2 * len(frame.roster), 3 * len(frame.roster))
-            unwrapped = columns.copy()
-            unwrapped[:, turning] = np.unwrap(columns[:, turning], axis=0)
-            last = frame
-            filled = None if heights is None or len(heights) != len(steps) else _between(heights, share)
-            times: Array = (float(steps[0]) + share) * step_length_s
-            yield frame._replace(columns=_between(unwrapped, share), heights=filled), times
-            continue
-        last = frame
+        steps = np.arange(step, step + len(frame.columns))
+        step += len(steps)
         rows = np.flatnonzero(steps % every == 0)
         if len(rows):
             spines = tuple(frame.spines[row] for row in rows) if frame.spines is not None else None
@@ -119,14 +96,6 @@ def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Fra
             part = frame._replace(columns=frame.columns[rows], heights=heights, spines=spines)
             instants: Array = steps[rows].astype(float) * step_length_s
             yield part, instants
-
-
-def _between(columns: Array, share: Array) -> Array:
-    row = np.minimum(share.astype(int), max(0, len(columns) - 2))
-    after = np.minimum(row + 1, len(columns) - 1)
-    part = (share - row)[:, None]
-    found: Array = columns[row] * (1 - part) + columns[after] * part
-    return found
 
 
 class Reach(NamedTuple):
@@ -146,7 +115,9 @@ class Reach(NamedTuple):
 def ways(
     frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Track, Others, list[str]] | None:
-    """Return what `tracks` returns of scenes at regular instants, from the core where it can.
+    """Return what `tracks` returns of instants that are `spacing_s` apart, from the core where it can.
+
+    Where steps are long, what was between two scenes is put in, as if everybody who is in both had gone straight.
 
     Args:
         frames: of an episode.
@@ -155,35 +126,16 @@ def ways(
         step_length_s: in s.
         reach: the core may leave out whoever is of no interest, and numbers nobody.
     """
-    core = core_of(frames)
-    if core is None or _between_steps(step_length_s) > 1:
-        return tracks(list(sampled(frames, step_length_s)), agent, within_m)
-    numbers: dict[str, int] = {}
-    every, step = _every(step_length_s), 0
-    parts = []
-    for frame in frames:
-        whose = frame.roster.rows
-        after = step + len(frame.columns)
-        # Where it has a sample; who somebody is says nothing where only some are of interest.
-        if reach is None and agent in frame.roster.index and -(-step // every) * every < after:
-            whose = [numbers.setdefault(actor.id, len(numbers)) for actor in frame.roster.actors]
-        parts.append(part_of(frame, agent, whose))
-        step = after
-    found = core.tracks(parts, every, within_m, *(reach or Reach()))
-    if found is None:
-        return tracks(list(sampled(frames, step_length_s)), agent, within_m)
-    (own, steps), (theirs, pairs) = found
-    if not steps:
+    between = _between_steps(step_length_s)
+    if between > 1:
+        reach = None  # whoever is not on the agent's way in two scenes may be on it between them
+    seen = _fronts_from_core(frames, agent, within_m, step_length_s, reach)
+    seen = seen or _fronts(list(sampled(frames, step_length_s)), agent, within_m)
+    if not len(seen.time):
         return None
-    x, y, heading, *half = np.frombuffer(own).reshape(5, -1)
-    flat = np.zeros(len(x))
-    tall = np.full(len(x), next(one.height for frame in frames for one in frame.roster.actors if one.id == agent))
-    time = np.frombuffer(steps, np.int64).astype(float) * step_length_s
-    mine = np.array([x, y, heading, flat, *half, tall])
-    sample, who = np.frombuffer(pairs, np.int64).reshape(2, -1)
-    other_x, other_y, other_heading, *other_half = np.frombuffer(theirs).reshape(5, -1)
-    z = np.zeros(len(sample))
-    return _track(time, mine), _others([sample, who, other_x, other_y, other_heading, z, *other_half, z]), list(numbers)
+    if between > 1:
+        seen = _filled(seen, between, step_length_s)
+    return _track(seen.time, seen.own), _others(seen.theirs), seen.names
 
 
 def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> tuple[Track, Others, list[str]] | None:
@@ -197,6 +149,61 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
     Returns:
         None where it is in no scene.
     """
+    seen = _fronts(parts, agent, within_m)
+    return (_track(seen.time, seen.own), _others(seen.theirs), seen.names) if len(seen.time) else None
+
+
+class _Fronts(NamedTuple):
+    """What a track is made of, with fronts in place of centres.
+
+    Args:
+        time: in s, shape (samples,).
+        own: shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent.
+        theirs: sample and who, and the same seven of each who is near, each of shape (pairs,).
+        names: of whom they number.
+    """
+
+    time: Array
+    own: Array
+    theirs: Sequence[NDArray[Any]]
+    names: list[str]
+
+
+def _fronts_from_core(
+    frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float, reach: Reach | None
+) -> _Fronts | None:
+    core = core_of(frames)
+    if core is None:
+        return None
+    numbers: dict[str, int] = {}
+    every, step = _every(step_length_s), 0
+    parts = []
+    for frame in frames:
+        whose = frame.roster.rows
+        after = step + len(frame.columns)
+        # Where it has a sample; who somebody is says nothing where only some are of interest.
+        if reach is None and agent in frame.roster.index and -(-step // every) * every < after:
+            whose = [numbers.setdefault(actor.id, len(numbers)) for actor in frame.roster.actors]
+        parts.append(part_of(frame, agent, whose))
+        step = after
+    found = core.tracks(parts, every, within_m, *(reach or Reach()))
+    if found is None:
+        return None
+    (own, steps), (theirs, pairs) = found
+    if not steps:
+        return _NOWHERE
+    x, y, heading, *half = np.frombuffer(own).reshape(5, -1)
+    flat = np.zeros(len(x))
+    tall = np.full(len(x), next(one.height for frame in frames for one in frame.roster.actors if one.id == agent))
+    time = np.frombuffer(steps, np.int64).astype(float) * step_length_s
+    mine = np.array([x, y, heading, flat, *half, tall])
+    sample, who = np.frombuffer(pairs, np.int64).reshape(2, -1)
+    other_x, other_y, other_heading, *other_half = np.frombuffer(theirs).reshape(5, -1)
+    z = np.zeros(len(sample))
+    return _Fronts(time, mine, [sample, who, other_x, other_y, other_heading, z, *other_half, z], list(numbers))
+
+
+def _fronts(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> _Fronts:
     numbers: dict[str, int] = {}
     times: list[Array] = []
     own: list[Array] = []
@@ -213,9 +220,52 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
         theirs.append((near[0] + first, *near[1:]))
         first += len(instants)
     if not times:
-        return None
-    track = _track(np.concatenate(times), np.concatenate(own, axis=1))
-    return track, _others([np.concatenate(column) for column in zip(*theirs, strict=True)]), list(numbers)
+        return _NOWHERE
+    columns = [np.concatenate(column) for column in zip(*theirs, strict=True)]
+    return _Fronts(np.concatenate(times), np.concatenate(own, axis=1), columns, list(numbers))
+
+
+_NOWHERE = _Fronts(np.zeros(0), np.zeros((7, 0)), [np.zeros(0)] * 9, [])
+
+
+def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
+    """Put in what was between two scenes: of everybody who is in both, as if they had gone straight."""
+    time, own, theirs, names = seen
+    joined = np.diff(time) < 1.5 * step_length_s  # the agent may have been away for some steps
+    size = np.append(np.where(joined, between, 1), 1)
+    first = np.cumsum(size) - size
+    share = np.arange(1, between) / between
+    whole = np.empty((len(own) + 1, int(size.sum())))
+    whole[:, first] = np.vstack((time, own))
+    start = np.flatnonzero(joined)
+    whole[:, (first[start, None] + np.arange(1, between)).ravel()] = _between(
+        whole[:, first], start, start + 1, share, 3
+    )
+    # Of long vehicles in bends each part counts, from front to back: the last one stands for those that it has not.
+    sample, who, *_ = theirs
+    order = np.lexsort((sample, who))
+    pairs = np.array([np.asarray(column, float)[order] for column in theirs])
+    begins = np.flatnonzero(np.append(True, (np.diff(pairs[0]) != 0) | (np.diff(pairs[1]) != 0))[: len(order)])
+    parts = np.diff(np.append(begins, len(order)))
+    here = np.flatnonzero((np.diff(pairs[1, begins]) == 0) & (np.diff(pairs[0, begins]) == 1))
+    here = here[joined[pairs[0, begins[here]].astype(int)]]
+    most = np.maximum(parts[here], parts[here + 1])
+    part = np.arange(most.sum()) - np.repeat(np.cumsum(most) - most, most)
+    here = np.repeat(here, most)
+    old, new = (begins[at] + np.minimum(part, parts[at] - 1) for at in (here, here + 1))
+    put_in = _between(pairs, old, new, share, 4)
+    put_in[0] = (first[pairs[0, old].astype(int), None] + np.arange(1, between)).ravel()
+    pairs[0] = first[pairs[0].astype(int)]
+    return _Fronts(whole[0], whole[1:], list(np.hstack((pairs, put_in))), names)
+
+
+def _between(columns: Array, old: NDArray[np.intp], new: NDArray[np.intp], share: Array, heading: int) -> Array:
+    """Return what is so far from old columns to new ones, each as often as there are shares; a row has headings."""
+    before, after = columns[:, old, None], columns[:, new, None].copy()
+    turned = after[heading] - before[heading]
+    after[heading] -= math.tau * np.round(turned / math.tau)  # the short way round
+    found: Array = (before * (1 - share) + after * share).reshape(len(columns), -1)
+    return found
 
 
 def _track(time: Array, fronts: Array) -> Track:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crashhunt.world import Actor, Frame, Roster
-from crashhunt.world._tracks import sampled, spacing_s, tracks
+from crashhunt.world._tracks import sampled, spacing_s, tracks, ways
 
 EGO, OTHER, FAR = Actor("ego", "car", 4.0, 2.0, 1.5), Actor("other", "truck", 10.0, 2.5, 4.0), Actor("far", "car", 4, 2)
 
@@ -22,57 +22,91 @@ def frame(rows, roster=None, **more):
     return Frame(roster, np.hstack((places, headings, np.zeros_like(headings))), **more)
 
 
-def places_of(parts):
-    return np.concatenate([part.columns[:, 0] for part, _ in parts])
-
-
-def times_of(parts):
-    return np.concatenate([times for _, times in parts])
-
-
 @pytest.mark.parametrize(
     ("step_s", "spacing"), [(0.04, 0.32), (0.1, 0.3), (0.2, 0.2), (0.3, 0.3), (0.5, 0.25), (1.0, 0.25), (1.2, 0.3)]
 )
 def test_samples_are_some_tenths_of_a_second_apart(step_s, spacing):
     assert spacing_s(step_s) == pytest.approx(spacing)
     rows = [((float(step), 0.0, 0.0),) for step in range(40)]
-    parts = list(sampled([frame(rows)], step_s))
-    times = times_of(parts)
-    assert np.diff(times) == pytest.approx(spacing)
-    assert (times[0], times[-1]) == (0.0, pytest.approx(39 * step_s, abs=spacing))
-    assert places_of(parts) == pytest.approx(times / step_s)
+    track, _, _ = ways([frame(rows)], "ego", 100.0, step_s)
+    assert np.diff(track.time) == pytest.approx(spacing)
+    assert (track.time[0], track.time[-1]) == (0.0, pytest.approx(39 * step_s, abs=spacing))
+    assert track.x == pytest.approx(track.time / step_s - 2.0)
 
 
 @pytest.mark.parametrize("step_s", [0.1, 0.5])
 def test_it_does_not_matter_in_which_parts_they_come(step_s):
-    whole = frame([((float(step) ** 2, -1.0, 0.1 * step),) for step in range(23)])
-    heights = np.arange(46, dtype=float).reshape(23, 2)
-    whole = whole._replace(heights=heights)
-    cuts = [0, 1, 5, 6, 20, 23]
-    parts = [whole._replace(columns=whole.columns[a:b], heights=heights[a:b]) for a, b in pairwise(cuts)]
-    at_once, in_parts = list(sampled([whole], step_s)), list(sampled(parts, step_s))
-    assert times_of(in_parts) == pytest.approx(times_of(at_once))
-    for name in ("columns", "heights"):
-        found, expected = (np.concatenate([getattr(part, name) for part, _ in each]) for each in (in_parts, at_once))
-        assert found == pytest.approx(expected), name
+    whole = frame([((float(step) ** 2, -1.0, 0.1 * step), (8.0 * step, step, 3 * step)) for step in range(23)])
+    heights = np.arange(92, dtype=float).reshape(23, 4)
+    spines = tuple({1: ((8.0 * step, step, 0.0), (8.0 * step - 10, step, step))} if 7 < step < 9 else {}
+                   for step in range(23))  # fmt: skip
+    for one in (whole._replace(heights=heights), whole._replace(spines=spines)):
+        parts = []
+        for a, b in pairwise([0, 1, 5, 6, 20, 23]):
+            high = heights[a:b] if one.heights is not None else None
+            bent = one.spines[a:b] if one.spines is not None and any(one.spines[a:b]) else None
+            parts.append(one._replace(columns=one.columns[a:b], heights=high, spines=bent))
+        parts[2] = parts[2]._replace(roster=Roster(one.roster.actors))  # another one, of the same
+        (at_once, others, _), (in_parts, others_in_parts, _) = (
+            ways(each, "ego", 1e4, step_s) for each in ([one], parts)
+        )
+        assert np.array(in_parts) == pytest.approx(np.array(at_once))
+        assert len(others.sample) >= len(at_once.time)
+        columns = slice(0, 9 if one.heights is not None else 8)  # how tall they are says nothing on a flat map
+        assert np.array(others_in_parts)[columns] == pytest.approx(np.array(others)[columns])
 
 
 def test_between_two_scenes_it_turns_the_short_way_round_and_goes_straight():
-    ((part, times),) = sampled([frame([((0.0, 0.0, 3.0),), ((8.0, 4.0, -3.0),)])], 1.0)
-    assert times == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0])
-    assert part.columns[:, 0] == pytest.approx([0, 2, 4, 6, 8])
-    assert part.columns[:, 1] == pytest.approx([0, 1, 2, 3, 4])
-    turned = math.tau - 6.0
-    assert part.columns[:, 2] == pytest.approx([3.0 + turned * share for share in (0, 0.25, 0.5, 0.75, 1)])
+    track, _, _ = ways([frame([((0.0, 0.0, 3.0),), ((8.0, 4.0, -3.0),)])], "ego", 100.0, 1.0)
+    assert track.time == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0])
+    turned = 3.0 + (math.tau - 6.0) * np.array((0, 0.25, 0.5, 0.75, 1))
+    assert track.heading == pytest.approx(turned)
+    assert track.x + 2 * np.cos(turned) == pytest.approx([0, 2, 4, 6, 8])  # its front, which is 2 m before its centre
+    assert track.y + 2 * np.sin(turned) == pytest.approx([0, 1, 2, 3, 4])
 
 
-def test_nothing_is_put_in_between_where_others_are_there_or_vehicles_are_bent():
-    first, second = frame([((0.0, 0, 0),)]), frame([((9.0, 0, 0), (50.0, 0, 0))])
-    assert times_of(list(sampled([first, second, second], 1.0)))[:2] == pytest.approx([0.0, 1.0])
-    bent = frame([((float(step), 0, 0),) for step in range(3)], spines=({}, {0: ((0.0, 0, 0), (-4.0, 0, 0))}, {}))
-    parts = list(sampled([bent], 1.0))
-    assert times_of(parts) == pytest.approx([0.0, 1.0, 2.0])
-    assert [sorted(spine) for part, _ in parts for spine in part.spines] == [[], [0], []]
+def test_who_comes_and_who_goes_does_not_keep_the_others_from_being_put_in_between():
+    """In a town, somebody comes into sight or leaves it in nearly every step of 1 s."""
+    first = frame([((0.0, 0, 0), (20.0, 0, 0))])
+    second = frame([((90.0, 0, 0), (8.0, 0, 0), (24.0, 0, 0))], Roster((FAR, EGO, OTHER)))
+    third = frame([((16.0, 0, 0), (50.0, 0, 0))], Roster((EGO, FAR)))
+    track, others, names = ways([first, second, third], "ego", 100.0, 1.0)
+    assert track.time == pytest.approx(np.arange(9) / 4)
+    assert track.x == pytest.approx(2.0 * np.arange(9) - 2)
+    seen = {name: sorted((others.sample[row], others.x[row]) for row in np.flatnonzero(others.who == number))
+            for number, name in enumerate(names)}  # fmt: skip
+    assert seen["other"] == [(sample, 15.0 + sample) for sample in range(5)]
+    assert seen["far"] == [(4 + sample, 88.0 - 10 * sample) for sample in range(5)]
+
+
+def test_nothing_is_put_in_between_where_the_agent_was_away():
+    """As when SUMO takes it out of a jam; the scenes in which it is not are none of its own."""
+    here, away = frame([((0.0, 0, 0), (20.0, 0, 0))]), frame([((20.0, 0, 0),)], Roster((OTHER,)))
+    track, others, _ = ways([here, away, here, here], "ego", 100.0, 1.0)
+    assert track.time == pytest.approx([0.0, 2.0, 2.25, 2.5, 2.75, 3.0])
+    assert sorted(others.sample) == list(range(6))
+
+
+def test_who_was_away_while_the_agent_stayed_is_not_put_in_between():
+    here, away = frame([((0.0, 0, 0), (20.0, 0, 0))]), frame([((0.0, 0, 0),)])
+    _, others, _ = ways([here, away, here], "ego", 100.0, 1.0)
+    assert others.sample.tolist() == [0, 8]
+    _, others, _ = ways([away], "ego", 100.0, 1.0)
+    assert others.sample.tolist() == []
+
+
+def test_parts_of_one_in_a_bend_are_put_in_between_one_by_one():
+    """Where it was straight before, it is cut into as many: each grows out of the whole."""
+    spine = ((20.0, 0.0, 0.0), (15.0, 0.0, 0.0), (10.0, 0.0, 0.0))
+    later = tuple((x + 4, y, z) for x, y, z in spine)
+    bent = frame([((0.0, 0, 0), (16.0, 0, 0)), ((0.0, 0, 0), (20.0, 0, 0)), ((0.0, 0, 0), (24.0, 0, 0))],
+                 spines=({}, {1: spine}, {1: later}))  # fmt: skip
+    _, others, _ = ways([bent], "ego", 100.0, 0.5)
+    rows = sorted(zip(others.sample, others.x, others.half_length, strict=True))
+    assert rows == [
+        (0, 11.0, 5.0), (1, 11.75, 3.75), (1, 14.25, 3.75), (2, 12.5, 2.5), (2, 17.5, 2.5),
+        (3, 14.5, 2.5), (3, 19.5, 2.5), (4, 16.5, 2.5), (4, 21.5, 2.5),
+    ]  # fmt: skip
     short = list(sampled([bent], 0.1))
     assert [len(part.spines) for part, _ in short] == [1]
 
