@@ -3,7 +3,8 @@
 Around each of many random trials that survived, others are run with every numeric argument moved by up to 5 % of its
 range, half of them with the seed of that trial. What is told is the rank correlation (Spearman) of a measure of the
 trial with the share of its neighbours that crash, with an interval of 95 % over the trials (bootstrap). A neighbourhood
-has few trials, so that its share is itself uncertain: even the best measure would not reach 1.
+has few trials, so that its share is itself uncertain: even the best measure would not reach 1. Where an agent decides
+coarsely, a neighbour with the same seed may be the same trial to the bit, and no neighbour: `unmoved` is their share.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ PROBLEMS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "intersection": ("intersection", 250, {}),
     "merge": ("merge", 300, {}),
     "merge-highway-env": ("merge-highway-env", 60, {}),
+    "loop, 1 s steps": ("loop", 40, {"step_length_s": 1.0}),
+    "intersection, 1 s steps": ("intersection", 40, {"step_length_s": 1.0}),
     "intersection-highway-env, 1 s steps": ("intersection-highway-env", 13, {"policy_frequency": 1}),
     "roundabout, 1 s steps": ("roundabout", 11, {"policy_frequency": 1}),
 }
@@ -177,10 +180,12 @@ def follow(one: Disturbance, steps: int, copy: Episode) -> dict[str, object]:
 
 
 def changed(name: str, changes: Mapping[str, Any]) -> Scenario:
-    """Return a shipped scenario with another agent or another frequency of decisions."""
+    """Return a shipped scenario with another agent, other steps or another frequency of decisions."""
     from crashhunt.scenario import load_scenario
 
     scenario = load_scenario(name)
+    if "step_length_s" in changes:
+        return replace(scenario, step_length_s=changes["step_length_s"])
     if "agent" in changes:
         return scenario.with_agents(dict.fromkeys(scenario.agents, str(changes["agent"])))
     if changes:
@@ -204,7 +209,7 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
     rng = np.random.default_rng(seed)
     measures = (*MEASURES, "probes") if probes else MEASURES
     found: dict[str, list[float]] = {name: [] for name in (*measures, "rate", "same")}
-    ran = crashed = 0
+    ran = crashed = near_ones = unmoved = 0
     with tempfile.TemporaryDirectory(prefix="crashhunt-danger-") as folder:
         place = Place(problem, Path(folder))
         while len(found["rate"]) < neighbourhoods:
@@ -219,6 +224,8 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
             for number in range(neighbours):
                 moved = place.move(values, rng)
                 near = place.run(moved, own if number % 2 == 0 else int(rng.integers(2**31)))
+                near_ones += number % 2 == 0
+                unmoved += number % 2 == 0 and near.digest == result.digest
                 if near.outcome is not Outcome.INVALID:
                     hits[number % 2].append(near.outcome.is_traffic_crash)
             if not hits[0] or not hits[1]:
@@ -233,7 +240,8 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
             found["rate"].append(float(np.mean([*hits[0], *hits[1]])))
             found["same"].append(float(np.mean(hits[0])))
     return {"problem": problem, "neighbourhoods": neighbourhoods, "neighbours": neighbours, "crash_rate": crashed / ran,
-            "neighbour_rate": float(np.mean(found["rate"])), "cpu_s": round(time.process_time(), 1),
+            "neighbour_rate": float(np.mean(found["rate"])), "unmoved": unmoved / near_ones,
+            "cpu_s": round(time.process_time(), 1),
             "correlations": {name: correlation(found[name], found["rate"]) for name in measures},
             "with_the_same_seed": {name: correlation(found[name], found["same"]) for name in measures}}  # fmt: skip
 

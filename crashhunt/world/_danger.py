@@ -48,6 +48,7 @@ _DECAY_S = 1.2  # in which the danger of a time gap falls to 1/e
 _HARDEST = 12.0  # m/s²
 _BLIND_S = 4.0  # how long the agent is taken to go on
 AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way; further off is no danger worth the time
+_MOVES_M = 0.01  # from sample to sample
 _UNKNOWN_M = 10.0  # at the end of the way: straight on is a guess
 _SAME_WAY = np.cos(np.pi / 6)  # of directions that differ by less than 30°
 _PLACES = 3  # that are looked at together
@@ -163,6 +164,8 @@ def _measured(
 ) -> tuple[Array, Array, NDArray[np.intp], list[str]] | None:
     """Times, dangers and who else, of each sample; and the names of these."""
     seen = ways(frames, agent, AHEAD_M, step_length_s, reach)
+    if seen is not None and reach is not None and _forwards(seen[0]) < 0:
+        seen = ways(frames, agent, AHEAD_M, step_length_s)  # the core leaves out whom it would not touch straight on
     if seen is None:
         return None
     track, others, names = seen
@@ -195,7 +198,7 @@ def measured_along(track: Track, others: Others, *, same_way: bool = False) -> t
 
 
 class _Way:
-    """The way that an agent drove, by how far along it is, straight on at its end."""
+    """The way that an agent drove, by how far along it is, straight on at its end, or back where it reversed."""
 
     def __init__(self, track: Track, *, flat: bool) -> None:
         self._track = track
@@ -203,10 +206,10 @@ class _Way:
         self.along = np.concatenate(([0.0], np.cumsum(moved))) + 1e-9 * np.arange(len(track.x))  # it never stands still
         seconds = np.diff(track.time)
         self.speed = np.append(moved[:1] / seconds[:1], moved / seconds) if len(moved) else np.zeros(1)
-        on = _UNKNOWN_M
+        on, way = _UNKNOWN_M, _UNKNOWN_M * _forwards(track)
         self._at = np.append(self.along, self.along[-1] + on)
-        self._x = np.append(track.x, track.x[-1] + on * np.cos(track.heading[-1]))
-        self._y = np.append(track.y, track.y[-1] + on * np.sin(track.heading[-1]))
+        self._x = np.append(track.x, track.x[-1] + way * np.cos(track.heading[-1]))
+        self._y = np.append(track.y, track.y[-1] + way * np.sin(track.heading[-1]))
         self._flat = flat
         self._heading, self._z = np.append(track.heading, track.heading[-1]), np.append(track.z, track.z[-1])
         self._time = np.append(track.time, track.time[-1] + on / max(float(self.speed[-1]), 0.1))
@@ -313,6 +316,16 @@ class _Way:
         above = others.z[pair] - np.interp(along, self._at, self._z)
         lower = np.where(above > 0, track.height[sample], others.height[pair])
         return np.where(np.abs(above) < np.maximum(LEVEL_M, lower), found, np.inf)
+
+
+def _forwards(track: Track) -> float:
+    """Return 1, or -1 where the agent reversed when it last moved; from lane to lane SUMO's vehicles move sideways."""
+    moved = np.hypot(np.diff(track.x), np.diff(track.y))
+    if not len(last := np.flatnonzero(moved > _MOVES_M)[-1:]):
+        return 1.0
+    (at,) = last
+    x, y, heading = track.x[at + 1] - track.x[at], track.y[at + 1] - track.y[at], track.heading[at]
+    return -1.0 if x * np.cos(heading) + y * np.sin(heading) < -moved[at] / 2 else 1.0
 
 
 def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tuple[Array, NDArray[np.intp]]:

@@ -120,6 +120,23 @@ def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there
         assert most.step > 20
 
 
+def test_whoever_reverses_goes_on_backwards():
+    """Where its way ends, it goes straight back: whoever stands there is as near as if it were ahead."""
+
+    def stop(speed, at):  # 1 m before somebody who stands there, and stays
+        way = straight(0, 0, 0, speed)
+        way[:, 0] = np.clip(way[:, 0], -30.0, 30.0)
+        return level(way, straight(at, 0, 0, 0))
+
+    forwards, _ = stop(5.0, 36.0 + 0.0)
+    backwards, most = stop(-5.0, -36.0)
+    assert most.other == "other"
+    assert forwards.max() > 0.8
+    assert backwards == pytest.approx(forwards, abs=0.02)
+    away, _ = level(straight(0, 0, 0, -5), straight(20, 0, 0, -5))
+    assert away.max() == 0.0  # who is ahead of one who reverses is behind it
+
+
 def test_nobody_near_is_no_danger_and_nobody_there_is_unknown():
     far = frame(straight(0, 0, 0, 10), straight(0, 300, 0, 10))
     steps, most = dangers([far], ("ego",), 0.1)
