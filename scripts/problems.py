@@ -227,5 +227,11 @@ REAL = {
          "arguments": {"delay_s": "0:2", "headway_s": "0.2:2", "desired_speed": "15:30", "max_brake": "2:8"},
          "scenario_arguments": {"vehicles": "12:20", "speed_spread": "0:0.4"}}, warmup_s=3.0, held_out=True,
     ),
+    "loop-careful": Real(
+        "car following with a shorter delay and better brakes on a ring of SUMO", 1 / 500,
+        {"scenario": "loop", "agents": {"": "car-following"}, "max_steps": 100,
+         "arguments": {"delay_s": "0:1.6", "headway_s": "0.3:2", "desired_speed": "15:28", "max_brake": "3:8"},
+         "scenario_arguments": {"vehicles": "12:20", "speed_spread": "0:0.4"}}, warmup_s=3.0, held_out=True,
+    ),
 }  # fmt: skip
 """Each has other traffic with every seed. Their rates were seen in a few hundred random trials."""
