@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -72,7 +73,8 @@ class Nearness(Observer):
         danger = 1.0 if touched else self._dangers.danger
         # Asked at the end: before the first step it names none, which counts as one that never does.
         if danger is None and offers(self._simulator, NamesDanger):
-            danger = self._simulator.named_danger
+            named = self._simulator.named_danger
+            danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
         return replace(result, closest=closest, danger=danger)
 
     def _take_in(self) -> None:

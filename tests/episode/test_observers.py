@@ -133,5 +133,9 @@ def test_a_simulator_may_name_the_danger_where_there_are_no_others():
     assert named.end(RESULT).danger is None
     simulator.named_danger = 0.25  # as is known after the first step, and not when it begins
     assert named.end(RESULT).danger == 0.25
+    for said, danger in ((math.nan, None), (7.0, 1.0), (-1.0, 0.0)):  # somebody's own, whom nobody has checked
+        simulator.named_danger = said
+        assert named.end(RESULT).danger == danger
+    simulator.named_danger = 0.25
     assert named.end(replace(RESULT, outcome=Outcome.COLLISION)).danger == 1.0
     assert named.end(replace(RESULT, outcome=Outcome.INVALID)).danger is None
