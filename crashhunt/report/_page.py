@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = ["report_data", "write_report"]
 
 _DOTS = 4000  # trials in a plot; more cannot be told apart
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 def write_report(
@@ -154,7 +155,7 @@ def _trials(directory: Path) -> dict[str, object]:
     try:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
-        every = max(1, math.ceil(total / _DOTS))
+        share = _DOTS / max(total, 1)
         trials, stress = [], None
         unchosen: list[tuple[Mapping[str, Value], float]] = []
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
@@ -163,9 +164,10 @@ def _trials(directory: Path) -> dict[str, object]:
                 stress = {"margin": margin, "trial": row.number}
             crashed = outcome.category != "no crash"
             danger = 1.0 if crashed else row.danger
-            if row.origin in UNCHOSEN and row.parent is None and danger is not None and number % every == 0:
+            drawn = _is_drawn(number, share)
+            if row.origin in UNCHOSEN and row.parent is None and danger is not None and drawn:
                 unchosen.append((values_of(row), danger))
-            if number % every == 0 or crashed:
+            if drawn or crashed:
                 time_s = row.time_to_collision_s
                 trials.append(
                     {
@@ -185,11 +187,19 @@ def _trials(directory: Path) -> dict[str, object]:
             "steps": ledger.steps_total(),
             "trials": trials,
             "stress": stress,
-            "thinned": every > 1,
+            "thinned": share < 1.0,
             "importance": importance_of(unchosen),
         }
     finally:
         ledger.close()
+
+
+def _is_drawn(number: int, share: float) -> bool:
+    """Whether a trial is among a share of all, evenly over the hunt.
+
+    Not every fifth, say: what comes in turns, as plain random trials do in a guided hunt, would be all or none.
+    """
+    return number * _GOLDEN % 1.0 < share
 
 
 def _crash(bundle: Bundle, story: Story) -> dict[str, object]:

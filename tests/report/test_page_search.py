@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from itertools import pairwise
 
+import numpy as np
+import pytest
+
+from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults
-from crashhunt.report import report_data
+from crashhunt.hunts import HuntResults, Ledger
+from crashhunt.report import _page, report_data
 from crashhunt.report._search import importance_of, lineage_of
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -61,6 +65,23 @@ def test_a_lineage_leads_from_parent_to_parent_and_ends_where_a_trial_is_missing
     trials = {9: made(9, 5), 5: made(5, 2), 2: made(2, None), 4: made(4, 3), 6: made(6, 6)}
     for number, line in ((9, [5, 2]), (2, []), (4, []), (6, []), (7, [])):
         assert [one.spec.number for one in lineage_of(number, trials.get)] == line
+
+
+@pytest.mark.parametrize("trials", [100, 200, 401, 1000])
+def test_of_many_trials_those_that_are_drawn_are_of_all_origins(tmp_path, monkeypatch, trials):
+    """Every fifth trial of a guided hunt is a plain random one: a page with every fifth or tenth had no others."""
+    monkeypatch.setattr(_page, "_DOTS", 40)
+    ledger = Ledger(tmp_path / layout.LEDGER, writable=True)
+    with ledger.together():
+        for number in range(trials):
+            origin = "random" if number % 5 == 0 else "model"
+            spec = TrialSpec(number, 1, {"ego": {}}, {}, max_steps=1, origin=origin)
+            ledger.record(TrialResult(spec, Outcome.SURVIVED, danger=0.5), snapshot="")
+    ledger.close()
+    drawn = _page._trials(tmp_path)["trials"]
+    assert 36 <= len(drawn) <= 44
+    assert 4 <= [trial["origin"] for trial in drawn].count("random") <= 12
+    assert max(after["number"] - before["number"] for before, after in pairwise(drawn)) < 3 * trials / 40
 
 
 def test_the_page_knows_from_which_trials_a_crash_was_made(shell):
