@@ -49,7 +49,7 @@ class Real:
 
     Args:
         about: in words.
-        rate: of crashes, of random draws, as measured: it says when a hunt is given up.
+        rate: of crashes, of random draws, as it was first seen in a few hundred: it says when a hunt is given up.
         request: what is hunted.
         warmup_s: instead of what the scenario has, on SUMO, so that an episode is short.
         held_out: whether nobody who changes a sampler may look at it before that is done.
@@ -234,4 +234,4 @@ REAL = {
          "scenario_arguments": {"vehicles": "12:20", "speed_spread": "0:0.4"}}, warmup_s=3.0, held_out=True,
     ),
 }  # fmt: skip
-"""Each has other traffic with every seed. Their rates were seen in a few hundred random trials."""
+"""Each has other traffic with every seed. What rates they have, the table says."""

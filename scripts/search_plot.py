@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from search import Run
 
-__all__ = ["costs", "interval", "rare", "table", "write_plot"]
+__all__ = ["costs", "interval", "one_in", "rare", "table", "write_plot"]
 
 GIVE_UP = 3.0  # times what random draws need
 _LEFT, _WIDTH, _ROW, _TOP = 190, 860, 24, 74
@@ -44,6 +44,15 @@ def _needed(problem: str, of_random: Sequence[Run]) -> float:
     if problem in PROBLEMS:
         return (1.0 - math.exp(-GIVE_UP)) / PROBLEMS[problem].rate
     return statistics.fmean(_paid(problem, of_random)) if of_random else math.nan
+
+
+def one_in(problem: str, runs: Sequence[Run]) -> float:
+    """Return how many random trials there are to a crash: by calculation without a simulator, else as they ended."""
+    if problem in PROBLEMS:
+        return 1 / PROBLEMS[problem].rate
+    drawn = [run for run in runs if (run.problem, run.sampler) == (problem, "random")]
+    crashes = sum(run.found for run in drawn)
+    return sum(run.trials for run in drawn) / crashes if crashes else math.nan
 
 
 def costs(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
@@ -92,7 +101,7 @@ def table(runs: Sequence[Run]) -> str:
     lines = [f"| problem | one in | {' | '.join(samplers)} |", f"| --- | ---: |{' ---: |' * len(samplers)}"]
     for name, row in found.items():
         cells = [_cell(runs, name, sampler, row) for sampler in samplers]
-        lines.append(f"| {name} | {1 / (PROBLEMS.get(name) or REAL[name]).rate:.0f} | {' | '.join(cells)} |")
+        lines.append(f"| {name} | {one_in(name, runs):.0f} | {' | '.join(cells)} |")
     means = [rare(found, sampler) for sampler in samplers]
     lines.append(f"| *rare, with a hint* | | {' | '.join('-' if math.isnan(one) else f'{one:.2f}' for one in means)} |")
     return "\n".join(lines)
@@ -148,10 +157,8 @@ def write_plot(runs: Sequence[Run], target: Path) -> None:
     parts.append(f'<text class="faint" x="{_x(1)}" y="{bottom + 32}" text-anchor="middle">random draws</text>')
     for place, (name, row) in enumerate(found.items()):
         y = _TOP + _ROW * place + _ROW / 2
-        problem = PROBLEMS.get(name) or REAL[name]
-        parts.append(
-            f'<text x="12" y="{y + 4}">{escape(name)} <tspan class="faint">1 in {1 / problem.rate:.0f}</tspan></text>'
-        )
+        rate = f"1 in {one_in(name, runs):.0f}"
+        parts.append(f'<text x="12" y="{y + 4}">{escape(name)} <tspan class="faint">{rate}</tspan></text>')
         if name in REAL and place and list(found)[place - 1] in PROBLEMS:
             parts.append(f'<line class="line" x1="12" x2="{_WIDTH - 12}" y1="{y - _ROW / 2}" y2="{y - _ROW / 2}"/>')
         if "guided" in row:
