@@ -310,7 +310,12 @@ if __name__ == "__main__":
         "crashhunt.executors._template",
         "crashhunt.executors._fresh",
         "crashhunt.simulators.toy",
+        "crashhunt.recording._log",
         "gymnasium",
+        "numpy.ma",
         "tomli_w",
+        "tomllib",
+        "xml.etree.ElementTree",
+        "xml.sax",
     )
     _serve(socket.socket(fileno=int(sys.argv[1])))
