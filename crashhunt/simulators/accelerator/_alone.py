@@ -49,6 +49,7 @@ def simulate(env: AbstractEnv, action: object, replaced: Iterable[tuple[type, st
             if action is not None and not env.config["manual_control"] and env.steps % _frames(env) == 0:
                 found.distrust()
                 env.action_type.act(action)
+                found.distrust()
             env.road.act()
             if _interferes(road):
                 found.distrust()

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Crowd"]
 
 _COLLIDES, _MOVES = attrgetter("collides"), attrgetter("moves")
+_STEEP = 20.0  # what has an exponent above need not be finite
 _POSE = attrgetter("heading", "speed")
 _NAMES = NUMBERS_OF["idm"]  # which all others have the first of
 _READ = {how: attrgetter(*names) for how, names in NUMBERS_OF.items()}
@@ -49,6 +50,7 @@ class Crowd:
         idm: the rows of vehicles that decide by themselves.
         controlled: the rows of vehicles that keep to a speed and a lane.
         sliding: the rows of vehicles that move by the dynamic model.
+        of_numpy: the rows of vehicles whose speeds are NumPy's floats, as which they stay.
         timed: the vehicles that count the time since they last thought of changing lanes.
     """
 
@@ -73,6 +75,7 @@ class Crowd:
         self.headings, self.speeds = np.array(poses, float).reshape(-1, 2).T.copy()
         self.idm = [row for row, how in enumerate(self.how) if how == "idm"]
         self.controlled = [row for row, how in enumerate(self.how) if how == "controlled"]
+        self.of_numpy = {row for row, (_, speed) in enumerate(poses[:count]) if type(speed) is np.float64}
         self.lanes: NDArray[np.intp] | None = None
         self.sliding = [row for row, kind in enumerate(kinds[:count]) if kind.slides]
         self.timed = [vehicle for vehicle, kind in zip(self.vehicles, kinds, strict=False) if kind.times]
@@ -114,6 +117,14 @@ class Crowd:
     def aims(self) -> list[bool]:
         """Which vehicles have a lane that they want to be on."""
         return [isinstance(vehicle, ControlledVehicle) for vehicle in self.vehicles]
+
+    @cached_property
+    def tame(self) -> bool:
+        """Whether every acceleration that drivers reckon with is finite, as long as everybody's velocity is."""
+        found = self.of_gaps[:, self.idm]
+        comfort, braking, *_ = found
+        steep = np.abs(self.numbers["DELTA"][self.idm])
+        return bool(np.isfinite(found).all() and (comfort * braking < 0).all() and (steep < _STEEP).all())
 
     @cached_property
     def of_steering(self) -> NDArray[np.float64]:

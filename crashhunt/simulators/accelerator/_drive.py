@@ -6,6 +6,8 @@ depends on besides, who drives where and how hard each would brake, does not cha
 
 from __future__ import annotations
 
+import math
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,11 +29,12 @@ if TYPE_CHECKING:
 
 __all__ = ["decide"]
 
+_AIM = attrgetter("target_lane_index")
 _WHOLE = 2**53  # up to here, floats hold whole numbers
 
 
 def decide(road: Road, frame: Frame, crowd: Crowd) -> bool:
-    """Let all vehicles decide; False where one of them is not known, and nothing was done.
+    """Let all vehicles decide; False where one of them is not known or something fails, and nothing was done.
 
     Args:
         road: with its vehicles.
@@ -41,7 +44,11 @@ def decide(road: Road, frame: Frame, crowd: Crowd) -> bool:
     decisions = _Decisions(road, frame, crowd)
     if not decisions.are_usual:
         return False
-    decisions.take()
+    try:
+        decisions.take()
+    except Exception:  # highway-env is to fail at the same vehicle, those before which have decided
+        decisions.undo()
+        return False
     return True
 
 
@@ -56,18 +63,24 @@ class _Decisions:
         self.rows = sorted(crowd.controlled + self.idm) if crowd.controlled else self.idm
         lanes = crowd.lanes
         self.lanes = np.array([number.get(id(v.lane), -1) for v in vehicles]) if lanes is None else lanes
-        targets = [index.get(vehicles[row].target_lane_index, -1) for row in self.rows]
+        self.aims = list(map(_AIM, map(vehicles.__getitem__, self.rows)))
         self.wanted = [getattr(vehicle, "target_speed", 0) for vehicle in vehicles]
-        timers = [vehicles[row].timer for row in self.idm]
+        self.timers = [vehicles[row].timer for row in self.idm]
         #: whether all that they reckon with are numbers of the usual kinds, and lanes of this road
-        self.are_usual = _are_speeds(self.wanted) and are_numbers(timers)
-        self.are_usual &= -1 not in targets and bool((self.lanes >= 0).all())
+        self.are_usual = _are_speeds(self.wanted) and are_numbers(self.timers)
+        try:
+            targets = list(map(index.get, self.aims))
+        except TypeError:  # a list names a lane as well
+            targets = [None]
+        self.are_usual &= None not in targets and bool((self.lanes >= 0).all())
         if not self.are_usual:
             return
         self.targets = np.array(targets, int)
         self.along, self.across = frame.coordinates_of(self.rows, self.targets)
         over = self.along > self.network.every_length[self.targets] - 5 / 2
         self.leaving = [self.rows[number] for number in np.flatnonzero(over).tolist()]
+        #: what is left of the routes of those who see the end of theirs
+        self.routes = [(vehicles[row].route, list(vehicles[row].route or ())) for row in self.leaving]
         if self.leaving:
             routes = [id(vehicles[row].route) for row in self.rows if vehicles[row].route]
             self.are_usual = len(set(routes)) == len(routes)  # else what one drops from its route matters to others
@@ -98,6 +111,7 @@ class _Decisions:
             and vehicles[row].enable_lane_change and row not in there
         ]  # fmt: skip
         self._ask_all(elsewhere)
+        self.tame = not thinking or (self.crowd.tame and math.isfinite(np.add.reduce(self.velocities, None)))
         ways = {row: self._ways(row) for row in thinking}
         accelerations = [*self._accelerations(), 0.0]  # of nobody, it is 0
         for row in sorted(elsewhere + thinking):
@@ -112,6 +126,17 @@ class _Decisions:
                 accelerations[number] = min(accelerations[number], accelerations[self.elsewhere[row, key]])
         self._look_again({*self.leaving, *elsewhere, *thinking})
         self._act(accelerations[: len(self.idm)])
+
+    def undo(self) -> None:
+        """Have everybody as they were; what they do is said last."""
+        vehicles = self.crowd.vehicles
+        for row, key in zip(self.rows, self.aims, strict=True):
+            vehicles[row].target_lane_index = key
+        for row, timer in zip(self.idm, self.timers, strict=True):
+            vehicles[row].timer = timer
+        for route, rest in self.routes:
+            if type(route) is list:  # nothing else can have lost a part
+                route[:] = rest
 
     def _act(self, accelerations: list[float]) -> None:
         vehicles = self.crowd.vehicles
@@ -174,7 +199,8 @@ class _Decisions:
             ahead, behind = self._neighbours(row, key)
             self.elsewhere[row, key] = own_then = self._ask(row, vehicle, ahead)
             asked = [own_then, self._ask(row, behind, vehicle)]
-            if vehicle.POLITENESS != 0:
+            # Nothing of what others gain matters, unless it is no number: then not even nothing of it is.
+            if vehicle.POLITENESS != 0 or not self.tame:
                 old_ahead, old_behind = self._neighbours(row, vehicle.lane_index)
                 pairs = ((behind, ahead), (old_behind, vehicle), (old_behind, old_ahead))
                 asked += [self._ask(row, *pair) for pair in pairs]

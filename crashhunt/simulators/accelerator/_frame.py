@@ -157,7 +157,10 @@ class Frame:
         self, vehicle: RoadObject, row: int, key: LaneIndex
     ) -> tuple[RoadObject | None, RoadObject | None] | None:
         """Who is ahead and who is behind on a lane: `Road.neighbour_vehicles`. None where that must be asked."""
-        lane = self.network.index.get(key)
+        try:
+            lane = self.network.index.get(key)
+        except TypeError:  # a list names a lane as well
+            return None
         if lane is None:
             return None
         queue = self._queues.get(lane)
@@ -250,7 +253,8 @@ def are_plain(things: list[RoadObject], kinds: list[Kind] | None = None) -> bool
 
 
 def _is_place(position: NDArray[np.float64]) -> bool:
-    return position.dtype is _FLOAT and position.shape == (2,)
+    # That of an array that has been pickled is another one that is equal.
+    return (position.dtype is _FLOAT or position.dtype == _FLOAT) and position.shape == (2,)
 
 
 _PLAIN = attrgetter("plain")

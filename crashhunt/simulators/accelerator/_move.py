@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
     Path = tuple[list[NDArray[np.float64]], list[float]]  # positions and headings that are predicted
 
-__all__ = ["collide", "collide_one_by_one", "enforce", "move"]
+__all__ = ["as_numpy", "collide", "collide_one_by_one", "enforce", "move"]
 
 _DICTS, _FLOATS = frozenset((dict,)), frozenset((float,))
 _MARGIN = 1e-6  # m; what is nearer than this is left to the exact test
 
 
-def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) -> Frame | None:
+def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None, *, alone: bool = False) -> Frame | None:
     """Move all vehicles, of whom it is known how they move, and have the crowd know.
 
     Args:
@@ -41,6 +41,7 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) 
         network: the lanes of their road.
         dt: how long, in s.
         frame: where they are, if that is known.
+        alone: whether headings may be Python's floats, until `as_numpy` is called.
 
     Returns:
         Where everybody is then, or None where numbers are not of the usual kinds and nothing was done.
@@ -64,7 +65,11 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) 
     places[:count, 1] += (speed * np.sin(course)) * dt
     turned = heading + speed * np.sin(slip) / (crowd.numbers["LENGTH"][:count] / 2) * dt
     faster = speed + acceleration * dt
-    _write(crowd, places, turned.tolist(), faster.tolist())
+    speeds: list[float] = faster.tolist()
+    # Of what kind a number is decides what arithmetic with others makes of it.
+    for row in range(count) if type(dt) is np.float64 else crowd.of_numpy:
+        speeds[row] = faster[row]
+    _write(crowd, places, turned.tolist() if alone else list(turned), speeds)
     for row in crowd.sliding:
         _slide(vehicles[row], dt)
         places[row], turned[row], faster[row] = vehicles[row].position, vehicles[row].heading, vehicles[row].speed
@@ -81,6 +86,13 @@ def move(crowd: Crowd, network: Network, dt: float, frame: Frame | None = None) 
         vehicle.lane = lanes[lane]
     crowd.lanes = np.array(closest)
     return frame
+
+
+def as_numpy(vehicles: list[Vehicle]) -> None:
+    """Make NumPy's floats of headings, as they are after a step of highway-env."""
+    for vehicle in vehicles:
+        if type(vehicle.heading) is float:
+            vehicle.heading = np.float64(vehicle.heading)
 
 
 def _slide(vehicle: Vehicle, dt: float) -> None:
@@ -119,6 +131,8 @@ def _clip_all(crowd: Crowd, acts: list[float], speed: NDArray[np.float64]) -> No
     for row in rows.difference(crowd.sliding):
         _clip_actions(vehicles[row])
         acts[row], acts[row + count] = vehicles[row].action["steering"], vehicles[row].action["acceleration"]
+        if type(acts[row + count]) is np.float64:
+            crowd.of_numpy.add(row)
 
 
 def _clip_actions(vehicle: Vehicle) -> None:

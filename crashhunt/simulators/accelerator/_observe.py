@@ -72,7 +72,7 @@ def close_objects(
 def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
     """`KinematicObservation.observe`; None where that must be asked."""
     env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
-    if frame is None or not _KNOWN.issuperset(features) or not _is_plain(vehicle, features):
+    if frame is None or not _are_known(features) or not _is_plain(vehicle, features):
         return None
     close = env.road.close_objects_to(
         vehicle,
@@ -82,7 +82,7 @@ def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.
         sort=kinematic.order == "sorted",
         vehicles_only=not kinematic.include_obstacles,
     )[-kinematic.vehicles_count + 1 :]
-    if not all(_is_plain(thing, features) for thing in (vehicle, *close)):
+    if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
         return None
     own = _values(vehicle)
     rows = [own]
@@ -110,6 +110,8 @@ def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.f
         return None
     things = [vehicle, goal]
     if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
+        return None
+    if any(getattr(thing, "route", None) for thing in things):  # whose end is asked for, shown or not
         return None
     here, there = (np.array([values[name] for name in features]) for values in (_values(vehicle), _values(goal)))
     scales = kinematic.scales
@@ -152,6 +154,23 @@ def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float6
             found = found + swing[:, None] * lane.direction_lateral
     places: NDArray[np.float64] = found
     return places
+
+
+def _are_known(features: object) -> bool:
+    """Whether features are known, and each is asked for once: of the others, a data frame has more columns."""
+    return type(features) is list and _KNOWN.issuperset(features) and len(set(features)) == len(features)
+
+
+def _arrives(thing: RoadObject, network: Network) -> bool:
+    """Whether the end of its route is on the road: whoever describes a vehicle asks for it, shown or not."""
+    route = getattr(thing, "route", None)
+    if not route:
+        return True
+    try:
+        start, end, number = route[-1]
+        return (start, end, 0 if number is None else number) in network.index
+    except (LookupError, TypeError, ValueError):
+        return False
 
 
 def _is_plain(thing: RoadObject, features: list[str]) -> bool:

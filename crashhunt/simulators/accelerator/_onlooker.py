@@ -13,6 +13,8 @@ __all__ = ["Onlooker"]
 class Onlooker:
     """Stands on a road in the place of its ``step``. What has been computed for a road holds while he only looks.
 
+    Meanwhile headings may be Python's floats, which are NumPy's after a step of the environment.
+
     Args:
         advance: the road's own ``step``.
         before: called before it, with how long the sub-step is (s).

@@ -11,10 +11,13 @@ from highway_env.road.road import Road
 from crashhunt.simulators.accelerator._crowd import Crowd
 from crashhunt.simulators.accelerator._frame import Frame
 from crashhunt.simulators.accelerator._known import Own, kinds_of
+from crashhunt.simulators.accelerator._move import as_numpy, move
 from crashhunt.simulators.accelerator._network import Network
 from crashhunt.simulators.accelerator._watch import Watch, is_plain
 
 if TYPE_CHECKING:
+    from highway_env.vehicle.kinematics import Vehicle
+
     Everybody = tuple["Prepared", Crowd, Frame]
 
 __all__ = [
@@ -51,6 +54,14 @@ class Prepared:
         self.frame: Frame | None = None
         self.alone = False
         self._crowd: Crowd | None = None
+        self._moved: list[Vehicle] = []
+
+    def move(self, crowd: Crowd, dt: float, before: Frame | None) -> Frame | None:
+        """Move everybody, as `move` does."""
+        frame = move(crowd, self.network, dt, before, alone=self.alone)
+        if self.alone and frame is not None:
+            self._moved = crowd.vehicles
+        return frame
 
     def keep(self, crowd: Crowd, frame: Frame) -> None:
         """Trust what is known about everybody until somebody else's code runs."""
@@ -63,8 +74,10 @@ class Prepared:
         return (self, crowd, self.frame) if crowd is not None and self.frame is not None else None
 
     def distrust(self) -> None:
-        """Look at everybody again, as somebody else's code may have run."""
+        """Have somebody else's code run: everybody is as in highway-env, and is looked at again afterwards."""
         self._crowd = None
+        as_numpy(self._moved)
+        self._moved = []
 
 
 def look(road: Road) -> Everybody | None:

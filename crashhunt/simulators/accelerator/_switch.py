@@ -21,7 +21,7 @@ from crashhunt.simulators.accelerator._alone import can_run_alone, simulate
 from crashhunt.simulators.accelerator._crowd import Crowd
 from crashhunt.simulators.accelerator._drive import decide
 from crashhunt.simulators.accelerator._known import left_alone, originals, reason_against
-from crashhunt.simulators.accelerator._move import collide, collide_one_by_one, enforce, move
+from crashhunt.simulators.accelerator._move import collide, collide_one_by_one, enforce
 from crashhunt.simulators.accelerator._observe import close_objects, fill_lanes, observe, observe_goal
 from crashhunt.simulators.accelerator._roads import (
     forget,
@@ -117,7 +117,7 @@ def _step(self: Road, dt: float) -> None:
     found, crowd, before = everybody or (prepared(self, known=True), Crowd(self), None)
     frame = None
     if found is not None and crowd.moves and not self.record_history:
-        frame = move(crowd, found.network, dt, before)
+        frame = found.move(crowd, dt, before)
     if frame is None:
         for vehicle in self.vehicles:
             vehicle.step(dt)

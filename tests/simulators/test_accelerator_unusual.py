@@ -1,0 +1,216 @@
+"""The accelerator where a user's numbers, lanes and routes are unusual: the same bits, kinds of numbers and errors."""
+
+from __future__ import annotations
+
+import pickle
+
+import highway_env
+import numpy as np
+import pytest
+from highway_env.envs.highway_env import HighwayEnvFast
+from highway_env.road import road
+from highway_env.road.lane import StraightLane
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+from crashhunt.simulators.accelerator import _roads, switch_off, switch_on
+from crashhunt.simulators.highway import restore_classes
+
+assert highway_env
+NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
+
+
+@pytest.fixture(autouse=True)
+def as_it_was():
+    switch_off()
+    restore_classes()
+    yield
+    switch_off()
+    restore_classes()
+
+
+def plain(value):
+    """Anything with its type: NumPy's floats are not Python's to whoever multiplies them by a `float32`."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [type(value), *map(plain, value)]
+    return type(value), float(value).hex() if isinstance(value, float | np.floating) else str(value)
+
+
+def state(place):
+    return [[plain(vars(vehicle).get(name)) for name in NAMES] for vehicle in place.vehicles]
+
+
+def two_roads(count=5):
+    """One after the other, of two lanes each."""
+    network = road.RoadNetwork()
+    for start, end, at in (("a", "b", 0), ("b", "c", 100)):
+        for beside in range(2):
+            network.add_lane(start, end, StraightLane([at, 4 * beside], [at + 100, 4 * beside], speed_limit=30))
+    place = road.Road(network, np_random=np.random.default_rng(1))
+    place.vehicles += [
+        IDMVehicle(place, [18.0 * number, 4.0 * (number % 2)], 0, 20 + number, timer=0.3 * number)
+        for number in range(count)
+    ]
+    return place
+
+
+def both(change, steps=8, dt=0.2):
+    """The state of all vehicles after each step, without and with the accelerator."""
+    found = []
+    for fast in (False, True):
+        switch_off()
+        if fast:
+            assert switch_on() == ""
+        with pytest.MonkeyPatch.context() as patch:
+            place, trace = two_roads(), []
+            for number in range(steps):
+                if number == 2:
+                    change(place, patch)
+                try:
+                    place.act()
+                    place.step(dt)
+                except Exception as error:  # somebody may go on after it
+                    trace.append(repr(error))
+                trace.append(state(place))
+            found.append(trace)
+    return found
+
+
+def nothing(place, patch):
+    pass
+
+
+@pytest.mark.parametrize(("number", "dt"), [(float, 0.2), (np.float64, 0.2), (int, 1), (float, np.float64(0.2))])
+def test_numbers_stay_of_the_kind_that_they_are_in_highway_env(number, dt):
+    def change(place, patch):
+        for vehicle in place.vehicles[::2]:
+            vehicle.speed = number(vehicle.speed)
+        place.vehicles[3].speed = 99.0
+        patch.setattr(Vehicle, "MAX_SPEED", np.float64(40))
+
+    slow, fast = both(change, dt=dt)
+    assert slow == fast
+
+
+def a_list_names_a_target(place, patch):
+    place.vehicles[1].target_lane_index = ["a", "b", 0]
+
+
+def a_list_names_a_lane(place, patch):
+    place.vehicles[1].lane_index = ["a", "b", 0]
+
+
+def no_number(place, patch):
+    place.vehicles[2].speed = float("nan")
+
+
+def no_direction(place, patch):
+    place.vehicles[2].heading = float("nan")
+
+
+def a_huge_exponent(place, patch):
+    for vehicle in place.vehicles:
+        vehicle.DELTA = 400.0
+    place.vehicles[2].target_speed = 0.001
+
+
+def braking_that_is_none(place, patch):
+    patch.setattr(IDMVehicle, "COMFORT_ACC_MIN", 5.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [a_list_names_a_target, a_list_names_a_lane, no_number, no_direction, a_huge_exponent, braking_that_is_none],
+)
+def test_what_nobody_expects_comes_to_the_same(change):
+    """Of what is no number, not even nothing is nothing: a driver who is not polite heeds it all the same."""
+    slow, fast = both(change)
+    assert slow == fast
+    assert slow != both(nothing)[0]  # it matters
+
+
+def test_an_error_is_that_of_the_same_vehicle_and_everybody_goes_on_as_after_it():
+    def change(place, patch):
+        place.vehicles[4].position[:] = 98.5, 0.0
+        place.vehicles[4].target_lane_index = ("a", "b", 0)
+        place.vehicles[4].route = [("a", "b", 0), ("b", "nowhere", 0)]
+        place.vehicles[1].position[:] = 98.6, 4.0
+        place.vehicles[1].target_lane_index = ("a", "b", 1)
+        place.vehicles[1].route = [("a", "b", 1), ("b", "c", None)]
+
+    slow, fast = both(change)
+    assert slow == fast
+    assert any("nowhere" in step for step in slow if isinstance(step, str))
+
+
+def environment(**config):
+    config = {"vehicles_count": 9, "vehicles_density": 1.6, "simulation_frequency": 5, **config}
+    env = HighwayEnvFast(config)
+    env.reset(seed=3)
+    return env
+
+
+def shown(features, change=lambda env: None):
+    found = []
+    for fast in (False, True):
+        switch_off()
+        env = environment()
+        env.observation_type.features = features
+        if fast:
+            assert switch_on() == ""
+        change(env)
+        try:
+            found.append(plain(env.observation_type.observe()))
+        except Exception as error:
+            found.append(repr(error))
+    return found
+
+
+def far_away(env):
+    env.vehicle.route = [("0", "1", 99)]
+
+
+@pytest.mark.parametrize(
+    ("features", "change"),
+    [
+        (["presence", "x", "x", "y"], lambda env: None),
+        (("presence", "x"), lambda env: None),
+        (["presence", "x"], far_away),
+    ],
+)
+def test_what_an_observation_asks_for_twice_or_cannot_have_is_that_of_highway_env(features, change):
+    slow, fast = shown(features, change)
+    assert slow == fast
+
+
+def test_what_actions_do_to_a_road_of_which_they_have_asked_something_is_noticed():
+    def drive(env):
+        place, act = env.road, env.action_type.act
+
+        def busy(action):
+            act(action)
+            place.act()
+            place.vehicles[4].position[1] += 0.5
+
+        env.action_type.act = busy
+        env.step(1)
+        return state(place)
+
+    slow = drive(environment())
+    assert switch_on() == ""
+    assert drive(environment()) == slow
+
+
+def test_an_environment_that_has_been_pickled_is_fast_too(monkeypatch):
+    assert switch_on() == ""
+    env = pickle.loads(pickle.dumps(environment()))
+    decided = []
+    crowd = _roads.Crowd
+    monkeypatch.setattr(_roads, "Crowd", lambda place: decided.append(crowd(place)) or decided[-1])
+    env.step(1)
+    assert len(decided) == 1
+    assert decided[0].drives
