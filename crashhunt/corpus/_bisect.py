@@ -112,14 +112,24 @@ def bisect(
             _git(tree, "checkout", "--quiet", "--detach", ends[0])
             _see(run(), "fixed", good, "--good")
             said = _git(tree, "bisect", "start", ends[1], ends[0])
+            told = set()
             while not (found := _FOUND.search(said)) and "only 'skip'ped commits left" not in said:
                 head = _git(tree, "rev-parse", "HEAD")
+                if head in told:  # git goes on to no other
+                    raise _no_way(good, bad, head)
+                told.add(head)
                 said = _git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
             if found is not None:
                 return Bisected(found[1], _git(tree, "log", "-1", "--format=%s", found[1]), (), tried)
             return Bisected("", "", tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)), tried)
         finally:
             _git(top, "worktree", "remove", "--force", str(tree), skipped=True)
+
+
+def _no_way(good: str, bad: str, parts: str) -> UsageError:
+    """No way leads from the one to the other: they part, and where they do, it crashes already."""
+    message = f"--good {good} is not before --bad {bad}: they part at {parts[:12]}, where it crashes already"
+    return UsageError(message, fix="give a revision before that")
 
 
 def _see(got: Got, expected: Got, revision: str, option: str) -> None:

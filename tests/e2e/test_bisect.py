@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 from test_corpus import BROKEN, DRIVER, MENDED
+
+from crashhunt.base.errors import UsageError
+from crashhunt.corpus import _bisect
 
 
 def git(folder, *words):
@@ -60,3 +64,25 @@ def test_what_is_no_revision_is_told(toy, made_once):
     git(toy.folder, "init", "-q")
     git(toy.folder, "commit", "-qm", "empty", "--allow-empty")
     assert "'v1' is no commit" in toy.crashhunt("bisect", "h", "--good", "v1", expect=2).err
+
+
+def test_a_revision_on_another_branch_that_mended_it_is_told(tmp_path, monkeypatch):
+    """Git says so again and again, and goes on to no other revision."""
+    git(tmp_path, "init", "-q", "-b", "main")
+    for words, code in ((), "bad"), (("-b", "mended"), "good"), (("main",), "bad as well"):
+        if words:
+            git(tmp_path, "checkout", "-q", *words)
+        (tmp_path / "code").write_text(code)
+        git(tmp_path, "add", "code")
+        git(tmp_path, "commit", "-qm", code)
+
+    def ran(case, folder, tree, modules):
+        return "still" if (tree / "code").read_text().startswith("bad") else "fixed"
+
+    monkeypatch.setattr(_bisect, "_run", ran)
+    monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
+    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}))
+    parts = git(tmp_path, "rev-parse", "main~1")[:12]
+    with pytest.raises(UsageError, match=f"--good mended is not before --bad main: they part at {parts}, where"):
+        _bisect.bisect(SimpleNamespace(hunt=tmp_path), "mended", bad="main", folder=tmp_path)
+    assert len(git(tmp_path, "worktree", "list").splitlines()) == 1
