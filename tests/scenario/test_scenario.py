@@ -222,6 +222,9 @@ def test_whom_a_controlled_vehicle_may_replace(town):
     assert drawn(trips[0] + tram + odd) == []  # only one is left
     (town / "r.rou.xml").write_text(f'<routes><vType id="tram" vClass="tram"/>{tram.replace("0", "900")}</routes>')
     assert load_scenario(path, ego="x").agents["x"].depart_s == 900.0  # who is named is waited for, on rails too
+    for some, told in ((trips[0], "departs"), (trips[0] + trips[3], "departs from 10 to 310 s")):
+        assert drawn(some) == []
+        assert load_scenario(path, ego="any").notes[0].endswith(f"the only one that {told}")
     flow = '<flow id="f" begin="0" end="3600" period="0.5" from="a" to="b"/>'
     many = drawn(flow)
     assert len(many) == len(set(many)) == 200

@@ -122,7 +122,8 @@ def _anybody(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     count = len(names)
     if count == 1:
         depart = next(one.depart_s for one in known if one.vehicle == names[0])
-        note = f"{why}the controlled vehicle is {names[0]!r}, the only one that departs"
+        when = "" if len(known) == 1 else f" from {since:.0f} to {since + _WINDOW_S:.0f} s"
+        note = f"{why}the controlled vehicle is {names[0]!r}, the only one that departs{when}"
         return Ego(names[0], AgentSetup(existing=True, depart_s=depart), note, {})
     if count > _AT_MOST:
         names = [names[index * count // _AT_MOST] for index in range(_AT_MOST)]
