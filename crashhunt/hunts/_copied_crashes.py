@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.hunts._from_the_start import Found, FromTheStart
+    from crashhunt.hunts._next_trials import Trials
     from crashhunt.hunts._progress import Progress
     from crashhunt.trial import TrialResult
 
@@ -28,10 +29,11 @@ class CopiedCrashes:
     Args:
         copies: runs from the start what they have found.
         progress: of the hunt, which gets what has crashed there as well.
+        trials: of the hunt that are still to run.
     """
 
-    def __init__(self, copies: FromTheStart, progress: Progress) -> None:
-        self._copies = copies
+    def __init__(self, copies: FromTheStart, progress: Progress, trials: Trials) -> None:
+        self._copies, self._trials = copies, trials
         self._progress = progress
         run, disturber = copies.again.settings.run, copies.disturber
         self._ends = not run.keep_going and not run.only_at_fault and disturber is not None and bool(disturber.models)
@@ -63,9 +65,10 @@ class CopiedCrashes:
         Args:
             tell: called before that, where there is any.
         """
-        waiting, self._waiting = sorted(self._waiting, key=lambda result: result.spec.number), []
+        waiting = sorted(self._waiting, key=lambda result: result.spec.number)
+        self._waiting = [result for result in waiting if self._comes_later(result.spec.number)]
         ends = False
-        for result in waiting:
+        for result in waiting[: len(waiting) - len(self._waiting)]:
             number, least = result.spec.number, self._progress.last_wanted
             if least is not None and (number > least or not self._deterministic):
                 continue
@@ -77,6 +80,11 @@ class CopiedCrashes:
                     ends = True
                     break
         return ends
+
+    def _comes_later(self, number: int) -> bool:
+        """Whether trials of lower numbers have not begun: it had ended when the hunt was killed, and they had not."""
+        upcoming = self._trials.upcoming
+        return self._deterministic and upcoming is not None and upcoming < number
 
     def _found(self, result: TrialResult) -> list[tuple[str, Found]]:
         """What copies of a trial have crashed with, of the kinds that its hunt has; of its branches the likeliest."""

@@ -169,7 +169,7 @@ class Hunt:
         )
         again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
         copies = FromTheStart(again, self._disturber)
-        self._copied = CopiedCrashes(copies, progress)
+        self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
         if not progress.is_done:

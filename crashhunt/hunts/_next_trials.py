@@ -69,6 +69,11 @@ class Trials:
             self._resume(finished)
 
     @property
+    def upcoming(self) -> int | None:
+        """The number of the next one; all of lower numbers have ended or are under way. None where there is none."""
+        return self._next
+
+    @property
     def exhausted(self) -> bool:
         """Whether there are no more."""
         return self._next is None

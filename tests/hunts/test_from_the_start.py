@@ -79,7 +79,7 @@ def looked(copies, *results, deterministic=False):
     """Which trial ends a hunt by a copy, and what was run from the start."""
     copies.again.settings.run.deterministic = deterministic
     progress = Progress()
-    at = CopiedCrashes(copies, progress)
+    at = CopiedCrashes(copies, progress, SimpleNamespace(upcoming=None))
     for result in results:
         at.add(result)
     told = []
@@ -110,7 +110,7 @@ def test_only_kinds_that_a_hunt_has_end_it():
 def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for():
     for deterministic, wanted in ((False, 4), (True, 2)):
         copies, progress = Copies(deterministic=deterministic), Progress()
-        at = CopiedCrashes(copies, progress)
+        at = CopiedCrashes(copies, progress, SimpleNamespace(upcoming=None))
         crashed = replace(ended(4), outcome=Outcome.COLLISION)
         progress.found[4] = crashed
         for number in (2, 6):
@@ -120,6 +120,23 @@ def test_a_copy_of_an_earlier_trial_comes_before_a_crash_where_that_is_asked_for
         assert progress.unsaved is (None if deterministic else crashed)
         assert (progress.ended_by_copy is not None) is deterministic
         assert len(copies.ran) == deterministic
+
+
+def test_a_deterministic_hunt_that_is_resumed_runs_trials_of_lower_numbers_first():
+    for deterministic, waits in ((False, False), (True, True)):
+        copies, progress = Copies(deterministic=deterministic), Progress()
+        trials = SimpleNamespace(upcoming=1)
+        at = CopiedCrashes(copies, progress, trials)
+        copies.again.ledger = SimpleNamespace(
+            plain_results=lambda: [ended(3, branch=3.0).to_json(), ended(0).to_json()],
+            result={3: ended(3, branch=3.0)}.get,
+        )
+        at.resume()
+        assert copies.ran == ([] if waits else [(3, "branches")])
+        assert progress.is_done is not waits
+        trials.upcoming = 4
+        assert at.look() is waits
+        assert progress.last_wanted == 3
 
 
 def test_what_is_kept_is_not_run_again_and_stays(tmp_path):
