@@ -69,10 +69,10 @@ class Episodes:
         if action:
             chosen = with_action(chosen, self.agent, action)
         self._arguments = argument_values(chosen)
+        self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
         self._stage = tempfile.TemporaryDirectory(prefix="crashhunt-")
         self._simulator = SumoSimulator(chosen, Path(self._stage.name))
         self._form = self._simulator.actions[self.agent]
-        self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
         self._max_steps = max_steps
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
         self._episode: Episode | None = None

@@ -109,7 +109,7 @@ def test_others_err_where_it_is_asked_for():
     assert said == again
     assert np.array_equal(first, second)
     assert any("brakes with" in words for _, *told in said for words in told)
-    plain = SumoEnv("loop", process=True)
+    plain = SumoEnv("loop")  # in this process, where it is the same
     plain.reset(seed=4)
     undisturbed = [plain.step((12.0, 0)) for _ in range(len(first) - 1)]
     plain.close()
@@ -121,7 +121,7 @@ def test_others_err_where_it_is_asked_for():
 
 def test_what_cannot_disturb_is_refused():
     with pytest.raises(UsageError, match="disturb needs to know how long"):
-        SumoEnv("loop", process=True, disturb="brake=1")
+        SumoEnv("loop", disturb="brake=1")
     with pytest.raises(UsageError, match="there is no disturbance 'brakes'"):
         SumoEnv("loop", process=True, disturb="brakes=1", max_steps=5)
 
