@@ -107,7 +107,7 @@ class Commands:
     def close(self) -> None:
         """End it."""
         self._control.close()
-        self._process.wait(10)
+        self._process.wait(60)
         self.warm.control.close()
         try:
             self._kept.wait(10)

@@ -76,7 +76,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("crashhunt")
 
-_TIMEOUT_S = 150.0
+_TIMEOUT_S = 400.0
 collect_ignore = ["e2e/frozen"]  # in which a case of a corpus is a test to whoever has crashhunt's plugin
 FAULTY = Path(__file__).parent / "e2e" / "faulty.py"
 
@@ -214,7 +214,7 @@ def _modules_of_its_own() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test itself replays, end to end, starts as little as what its commands do."""
-    if request.path.parent.name == "e2e":
+    if request.path.parent.name in ("e2e", "contracts"):
         monkeypatch.setattr(
             "crashhunt.base.keeper.subprocess",
             SimpleNamespace(

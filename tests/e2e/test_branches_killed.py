@@ -56,6 +56,7 @@ def with_copies(process):
 NIGHTLY = [pytest.param(level, marks=pytest.mark.nightly) for level in (1, 2, 3)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("level", [0, *NIGHTLY])  # the hunt, what workers are forked from, a worker, a copy
 def test_whoever_is_killed_nothing_goes_on_and_the_hunt_comes_to_its_end(toy, level):
     process = toy.start(*HUNT)
@@ -69,7 +70,7 @@ def test_whoever_is_killed_nothing_goes_on_and_the_hunt_comes_to_its_end(toy, le
         assert "Traceback" not in err
     else:
         process.communicate(timeout=90)
-        wait_for(lambda: not go_on(below), timeout_s=20.0)
+        wait_for(lambda: not go_on(below), timeout_s=60.0)
         (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
         assert (state["state"], state["branches"]["run_again"]) == ("killed", None)
         toy.crashhunt(*HUNT)

@@ -124,10 +124,15 @@ def test_logs_follow_what_runs(toy):
         [str(CRASHHUNT), "logs", "h", "--follow", "--type", "state"], cwd=toy.folder, env=toy.environment,
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    time.sleep(1)
+    assert following.stdout is not None
+    out = ""
+    while "running" not in out:
+        line = following.stdout.readline()
+        assert line, out
+        out += line
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=150)
-    out, _ = following.communicate(timeout=150)
+    out += following.communicate(timeout=150)[0]
     assert out.count("running") == 1
     assert "interrupted" in out
 

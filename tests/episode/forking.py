@@ -143,7 +143,7 @@ def refused(stage):
         with begun(simulator, scenario, stage, agent=KeepLaneWithSpeed(10.0)) as (episode, _):
             kept = make()
             try:
-                episode.fork(lambda copy: {}).answer(10.0)
+                episode.fork(lambda copy: {}).answer(60.0)
                 found[name] = ""
             except CrashhuntError as error:
                 found[name] = str(error)
@@ -157,11 +157,11 @@ def ends(stage):
     scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()})
     simulator = locate("simulators", "toy")(scenario, stage)
     with begun(simulator, scenario, stage) as (episode, _):
-        hung = episode.fork(lambda copy: time.sleep(60)).answer(0.2)
-        died = episode.fork(lambda copy: os.kill(os.getpid(), 9)).answer(10.0)
+        hung = episode.fork(lambda copy: time.sleep(600)).answer(0.2)
+        died = episode.fork(lambda copy: os.kill(os.getpid(), 9)).answer(60.0)
         divides = episode.fork(lambda copy: 1 / 0)
-        raised = divides.answer(10.0)
-        copies = [episode.fork(lambda copy: time.sleep(60)) for _ in range(2)]
+        raised = divides.answer(60.0)
+        copies = [episode.fork(lambda copy: time.sleep(600)) for _ in range(2)]
         copies[0].end()
         copies[0].end()
     return {"answers": [hung, died, raised], "raised": divides.raised, "left": copies[1].pid}
