@@ -27,6 +27,7 @@ def typed(shell, text: str, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
     out = typed(crash, "p 'at', step, self.step, observation.shape, len(scene.points) > 3\nc\n", "--pdb")
     assert "('at', 30, 29, (8, 7), True)" in out  # its own counter has not moved yet

@@ -179,6 +179,7 @@ sys.meta_path.insert(0, Hide())
     assert "crashhunt[video]" in done.err
 
 
+@pytest.mark.long
 def test_a_full_disk_leaves_no_half_film(crash):
     import resource
 

@@ -10,6 +10,7 @@ from crashhunt.errors import CrashhuntError
 from crashhunt.testing import assert_survives
 
 
+@pytest.mark.long
 def test_what_crashes_fails_and_what_is_printed_can_be_pasted(toy, monkeypatch):
     monkeypatch.chdir(toy.folder)
     words = {"max_steps": 80, "parallel": 1}

@@ -303,6 +303,7 @@ def rows(shell, hunt):
     return [{key: value for key, value in row.items() if key not in passing} for row in found]
 
 
+@pytest.mark.long
 def test_a_hunt_is_the_same_as_on_one_machine(toy, cluster):
     """The same rows, and the same first crash with everything that belongs to it."""
     words = ("2", "12", "60", "--scenario", "toy", "--seed", "3", "--arg", "speed=5:14", "--deterministic", "--json")
