@@ -22,7 +22,9 @@ _SIGMA = 0.2
 
 
 class CmaEs:
-    """One run after the other, each from the most dangerous trial that is not near to where one began before.
+    """One run after the other, each from the most dangerous of ten trials: of the first, or those after the last run.
+
+    Among these may be what that run itself proposed, where it ended.
 
     Args:
         cube: of the arguments.

@@ -117,6 +117,20 @@ def test_kinds_are_told_by_manner_and_road_and_by_what_was_raised():
     assert kind_of(event=light) == "collision red_light north"
 
 
+def test_a_danger_is_never_a_crash_and_a_crash_is_the_greatest_danger():
+    spec = spec_of(0, ask(RandomSampler(UNIT), 0))
+    for outcome, danger, score in (
+        (Outcome.SURVIVED, 1.0, 0.999),
+        (Outcome.FINISHED, -0.5, 0.0),
+        (Outcome.COLLISION, None, 1.0),
+        (Outcome.HANG, 0.2, 1.0),
+    ):
+        told = told_of(TrialResult(spec, outcome, danger=danger), Cube(UNIT), HuntFacts())
+        assert (told.score, told.crashed) == (score, score == 1.0)
+    assert told_of(TrialResult(spec, Outcome.SURVIVED), Cube(UNIT), HuntFacts()) is None
+    assert told_of(TrialResult(spec, Outcome.INVALID), Cube(UNIT), HuntFacts()) is None
+
+
 def test_a_hunt_that_goes_on_comes_back_to_arguments_that_lead_to_several_kinds():
     """All crashes are in one small region, and of four kinds: whoever kept away from it would find one."""
     lanes = ["north_0", "south_0", "east_0", "west_0"]

@@ -29,6 +29,12 @@ def test_what_is_near_a_dangerous_trial_is_worth_more_than_what_is_near_a_harmle
     assert near_best > near_worst
 
 
+def test_the_more_is_wanted_the_further_from_what_is_known_it_looks():
+    known = process([[0.0], [0.5], [1.0]], [0.1, 0.2, 0.9])
+    near, far = np.array([[1.01], [2.5]]), np.array([-1, -1])
+    assert [int(np.argmax(known.worth(near, far, ambition))) for ambition in (0.01, 5.0)] == [0, 1]
+
+
 def test_only_the_order_of_scores_counts():
     points, scores = [[0.1], [0.4], [0.8]], np.array([0.1, 0.5, 0.4])
     asked = np.array([[0.3], [0.6]]), np.array([-1, -1]), 0.3
@@ -75,6 +81,17 @@ def test_a_model_proposes_what_leads_uphill():
         model.tell(told)
     drafts = [model.propose(number, np.random.default_rng(number)) for number in range(40)]
     assert np.median([np.linalg.norm(draft.point - 0.8) for draft in drafts]) < 0.25
+    assert len({draft.parent for draft in drafts}) > 2
+
+
+def test_what_is_most_dangerous_has_most_neighbours_and_each_candidate_is_one_of_its_parent():
+    model = Model(PLANE)
+    best = [Told(place, np.full(2, (place + 0.5) / 12), place, 0.9 - place / 20) for place in range(12)]
+    points, places, kept = model._candidates(best, np.random.default_rng(1))
+    assert places.mean() < 5
+    away = np.array([np.abs(point - best[place].point).min() for point, place in zip(points, places, strict=True)])
+    assert (away < 1e-12).mean() > 0.2  # one of two arguments is as its parent's
+    assert 0.2 < kept.mean() < 0.6
 
 
 def test_another_peak_is_climbed_where_the_highest_leads_nowhere():
@@ -90,6 +107,8 @@ def test_another_peak_is_climbed_where_the_highest_leads_nowhere():
     away = [np.linalg.norm(draft.point - 0.2) for draft in drafts if draft is not None]
     assert np.median(away) < 0.25
     assert not niches.climbs
+    niches.tell(Told(59, np.array([0.8, 0.81]), 59, 0.95, "model"))
+    assert not niches.climbs  # that is another peak
     niches.tell(Told(60, np.array([0.2, 0.21]), 60, 0.7, "niche"))
     assert niches.climbs
     for number in range(61, 70):
