@@ -9,6 +9,7 @@ that a test starts by `Shell.process` or `Shell.start` does.
 
 from __future__ import annotations
 
+import _imp
 import atexit
 import dataclasses
 import fcntl
@@ -43,6 +44,7 @@ _FREE = 500  # where a process has no files of its own
 
 
 _compiled: dict[bytes | str, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
+_given: set[bytes | str] = set()  # the texts whose code has become that of a module
 _read: dict[tuple[str, str], str | None] = {}  # what a file says of something that is installed
 
 
@@ -176,8 +178,15 @@ class _Known(SourceFileLoader):
     """Takes what has been compiled of the same text."""
 
     def get_code(self, fullname: str) -> types.CodeType | None:
-        known = _compiled.get(self.get_data(self.path))
-        return super().get_code(fullname) if known is None else _of_file(known, self.path)
+        text = self.get_data(self.path)
+        known = _compiled.get(text)
+        if known is None:
+            return super().get_code(fullname)
+        if text in _given:  # another file says the same
+            return _of_file(known, self.path)
+        _given.add(text)
+        _imp._fix_co_filename(known, self.path)  # type: ignore[attr-defined] - as importlib does it, in C
+        return known
 
     @classmethod
     def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
