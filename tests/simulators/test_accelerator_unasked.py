@@ -14,6 +14,7 @@ from crashhunt.simulators.highway import restore_classes
 from highway_env.envs.common.observation import KinematicObservation, MultiAgentObservation
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.objects import Landmark
 from test_highway import drive, simulator_of
 
 from crashhunt.scenario import ObservationSetup
@@ -93,12 +94,27 @@ def seeing_otherwise(env):
     env.observation_type.normalize_obs = lambda df: df * 0.5
 
 
+def not_settled(env):
+    env.observation_type.features_range = None  # chosen by the lanes where it is first needed
+
+
 CASES = [
     (made, {"observation": {"type": "Kinematics", "order": "shuffled"}}, None),  # it draws random numbers
     (made, {"observation": {"type": "TimeToCollision"}}, None),
     (lambda **config: made(Told, **config), {}, None),
-    *((made, {}, change) for change in (of_another_class, of_another_mind, asked_otherwise, seeing_otherwise)),
+    *(
+        (made, {}, change)
+        for change in (of_another_class, of_another_mind, asked_otherwise, seeing_otherwise, not_settled)
+    ),
 ]
+
+
+def test_it_is_made_where_an_object_describes_itself_otherwise():
+    env = made()
+    env.road.objects.append(Landmark(env.road, env.vehicle.position + 5.0))
+    assert not seen(env)
+    env.road.objects[-1].to_dict = lambda *_, **__: dict.fromkeys(env.observation_type.features, 0.5)
+    assert seen(env)
 
 
 @pytest.mark.parametrize(("make", "config", "change"), CASES)

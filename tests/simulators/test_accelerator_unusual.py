@@ -41,7 +41,7 @@ def plain(value):
 
 
 def state(place):
-    return [[plain(vars(vehicle).get(name)) for name in NAMES] for vehicle in place.vehicles]
+    return [[len(vehicle.history), *(plain(vars(vehicle).get(name)) for name in NAMES)] for vehicle in place.vehicles]
 
 
 def two_roads(count=5):
@@ -133,18 +133,32 @@ def test_what_nobody_expects_comes_to_the_same(change):
     assert slow != both(nothing)[0]  # it matters
 
 
-def test_an_error_is_that_of_the_same_vehicle_and_everybody_goes_on_as_after_it():
-    def change(place, patch):
-        place.vehicles[4].position[:] = 98.5, 0.0
-        place.vehicles[4].target_lane_index = ("a", "b", 0)
-        place.vehicles[4].route = [("a", "b", 0), ("b", "nowhere", 0)]
-        place.vehicles[1].position[:] = 98.6, 4.0
-        place.vehicles[1].target_lane_index = ("a", "b", 1)
-        place.vehicles[1].route = [("a", "b", 1), ("b", "c", None)]
+def a_road_to_nowhere(place):
+    place.vehicles[4].position[:] = 98.5, 0.0
+    place.vehicles[4].target_lane_index = ("a", "b", 0)
+    place.vehicles[4].route = [("a", "b", 0), ("b", "nowhere", 0)]
+    place.vehicles[1].position[:] = 98.6, 4.0
+    place.vehicles[1].target_lane_index = ("a", "b", 1)
+    place.vehicles[1].route = [("a", "b", 1), ("b", "c", None)]
 
-    slow, fast = both(change)
+
+def a_route_without_lanes(place):
+    """Of the last one, who thinks of changing lanes after the first one has done so."""
+    place.vehicles[1].position[0] = 95.0
+    place.vehicles[2].speed, place.vehicles[3].speed = 5.0, 15.0
+    place.vehicles[3].position[0] = 20.0
+    place.vehicles[4].route = [("a", "b")]
+    for vehicle in place.vehicles[::4]:
+        vehicle.timer = 5.0
+
+
+@pytest.mark.parametrize(
+    ("change", "error"), [(a_road_to_nowhere, "nowhere"), (a_route_without_lanes, "tuple index out of range")]
+)
+def test_an_error_is_that_of_the_same_vehicle_and_everybody_goes_on_as_after_it(change, error):
+    slow, fast = both(lambda place, patch: change(place))
     assert slow == fast
-    assert any("nowhere" in step for step in slow if isinstance(step, str))
+    assert any(error in step for step in slow if isinstance(step, str))
 
 
 def environment(**config):
@@ -214,3 +228,75 @@ def test_an_environment_that_has_been_pickled_is_fast_too(monkeypatch):
     env.step(1)
     assert len(decided) == 1
     assert decided[0].drives
+
+
+def one_action(place, patch):
+    """Each step of a vehicle clips what its action says, which the next one then has."""
+    first, second = (Vehicle(place, [30.0 * number, 4.0], 0, 90.0 - 30 * number) for number in (1, 2))
+    first.action = second.action = {"steering": 0.01, "acceleration": 2.0}
+    place.vehicles[3:] = [first, second]
+
+
+def one_of_another_road(place, patch):
+    place.vehicles[2].road = two_roads(1)
+
+
+def one_crashed(place, patch):
+    place.vehicles[2].crashed = True
+
+
+def one_pushed(place, patch):
+    place.vehicles[2].impact = np.array([0.5, 3.9])
+
+
+def ghosts(place, patch):
+    for number, vehicle in enumerate(place.vehicles):
+        vehicle.position[:] = 30.0 + 2.5 * number, 0.3 * number
+        vehicle.collidable = number != 2
+        vehicle.check_collisions = number not in (0, 1)
+
+
+def one_of_its_own(place, patch):
+    place.vehicles[1].LENGTH, place.vehicles[1].MAX_SPEED, place.vehicles[3].ACC_MAX = 9.0, 12.0, 0.5
+
+
+def history(place, patch):
+    place.record_history = True
+    for vehicle in place.vehicles:
+        vehicle.history.clear()
+
+
+def slow_ones(place, patch):
+    for number, vehicle in enumerate(place.vehicles):
+        vehicle.speed, vehicle.timer = 0.9, 2.0
+        vehicle.position[:] = 5.9 * number, 4.0 * (number % 3 == 2)
+
+
+def one_about_to_change_lanes(place, patch):
+    place.vehicles[1].target_lane_index, place.vehicles[1].timer = ("a", "b", 0), 5.0
+
+
+def clipped_otherwise(place, patch):
+    clip = Vehicle.clip_actions
+    patch.setattr(Vehicle, "clip_actions", lambda self: (clip(self), self.action.update(acceleration=0.25))[0])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        one_about_to_change_lanes,
+        clipped_otherwise,
+        one_action,
+        one_of_another_road,
+        one_crashed,
+        one_pushed,
+        ghosts,
+        one_of_its_own,
+        history,
+        slow_ones,
+    ],
+)
+def test_what_vehicles_have_of_their_own_is_heeded(change):
+    slow, fast = both(change)
+    assert slow == fast
+    assert slow != both(nothing)[0]
