@@ -238,6 +238,8 @@ def _right_of_way(case: Case) -> Finding | None:
     yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
     if float(case.way(goes).speeds.min()) < _STANDS or case.drifted(yields) or case.drifted(goes):
         return None  # who had stood in the junction may have been let through
+    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < _STANDS:
+        return None  # who has stood there for so long could be seen
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
         return None  # who starts off while somebody is in the junction has to let it out
     words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"

@@ -307,6 +307,14 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
         case.scenes[-40].lanes, case.scenes[-10].lanes = ("w", ":c_1"), ("w", "s")
         return verdict(case)
 
+    rights = RightOfWay(tuple(ways), frozenset({(1, 0)}))
+    for stood_s, expected in ((2.5, "the other"), (9.0, "nobody can tell")):
+        stands = drive(
+            straight(14), lambda t, s=stood_s: (0.0, -8 * max(0.0, t - s), math.pi / 2, 8.0 if t > s else 0.0),
+            right_of_way=rights,
+        )  # fmt: skip
+        stands.scenes[-10].lanes = ("w", "s")
+        assert verdict(stands) == expected
     # Who starts off while somebody is in the junction has to let it out; who drives along has not.
     assert (inside_before(2.0), inside_before(10.0)) == ("nobody can tell", "the other")
     lights = [Link(*(ways[0].junction, "w", "e"), ways[0].inside, signalised=True, shape=ways[0].shape), ways[1]]
