@@ -40,7 +40,8 @@ def _folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
 def find_bundle(directory: Path, crash: str = "") -> Bundle:
     """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
 
-    Of a hunt that has near misses only, that is the most dangerous of them; and else one that copies have found.
+    Of a hunt that has near misses only, that is the most dangerous of them; else one that copies have found; and else
+    one that was made smaller, as in the file to which that was exported.
 
     Args:
         directory: of the hunt, or of the bundle itself.
@@ -62,6 +63,7 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
         bundles = bundles if bundles is not None else _readable(directory, crash, _PLACES[0])
     else:
         bundles = list_bundles(directory) or list_near_misses(directory)[:1] or _of_copies(directory)
+        bundles = bundles or _made_smaller(directory)
     if not bundles:
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
@@ -79,6 +81,11 @@ _PLACES = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANC
 
 def _of_copies(directory: Path) -> list[Bundle]:
     return [read_bundle(folder) for place in (layout.PROBES, layout.BRANCHES) for folder in _folders(directory, place)]
+
+
+def _made_smaller(directory: Path) -> list[Bundle]:
+    found = sorted((directory / layout.CRASHES).glob(f"*{layout.SMALL}"))
+    return [read_bundle(path) for path in found if (path / layout.CRASH).is_file()]
 
 
 def _may_be(bundle: Bundle, crash: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import stat
 import zipfile
 
@@ -12,7 +13,14 @@ from episodes import Episode, write
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError
-from crashhunt.crashes import _archive as archives, export_crash, open_archive, write_bundle
+from crashhunt.crashes import (
+    _archive as archives,
+    export_crash,
+    find_bundle,
+    open_archive,
+    read_bundle,
+    write_bundle,
+)
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.scenario import digest_of_described
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
@@ -100,6 +108,19 @@ def test_what_was_exported_is_unpacked(crash, file, tmp_path):
     index = json.loads(entries(file)[layout.ARCHIVE_INDEX])
     assert (index["schema"], index["crash"]) == (1, crash.id)
     assert set(index["files"]) == set(there)
+
+
+def test_one_that_was_made_smaller_is_found_in_its_archive(crash, tmp_path):
+    """It is the only one there, and in the directory of its hunt only meant by its whole id."""
+    path = crash.path.with_name(f"{crash.id}{layout.SMALL}")
+    shutil.copytree(crash.path, path)
+    try:
+        assert find_bundle(crash.hunt).path == crash.path
+        export_crash(read_bundle(path), tmp_path / "small.zip")
+    finally:
+        shutil.rmtree(path)
+    with open_archive(tmp_path / "small.zip") as archive:
+        assert find_bundle(archive.directory).path.name == path.name
 
 
 def test_only_who_made_it_here_is_believed_to_have(file, home):
