@@ -200,6 +200,19 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
             pytest.fail(f"{what}: build it again with `pip install --no-deps --editable .`", pytrace=False)
 
 
+@pytest.fixture
+def plain_highway_env() -> Iterator[None]:
+    """highway-env without the accelerator and with its own classes, before a test and after it, whatever it does."""
+    from crashhunt.simulators.accelerator import switch_off
+    from crashhunt.simulators.highway import restore_classes
+
+    switch_off()
+    restore_classes()
+    yield
+    switch_off()
+    restore_classes()
+
+
 @pytest.fixture(autouse=True)
 def _modules_of_its_own() -> Iterator[None]:
     """What a test has imported from its own folder is no other test's, nor found by others."""

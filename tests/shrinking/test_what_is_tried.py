@@ -73,6 +73,16 @@ def test_values_become_plainer(value, default, plainer):
 OTHERS = tuple("abcdefgh")
 
 
+RERUN = SimpleNamespace(
+    spec=TrialSpec(0, 1, {"ego": {}}, {}, 300),
+    defaults={},
+    recorded=SimpleNamespace(agents=("ego",), prologue=SimpleNamespace(step_length_s=0.1)),
+    bundle=SimpleNamespace(
+        confirmed=True, driver="ego", result=SimpleNamespace(collision=SimpleNamespace(other="a"), event=None)
+    ),
+)
+
+
 class Scripting:
     """Parts of a crash of 100 steps."""
 
@@ -118,19 +128,10 @@ def test_time_that_runs_out_while_others_are_moved_takes_nothing_away(monkeypatc
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS[:6]))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
     monkeypatch.setattr(_stages.Search, "steps_cut", 0)
-    spec = TrialSpec(0, 1, {"ego": {}}, {}, 300)
-    rerun = SimpleNamespace(
-        spec=spec,
-        defaults={},
-        recorded=SimpleNamespace(agents=("ego",), prologue=SimpleNamespace(step_length_s=0.1)),
-        bundle=SimpleNamespace(
-            confirmed=True, driver="ego", result=SimpleNamespace(collision=SimpleNamespace(other="a"), event=None)
-        ),
-    )
-    search = _stages.Search(rerun, Runs(scripted), "either")
+    search = _stages.Search(RERUN, Runs(scripted), "either")
     search._scripting = Scripting()
     assert search.run(lambda: False)[0] in ("time", "done")
-    assert search.best == replace(spec, only=("a", "b", "c"))
+    assert search.best == replace(RERUN.spec, only=("a", "b", "c"))
     assert search.smaller[-1] == search.best
 
 
@@ -171,15 +172,7 @@ class LaterRuns(Runs):
 def test_fewer_are_enough_where_it_begins_later(monkeypatch, pair):
     monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
     monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
-    rerun = SimpleNamespace(
-        spec=TrialSpec(0, 1, {"ego": {}}, {}, 300),
-        defaults={},
-        recorded=SimpleNamespace(agents=("ego",), prologue=SimpleNamespace(step_length_s=0.1)),
-        bundle=SimpleNamespace(
-            confirmed=True, driver="ego", result=SimpleNamespace(collision=SimpleNamespace(other="a"), event=None)
-        ),
-    )
-    search = _stages.Search(rerun, LaterRuns(pair), "either")
+    search = _stages.Search(RERUN, LaterRuns(pair), "either")
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
     assert (set(search.best.script.names), search.best.max_steps) == ({*pair}, 60)

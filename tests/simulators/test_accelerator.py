@@ -78,14 +78,7 @@ CASES += [
 ]
 
 
-@pytest.fixture(autouse=True)
-def as_it_was():
-    """Whatever a test does, highway-env is as it was afterwards."""
-    switch_off()
-    restore_classes()
-    yield
-    switch_off()
-    restore_classes()
+pytestmark = pytest.mark.usefixtures("plain_highway_env")
 
 
 def plain(value):

@@ -23,13 +23,7 @@ NAMES = "position heading speed action crashed impact lane_index target_lane_ind
 NAMES += " lateral_speed yaw_rate is_yielding"
 
 
-@pytest.fixture(autouse=True)
-def as_it_was():
-    switch_off()
-    restore_classes()
-    yield
-    switch_off()
-    restore_classes()
+pytestmark = pytest.mark.usefixtures("plain_highway_env")
 
 
 def state(place):

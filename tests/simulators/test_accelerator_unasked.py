@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 # First: this imports highway-env without what takes most of that time.
-from crashhunt.simulators.highway import restore_classes
+from crashhunt.simulators.highway import HighwaySimulator
 
 # isort: split
 
@@ -20,17 +20,13 @@ from test_highway import drive, simulator_of
 from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators.accelerator import Unasked, switch_off, switch_on
 
+assert HighwaySimulator
 SMALL = {"vehicles_count": 6, "simulation_frequency": 4, "duration": 9}
 
 
 @pytest.fixture(autouse=True)
-def as_it_was():
-    switch_off()
-    restore_classes()
+def accelerated(plain_highway_env):
     assert switch_on() == ""
-    yield
-    switch_off()
-    restore_classes()
 
 
 def made(kind=HighwayEnvFast, **config):

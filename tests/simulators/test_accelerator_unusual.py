@@ -14,19 +14,12 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from crashhunt.simulators.accelerator import _roads, switch_off, switch_on
-from crashhunt.simulators.highway import restore_classes
 
 assert highway_env
 NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
 
 
-@pytest.fixture(autouse=True)
-def as_it_was():
-    switch_off()
-    restore_classes()
-    yield
-    switch_off()
-    restore_classes()
+pytestmark = pytest.mark.usefixtures("plain_highway_env")
 
 
 def plain(value):

@@ -51,13 +51,7 @@ def _slower(name, value):
     return value * 0.999 if name == "speed" else value
 
 
-@pytest.fixture(autouse=True)
-def as_it_was():
-    switch_off()
-    restore_classes()
-    yield
-    switch_off()
-    restore_classes()
+pytestmark = pytest.mark.usefixtures("plain_highway_env")
 
 
 def plain(value):
