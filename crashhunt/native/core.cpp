@@ -1029,7 +1029,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
         return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
     }
     struct Body {
-        double x, y, vx, vy, c, s, reach, apart;
+        double x, y, vx, vy, c, s, reach, within, apart;
     };
     // Who may be near, with what is surely not exceeded: the least gap, the soonest contact, the hardest braking.
     struct Candidate {
@@ -1063,7 +1063,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
                 double c, s;
                 sincos(heading, &s, &c);
                 bodies[actor] = {line[2 * actor] - half * c, line[2 * actor + 1] - half * s, speed * c, speed * s, c, s,
-                                 sqrt(half * half + wide * wide), 0.0};
+                                 sqrt(half * half + wide * wide), std::min(half, wide), 0.0};
             }
             const Body me = bodies[own];
             double best = best_gap;
@@ -1072,7 +1072,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
                 const double dx = body.x - me.x, dy = body.y - me.y;
                 body.apart = sqrt(dx * dx + dy * dy);
                 if (actor != own && body.apart - me.reach - body.reach < gap - SLACK * (1 + body.apart)) {
-                    best = std::min(best, body.apart - part.widths[actor] / 2 - part.widths[own] / 2);
+                    best = std::min(best, body.apart - body.within - me.within);
                 }
             }
             for (size_t actor = 0; actor < actors; actor++) {

@@ -103,10 +103,11 @@ def approaches(
 
     near = np.flatnonzero(others & (distance - reach < _GAP_M))
     if len(near):
-        # The circles around both outlines bound the gap from below; only who could be the nearest is measured.
-        bound = distance[near] - reach[near]
+        # The circles around both outlines bound the gap from below, those within from above (a person is wider than
+        # long); only who could be the nearest is measured.
+        bound, within = distance[near] - reach[near], half.min(axis=1)
         best = np.full(count, np.inf)
-        np.minimum.at(best, number[near], distance[near] - half[near, 1] - half[own[near], 1])
+        np.minimum.at(best, number[near], distance[near] - within[near] - within[own[near]])
         near = near[bound <= best[number[near]]]
         place, _, turn, one, two = pairs(near)
         np.minimum.at(gaps, number[near], rectangle_gap(place, turn, one, two))

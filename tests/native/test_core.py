@@ -281,6 +281,17 @@ def test_the_closest_so_far_leaves_out_nothing(episodes):
     assert repr(ours.closest) == repr(theirs.closest)
 
 
+def test_the_closest_of_a_crowd_is_the_same_where_somebody_is_wider_than_long():
+    sizes = [(1.0, 1.0), (1.0, 1.0), (1.0, 2.0), (1.0, 12.0)]
+    roster = Roster(tuple(Actor(str(row), "passenger", *size) for row, size in enumerate(sizes)))
+    columns = np.array([[0.0] * 6 + [5.0, 0.0] + [0.0] * 4 + [1.0, 0.0, 0.0, 0.0]])
+    ours, theirs = ApproachMeter("0"), ApproachMeter("0")
+    ours.measure([joined_frame(roster, columns, [None], core)])
+    theirs.measure([joined_frame(roster, columns, [None])])
+    assert ours.closest == theirs.closest
+    assert ours.closest.gap_m == 0.0
+
+
 @settings(deadline=None, max_examples=60)
 @given(two_scenes(), some.lists(some.floats(), max_size=3), some.integers(0, 2**40))
 def test_the_record_of_a_step_is_the_same(tmp_path_factory, scenes, rewards, step):

@@ -75,12 +75,13 @@ def test_actors_that_come_and_go_are_measured_in_their_own_steps():
 
 
 def test_everybody_is_measured_as_if_alone():
-    """What is left out because it cannot be the nearest was not the nearest: long, short, turned and fast ones."""
+    """What is left out because it cannot be the nearest was not the nearest: long, wide, turned and fast ones."""
     random = np.random.default_rng(7)
     views, times, gaps, brakes = [], [], [], []
     for number in range(90):
         count = int(random.integers(2, 8))
-        sizes = {f"v{n}": (float(random.uniform(0.5, 18)), float(random.uniform(0.4, 3))) for n in range(count)}
+        order = 1 if number % 3 else -1  # a person is wider than long
+        sizes = {f"v{n}": (random.uniform(0.5, 18), random.uniform(0.4, 3))[::order] for n in range(count)}
         reach = 15 if number % 2 else 70
         rows = [
             (f"v{n}", *random.uniform(-reach, reach, 2), random.uniform(-4, 4), random.uniform(0, 35))
