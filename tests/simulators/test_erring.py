@@ -134,6 +134,20 @@ def test_a_dawdler_slows_down_gently(drive):
     assert drives_by_itself("lead")
 
 
+def test_a_dawdler_that_had_to_wait_goes_on_as_slowly_as_before_and_no_slower(drive):
+    front = AHEAD.replace('"lead"', '"front"').replace('"60"', '"75"')
+    episode, watch = drive(planned(3, "dawdle", strong=0.5, long=18.0), traffic=front + AHEAD, agent=Steady(0.0))
+    advance(episode, 4)
+    wanted = watch.speeds("lead")[2] / 2
+    libsumo.vehicle.setSpeed("front", 0.0)
+    advance(episode, 80)
+    assert watch.told[0].vehicle == "lead"
+    assert watch.speeds("lead")[-1] < 0.1
+    libsumo.vehicle.setSpeed("front", -1.0)
+    advance(episode, 60)
+    assert watch.speeds("lead")[-1] == pytest.approx(wanted)
+
+
 def test_a_follower_wants_to_drive_faster(drive):
     episode, watch = drive(planned(3, "speed", "behind", 0.5, 2.0), agent=Steady(14.0))
     advance(episode, 10)

@@ -10,7 +10,9 @@ import pytest
 
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.trial import Disturbance
 
+OTHER = '<vehicle id="{0}" type="car" route="st" depart="0" departPos="70" departLane="{0}" departSpeed="10"/>'
 NET = Path(__file__).with_name("nets") / "left.net.xml"
 SCENARIO = """
 schema = 1
@@ -56,3 +58,28 @@ def test_a_change_to_the_left_is_one(tmp_path, options, action):
             shown = step[0]["ego"][0]
             assert before[2] == pytest.approx(3.2)  # right of the leftmost lane, of three
             assert shown[2] - before[2] == pytest.approx(-moved, abs=1e-3)
+
+
+@pytest.mark.parametrize(("who", "lane", "side"), [("left ahead", "0", 1), ("right ahead", "2", -1)])
+def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
+    shutil.copy(NET, tmp_path)
+    traffic = '<vType id="car" sigma="0" speedFactor="1"/><route id="st" edges="st"/>' + "".join(
+        map(OTHER.format, "02")
+    )
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>")
+    (tmp_path / "scenario.toml").write_text(SCENARIO % ("", "continuous"))
+    stage = tmp_path / "stage"
+    stage.mkdir()
+    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+        simulator.reset(seed=1, options={})
+        cut_in = Disturbance(1, who, "cut_in", 0.0, 2.0, "ego")
+        assert simulator.whom(cut_in) == lane
+        scene = simulator.scene()
+        y = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+        assert side * (y[lane] - y["ego"]) > 3.0  # it drives towards x
+        assert simulator.disturb(lane, cut_in) is not None
+        for _ in range(5):
+            simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
+        scene = simulator.scene()
+        after = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+        assert after[lane] == after["ego"]

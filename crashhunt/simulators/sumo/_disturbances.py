@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from crashhunt.simulators._protocol import Disturbing
+    from crashhunt.simulators.sumo._driving import Driving
     from crashhunt.trial import Disturbance
     from crashhunt.world import Scene
 
@@ -40,14 +41,16 @@ class SumoDisturbances:
     Args:
         controlled: the vehicles that are driven from outside, which are never meant.
         step_length_s: of the simulation.
+        driving: knows to which side traffic keeps.
 
     Attributes:
         speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
     """
 
-    def __init__(self, controlled: Collection[str], step_length_s: float) -> None:
+    def __init__(self, controlled: Collection[str], step_length_s: float, driving: Driving) -> None:
         self._controlled = controlled
         self._dt = step_length_s
+        self._driving = driving
         self.speeds: dict[str, float] = {}
 
     def whom(self, disturbance: Disturbance, scene: Scene) -> str:
@@ -58,7 +61,7 @@ class SumoDisturbances:
             elif disturbance.what == "step_out":
                 found = roadside(scene, disturbance.agent, disturbance.who)
             else:
-                found = _at(disturbance.agent, disturbance.who)
+                found = _at(disturbance.agent, disturbance.who, left_hand=self._driving.left_hand)
         except libsumo.TraCIException:  # the agent has just arrived
             return ""
         return "" if found in self._controlled else found
@@ -81,7 +84,8 @@ class SumoDisturbances:
             if disturbance.what == "speed":
                 return _Speeds(vehicle, strong)
             if disturbance.what == "cut_in":
-                side = -1 if disturbance.who.startswith("left") else 1  # lanes are counted from the right
+                # Lanes are counted from the side that traffic keeps to.
+                side = 1 if disturbance.who.startswith("left") == self._driving.left_hand else -1
                 return _cut_in(vehicle, side, disturbance.how_long, min(strong, decel), self._dt)
             return _Ignores(vehicle, self._dt)
         except libsumo.TraCIException:
@@ -107,7 +111,7 @@ class SumoDisturbances:
 
 
 class _Slows:
-    """Brakes down to a speed, and keeps to it."""
+    """Brakes down to a speed, and keeps to it, or to what is possible of it."""
 
     def __init__(self, vehicle: str, deceleration: float, dt: float, *, how_strong: float, target: float = 0.0) -> None:
         self.how_strong = how_strong
@@ -126,7 +130,10 @@ class _Slows:
 
     def _command(self) -> None:
         speed = sumo.vehicle_getSpeed(self._vehicle)
-        sumo.vehicle_setSpeed(self._vehicle, max(min(self._target, speed), speed - self._change))
+        if speed < self._target:  # whoever it drives behind was slower; SUMO lets it drive no faster than is safe
+            sumo.vehicle_setSpeed(self._vehicle, min(self._target, sumo.vehicle_getAllowedSpeed(self._vehicle)))
+        else:
+            sumo.vehicle_setSpeed(self._vehicle, max(self._target, speed - self._change))
 
 
 class _Speeds:
@@ -240,14 +247,15 @@ class _gone:  # noqa: N801 - it is used as a statement
         return isinstance(error, libsumo.TraCIException)
 
 
-def _at(agent: str, who: str) -> str:
+def _at(agent: str, who: str, *, left_hand: bool) -> str:
     """Who is at a place around an agent, along the lanes; empty where nobody is."""
     if who in ("ahead", "behind"):
         ask = sumo.vehicle_getLeader if who == "ahead" else sumo.vehicle_getFollower
         found = ask(agent, _IN_LANE_M)
         return str(found[0]) if found is not None and found[0] and found[1] <= _IN_LANE_M else ""
     side, _, along = who.partition(" ")
-    bit = _LEFT if side == "left" else _RIGHT
+    # What SUMO calls left is the lane with the next higher number, wherever that lies.
+    bit = _LEFT if (side == "left") != left_hand else _RIGHT
     near = []
     for ahead in (0, _AHEAD):
         for vehicle, gap in sumo.vehicle_getNeighbors(agent, bit | ahead):

@@ -81,7 +81,8 @@ class SumoSimulator:
         # Without these options of SUMO a vehicle is always in the middle of a lane.
         options = scenario.table(SumoSetup).options
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
-        self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s)
+        self._driving = Driving(scenario.agents, scenario.step_length_s)
+        self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
         core = None
         if scenario.table(SumoSetup).native is not False:
             core = core_for(libsumo.__version__, sumo.__file__)
@@ -93,7 +94,6 @@ class SumoSimulator:
             core=core,
         )
         self.notices: list[str] = []
-        self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._lanes: list[Lane] | None = None
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
