@@ -18,7 +18,7 @@ from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate, registered
 from crashhunt.disturbances._fixed import FORM, is_fixed
 from crashhunt.disturbances._protocol import Drawn
-from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn
+from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn, why_not
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -249,7 +249,11 @@ class Disturber:
     def _one(self, step: int, name: str, agent: str, rng: np.random.Generator) -> Disturbance:
         drawn = _drawn(name, self.models[name], rng)
         strong, long = float(drawn.how_strong), float(drawn.how_long)
-        return Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
+        one = Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
+        reason = why_not(one) if one.what in KINDS else None  # of a kind of somebody else's, nobody knows
+        if reason is not None:
+            raise PluginError(f"the disturbance {name!r} has drawn {drawn}: {reason[0]}", fix=reason[1])
+        return one
 
     def log_likelihood(self, disturbances: Iterable[Disturbance], steps: int) -> float:
         """Return the natural logarithm of the probability that just these begin in so many steps.

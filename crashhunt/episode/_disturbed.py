@@ -167,7 +167,7 @@ class Disturbed:
             self._tell(replace(planned, vehicle=""))
             return
         self._going.append(_Going(last, vehicle, planned.what, errs))
-        self._tell(planned.took_place(vehicle, errs.how_strong))
+        self._tell(planned.took_place(vehicle, errs.how_strong, self._dt))
 
     def _whom(self, planned: Disturbance) -> str:
         if planned.what in HELD:
@@ -216,14 +216,15 @@ class Disturbed:
             return
         last = planned.step + self._steps(planned.how_long) - 1
         self._going.append(_Going(last, agent, planned.what, filters=made))
-        self._tell(planned.took_place(agent, planned.how_strong))
+        self._tell(planned.took_place(agent, planned.how_strong, self._dt))
 
     def _filter(self, planned: Disturbance) -> _Filter | None:
         agent, simulator = planned.agent, self._simulator
+        delay = self._steps(planned.how_strong) if planned.how_strong > 0 else 0
         if planned.what == "late_action":
-            return _Late(self._steps(planned.how_strong), _Held(simulator.actions[agent], self._before.get(agent)))
+            return _Late(delay, _Held(simulator.actions[agent], self._before.get(agent)))
         if planned.what == "late_observation":
-            return _Late(self._steps(planned.how_strong))
+            return _Late(delay)
         names = tuple(simulator.observation_names) if offers(simulator, NamesObservations) else ()
         space: Any = simulator.observation_spaces[agent]
         if np.dtype(space.dtype).kind != "f":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
 from crashhunt.simulators import Disturbs
-from crashhunt.trial import OF_AGENT, Disturbance, Outcome, Stress, steps_of
+from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Outcome, Stress, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -28,9 +28,11 @@ BUDGET: Final = 4
 """Steps that copies may take for each step of their trial."""
 BUDGET_BESIDE: Final = 1
 """The same where the trial branches as well, which finds crashes in fewer steps."""
+_DIGITS = 9
+_NOTHING = 1e-9
 _HORIZON_S = 5.0  # of simulation time, for which a copy is followed
 _SHARES = 16  # of the worst, to which the mildest is found
-_HALF = _SHARES // 2
+_HALF = 0.5
 _PATIENCE_S = 30.0  # of wall time, for a copy
 _BEGINS = 2  # steps on: what an agent sees late is noticed a step before
 
@@ -55,6 +57,22 @@ class Probed:
     least: float = 0.0
     grade: Literal["strength", "length", "whether"] = "strength"
 
+    def shares(self, step_length_s: float) -> tuple[float, ...]:
+        """Return how much of it may be asked for, from the mildest on; all of it is not.
+
+        Where it is graded in s, that are as many as differ in whole steps: with steps of 1 s, nothing comes a sixteenth
+        of a second late.
+        """
+        if self.grade == "whether":
+            return (_HALF,)
+        sixteenths = tuple(number / _SHARES for number in range(1, _SHARES))
+        is_time = self.grade == "length" or KINDS[self.what].unit == "s"
+        if not is_time:
+            return sixteenths
+        worst = self.how_long if self.grade == "length" else self.most
+        steps = dict.fromkeys(steps_of(share * worst, step_length_s) for share in sixteenths)
+        return tuple(share for one in steps if (share := one * step_length_s / worst) < 1 - _NOTHING)
+
     def disturbance(self, share: float, who: str, agent: str, step: int) -> Disturbance:
         """Return one.
 
@@ -66,6 +84,7 @@ class Probed:
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
         long = share * self.how_long if self.grade == "length" else self.how_long
+        strong, long = round(strong, _DIGITS), round(long, _DIGITS)  # of 3 steps of 0.1 s, 0.3 s
         return Disturbance(step, who, self.what, strong, long, agent)
 
 
@@ -181,25 +200,25 @@ class Prober:
     def _mildest(self, episode: Episode, question: _Question) -> bool:
         """Ask one question; return whether there is any point in asking another."""
         kind, step = question.kind, episode.steps + _BEGINS
-        low, high = 0, round(self._stress.margin * _SHARES)
-        share = high - 1
-        if kind.grade == "whether":
-            low, share = (_HALF - 1, _HALF) if high > _HALF else (high - 1, high - 1)
-        while share > low:
-            disturbance = kind.disturbance(share / _SHARES, question.who, question.agent, step)
+        every = kind.shares(episode.simulator.step_length_s)
+        shares = [share for share in every if share < self._stress.margin - _NOTHING]
+        low, high = -1, len(shares)  # so many of them do no harm, and from here on they do
+        at = high - 1
+        while at > low:
+            disturbance = kind.disturbance(shares[at], question.who, question.agent, step)
             outcome, ended = self._copy(episode, disturbance)
             if not outcome:
-                low = share
+                low = at
             elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
             else:
-                self._goes_on, high = True, share
+                self._goes_on, high = True, at
                 self._stress = replace(
-                    self._stress, margin=high / _SHARES, disturbance=disturbance, outcome=outcome, step=ended
+                    self._stress, margin=shares[at], disturbance=disturbance, outcome=outcome, step=ended
                 )
-            if self.why_not or low == high - 1 or kind.grade == "whether":
+            if self.why_not or low == high - 1:
                 break
-            share = (low + high) // 2
+            at = (low + high) // 2
         return not self.why_not and self._stress.margin > 1 / _SHARES
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:

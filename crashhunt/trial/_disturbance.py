@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of", "why_not"]
 
+_DIGITS = 9  # of so many s: three steps of 0.1 s are 0.3 s
 
 _PLACES = {
     "left ahead": "ahead of {} to the left",
@@ -82,7 +84,13 @@ OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 
 def steps_of(seconds: float, step_length_s: float) -> int:
     """Return in how many steps something of so many s goes on: in one at least."""
-    return max(1, round(seconds / step_length_s))
+    return max(1, round(min(seconds / step_length_s, sys.maxsize)))
+
+
+def _in_steps(seconds: float, step_length_s: float) -> float:
+    """How long something of so many s is, in whole steps; nothing at all is none."""
+    found = steps_of(seconds, step_length_s) * step_length_s if seconds > 0 else 0.0
+    return seconds if math.isclose(found, seconds) else round(found, _DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,14 +116,19 @@ class Disturbance:
     agent: str = ""
     vehicle: str = field(default="")
 
-    def took_place(self, vehicle: str, how_strong: float) -> Disturbance:
-        """Return it as it took place.
+    def took_place(self, vehicle: str, how_strong: float, step_length_s: float = 0.0) -> Disturbance:
+        """Return it as it took place: in whole steps, so that with steps of 1 s nothing is 0.2 s late.
 
         Args:
             vehicle: who was there.
             how_strong: what that vehicle can do of it.
+            step_length_s: of the simulation; 0 where nobody knows.
         """
-        return replace(self, vehicle=vehicle, how_strong=how_strong)
+        if not step_length_s:
+            return replace(self, vehicle=vehicle, how_strong=how_strong)
+        kind = KINDS.get(self.what)
+        strong = _in_steps(how_strong, step_length_s) if kind is not None and kind.unit == "s" else how_strong
+        return replace(self, vehicle=vehicle, how_strong=strong, how_long=_in_steps(self.how_long, step_length_s))
 
     @property
     def words(self) -> str:

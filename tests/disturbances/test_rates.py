@@ -209,6 +209,23 @@ def test_a_model_that_draws_nonsense_is_named():
         Disturber({"odd": Odd()}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
 
 
+@pytest.mark.parametrize(
+    ("what", "who", "strong"),
+    [
+        ("brake", "ahead", -3.0),
+        ("brake", "itself", 3.0),
+        ("late_action", "ahead", 0.5),
+        ("noisy_observation", "itself", 2),
+    ],
+)
+def test_a_model_draws_only_what_its_kind_may_be(what, who, strong):
+    model = Choices(what, {who: 1.0}, {strong: 1.0}, {1.0: 1.0})
+    with pytest.raises(PluginError, match=f"'odd' has drawn .*who='{who}'"):
+        Disturber({"odd": model}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
+    own = Choices("lean", {who: 1.0}, {strong: 1.0}, {1.0: 1.0})  # a kind of a simulator's of somebody's own
+    assert Disturber({"own": own}, {"own": 5.0}, ("ego",), DT).draw(1, 100)
+
+
 def test_weights_are_shares():
     model = cut_in()
     rng = np.random.default_rng(1)

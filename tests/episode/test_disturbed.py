@@ -165,6 +165,24 @@ def test_a_late_action_is_recorded_when_it_is_decided_and_done_later(run):
     assert there[16] == pytest.approx(here[11])
 
 
+def test_what_is_late_is_so_in_whole_steps_and_told_so(run):
+    given = {"steps": 8, "agent": Counts(lambda step: (10.0 + 0.1 * step, 0))}
+    _, without = run(**given)
+    for what, shown in (("late_action", lambda made: speeds(made, "ego")), ("late_observation", observed)):
+        result, recording = run(planned(3, what, "itself", 0.26, 0.33), **given)
+        exact, same = run(planned(3, what, "itself", 0.3, 0.3), **given)
+        assert shown(recording) == shown(same) != shown(without)
+        assert [(one.how_strong, one.how_long) for one in result.disturbances] == [(0.3, 0.3)]
+        assert exact.digest == result.digest
+        result, recording = run(planned(3, what, "itself", 0.0, 0.3), **given)  # not late at all
+        assert shown(recording) == shown(without)
+        assert result.disturbances[0].how_strong == 0.0
+
+
+def observed(recording):
+    return recording.observations("ego").tolist()
+
+
 def test_while_no_action_comes_no_lane_is_changed_and_nothing_is_pressed_again(run):
     seen = []
 

@@ -38,3 +38,24 @@ def test_what_is_milder_is_weaker_shorter_or_earlier_and_some_only_happen_or_not
     assert asked("late_merge", 0.5) == (27.5, 10.0)  # m that are left of its lane
     assert asked("cut_in", 0.5) == asked("cut_in", 1.0) == (0.0, 4.0)
     assert asked("step_out", 0.5) == asked("step_out", 1.0) == (1.4, 6.0)
+
+
+def test_what_is_graded_in_seconds_is_asked_for_in_whole_steps():
+    by_name = {kind.what: kind for kind in PROBED}
+
+    def asked(what, dt):
+        kind = by_name[what]
+        some = [kind.disturbance(share, "ahead", "ego", 7) for share in kind.shares(dt)]
+        return [one.how_long if kind.grade == "length" else one.how_strong for one in some]
+
+    assert asked("late_action", 0.1) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+    assert asked("late_observation", 0.25) == [0.25, 0.5, 0.75]
+    assert asked("late_action", 1.0) == []  # one step late is the worst already, and nothing is milder
+    assert asked("unseen", 1.0) == [1.0, 2.0, 3.0]
+    assert asked("brake", 1.0) == [6.0 * share / 16 for share in range(1, 16)]
+    assert len(asked("unseen", 0.01)) == 15
+    for kind in PROBED:
+        for dt in (0.02, 0.1, 0.2, 0.5, 1.0, 2.0):
+            shares = kind.shares(dt)
+            assert list(shares) == sorted(set(shares))
+            assert all(0 < share < 1 for share in shares)

@@ -134,6 +134,17 @@ def test_other_kinds_are_asked_for_what_is_milder_only():
     assert stress.left_out == 0
 
 
+def test_how_late_is_told_as_it_was():
+    asker, _ = prober()
+    road = Road({"late_action": 0.01}, kinds=())
+    asker.ask(road)
+    stress = stress_of(asker)
+    # One step late, and not a sixteenth of a second.
+    assert (stress.margin, stress.disturbance.how_strong) == (pytest.approx(DT), DT)
+    late = [one.how_strong for one in road.asked if one is not None and one.what == "late_observation"]
+    assert late == []  # which would be as late at least
+
+
 def test_where_nothing_milder_is_left_nobody_else_is_asked():
     asker, _ = prober()
     road = Road({"brake": 1 / 16})
