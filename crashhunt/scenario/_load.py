@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -198,7 +199,7 @@ def _beside(setup: AgentSetup, folder: Path) -> AgentSetup:
     found = {}
     for name, argument in setup.arguments.items():
         default = argument.default
-        if isinstance(default, str) and default and (folder / default).is_file():
+        if isinstance(default, str) and default and os.path.isfile(folder / default):  # noqa: PTH113 - however long
             argument = replace(argument, default=str(folder / default))
         found[name] = argument
     return replace(setup, arguments=found)

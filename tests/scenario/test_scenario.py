@@ -119,6 +119,12 @@ def test_what_ran_before_is_not_refused_in_a_snapshot(loop):
     assert load_scenario(loop / "scenario.toml", kept=True).arguments["vehicles"].default == 40
 
 
+def test_a_default_may_be_a_text_that_no_file_could_be_called(loop):
+    text = "a prompt, say: " + "word " * 100
+    change(loop, "agents", "ego", "arguments", "speed", value={"default": text})
+    assert load_scenario(loop / "scenario.toml").agents["ego"].arguments["speed"].default == text
+
+
 def test_a_path_that_is_not_there_has_a_neighbour(loop, monkeypatch):
     monkeypatch.chdir(loop.parent)
     for name, says in (
