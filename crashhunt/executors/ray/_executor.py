@@ -179,9 +179,18 @@ class RayExecutor:
         self._send({"submit": [(ticket, spec.to_json()) for ticket, spec in self._open.items()]})
 
     def _send(self, message: ToBridge) -> None:
-        if self._control is not None:
-            with suppress(OSError):  # it is gone, which shows when it is listened to
-                self._control.sendall(json.dumps(message).encode() + b"\n")
+        """Tell the bridge something; where it waits to be heard before it listens, hear it meanwhile."""
+        if self._control is None:
+            return
+        left = memoryview(json.dumps(message).encode() + b"\n")
+        with suppress(OSError):  # it is gone, which shows when it is listened to
+            while left:
+                with suppress(BlockingIOError):
+                    left = left[self._control.send(left, socket.MSG_DONTWAIT) :]
+                    continue
+                readable, _, _ = select.select([self._control], [self._control], [])
+                if readable and not self._take_in(self._control):
+                    return
 
     def _receive(self, wait_s: float) -> None:
         """Take what the bridge says, waiting so long for something."""
@@ -189,19 +198,25 @@ class RayExecutor:
             if self._closed or not self._is_back():
                 time.sleep(wait_s)
             return
-        if not select.select([self._control], [], [], wait_s)[0]:
+        heard = b"\n" in self._received  # while something was sent
+        if not heard and not select.select([self._control], [], [], wait_s)[0]:
             return
-        try:
-            data = self._control.recv(_RECEIVED)
-        except OSError:
-            data = b""
-        self._received += data
+        is_there = heard or self._take_in(self._control)
         *lines, rest = bytes(self._received).split(b"\n")
         self._received = bytearray(rest)
         for line in lines:
             self._hear(json.loads(line))
-        if not data and self._control is not None:
+        if not is_there and self._control is not None:
             self._lose()
+
+    def _take_in(self, control: socket.socket) -> bool:
+        """Take what has come from the bridge; return whether it is still there."""
+        try:
+            data = control.recv(_RECEIVED)
+        except OSError:
+            data = b""
+        self._received += data
+        return bool(data)
 
     def _hear(self, message: FromBridge) -> None:
         if "result" in message:
