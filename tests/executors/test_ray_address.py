@@ -69,6 +69,7 @@ def listener(answer):
         ("127.0.0.1:1", "--executor ray:127.0.0.1:1: nobody answers there (Connection refused); start one with"),
         ("nowhere", "--executor ray:nowhere is no address HOST:PORT; write --executor ray:nowhere:6379"),
         ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
+        (".x:1", "--executor ray:.x:1: no machine can have that name; start one with"),
         ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which a hunt does not use"),
         ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
     ],

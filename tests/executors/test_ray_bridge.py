@@ -10,9 +10,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.episode import WorkerSettings
-from crashhunt.executors.ray import _bridge
+from crashhunt.executors.ray import RayExecutor, _bridge, _executor
+from crashhunt.executors.ray._address import Meant
 from crashhunt.executors.ray._cluster import Found, Lost
 from crashhunt.executors.ray._messages import Ended, News
 from crashhunt.scenario import Scenario
@@ -405,6 +406,20 @@ def test_what_is_submitted_for_what_has_ended_goes_along_with_the_next_question(
     assert cluster.given == [("a", "take", [(103, spec(3)), (104, spec(4))])]
 
 
+def test_a_disk_that_is_full_here_is_told_from_a_cluster_that_is_lost(begin, monkeypatch):
+    bridge, cluster, after = begin(a=1)
+    submit(bridge, 0)
+    after()
+    cluster.news(cluster.actors[0], ended(0, {"run.log": b""}))
+
+    def full(files, folder):
+        raise OSError(28, "No space left on device", str(folder))
+
+    monkeypatch.setattr(_bridge, "unpacked", full)
+    with pytest.raises(RecorderError, match=r"trial-000000: what came back from a cannot be written here: No space"):
+        after()
+
+
 def test_the_hunt_is_given_a_moment_to_submit_more(begin, monkeypatch):
     bridge, cluster, after = begin(a=1)
     after()
@@ -425,6 +440,41 @@ def test_the_hunt_is_given_a_moment_to_submit_more(begin, monkeypatch):
     thread.join()
     bridge.turn(0)
     assert cluster.given == [("a", "take", [(101, spec(1))])]
+
+
+def test_neither_waits_for_the_other_to_listen_first(tmp_path, monkeypatch):
+    """However much both have to say: the bridge does not listen while it tells what has ended."""
+    settings = WorkerSettings(
+        scenario=Scenario(simulator="toy", folder=tmp_path), oracles=(), crash_on=CRASHES, scratch=tmp_path
+    )
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr(_executor, "require_ray", lambda: None)
+    monkeypatch.setattr(_executor, "cluster_of", lambda argument: Meant("x:1", {}, {}))
+    monkeypatch.setattr(RayExecutor, "_start", lambda self: setattr(self, "_control", ours))
+    executor = RayExecutor(settings)
+    heard = bytearray()
+
+    def bridge():
+        with theirs:
+            theirs.settimeout(30.0)
+            theirs.sendall(json.dumps({"note": "a" * (1 << 20)}).encode() + b"\n" + b'{"note": ')
+            while not heard.endswith(b"\n"):
+                heard.extend(theirs.recv(1 << 20))
+            theirs.sendall(b'"b"}\n')
+
+    thread = threading.Thread(target=bridge)
+    thread.start()
+    with ours:
+        executor.submit(TrialSpec(0, 0, {"ego": {"text": "c" * (1 << 20)}}, {}, max_steps=3))
+        thread.join()
+        assert len(heard) > 1 << 20
+        list(executor.completed(0.0))
+        assert executor.notes() == ["a" * (1 << 20)]
+        list(executor.completed(0.0))
+        assert executor.notes() == ["b"]
+        executor._ever_up = True
+        list(executor.completed(0.0))
+        assert executor.notes() == ["the Ray cluster was lost; the hunt waits until it is back"]
 
 
 def spec(number):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import os
 import re
 import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
@@ -51,6 +53,17 @@ def test_a_parcel_arrives_as_it_was_sent(settings, tmp_path):
     assert Path(there.argument_files["weights"]).read_text() == "w"
     assert there.scenario.folder.is_dir()
     assert there.scratch == tmp_path / "scratch there"
+
+
+def test_what_can_be_run_can_be_run_there(settings, tmp_path):
+    """And a parcel that was sent before somebody thought of that is not taken for it."""
+    before = Parcel.of(settings).digest()
+    (tmp_path / "code" / "mine" / "agent.py").chmod(0o700)
+    parcel = Parcel.of(settings)
+    assert parcel.digest() != before
+    unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
+    assert os.access(tmp_path / "there" / "code" / "0" / "mine" / "agent.py", os.X_OK)
+    assert not os.access(tmp_path / "there" / "files" / "0-w.npz", os.X_OK)
 
 
 def test_a_parcel_that_is_not_what_was_sent_is_refused(settings, tmp_path):
@@ -98,6 +111,26 @@ def test_a_place_is_removed_by_whoever_comes_after_its_owner(tmp_path):
     for place in (mine, other):
         place.remove()
     assert not list((tmp_path / "store").iterdir())
+
+
+@pytest.mark.parametrize("make", [lambda path: Store(path).place(), Folder])
+def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(make, tmp_path, monkeypatch):
+    """Two hunts begin at once: one looks for what was left while the other one makes its folder, whenever that is."""
+    (tmp_path / "store").mkdir()
+    others, lock = [], fcntl.flock
+
+    def late(file, operation):
+        if not others:
+            others.append(None)
+            others[0] = make(tmp_path / "store")
+        lock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    mine = make(tmp_path / "store")
+    last = make(tmp_path / "store")
+    for place in (mine, *others, last):
+        assert place.path.exists()
+        place.remove()
 
 
 def test_a_node_says_what_differs(monkeypatch):
@@ -186,6 +219,17 @@ def test_what_is_kept_goes_back_at_once(work):
     node = work((0, False), (1, True), (2, False))
     scratch_of(node._place.scratch, 1).mkdir(parents=True)
     assert [ended.number for ended in node.take(0.0, submissions(*range(8))).ended] == [0, 1]
+
+
+def test_whatever_an_agent_has_put_where_its_trial_is_recorded_the_node_goes_on(work):
+    node = work((0, True))
+    folder = scratch_of(node._place.scratch, 0)
+    (folder / "deep" / "er").mkdir(parents=True)
+    (folder / "link").symlink_to("nowhere")
+    (folder / layout.RUN_LOG).write_text("said")
+    news = node.take(0.0, submissions(0))
+    assert {name: zlib.decompress(content) for name, content in news.ended[0].files.items()} == {"run.log": b"said"}
+    assert not folder.exists()
 
 
 def test_what_was_given_up_on_its_way_is_not_run(work):

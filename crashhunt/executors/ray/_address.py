@@ -117,6 +117,8 @@ def silent(address: str) -> str:
                 said.put(_greeting(connection))
         except OSError as error:
             said.put(f"nobody answers there ({error.strerror or error})")
+        except UnicodeError:
+            said.put("no machine can have that name")
 
     threading.Thread(target=ask, daemon=True).start()  # looking a name up may take longer than anybody waits
     try:

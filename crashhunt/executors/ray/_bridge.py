@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from crashhunt.base import layout
 from crashhunt.base.blame import in_words
-from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._remains import died
 from crashhunt.executors.ray._cluster import Cluster, Lost, TokenError, UnreachableError
@@ -289,13 +289,24 @@ class Bridge:
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
 
     def _keep(self, node: Node, ended: Ended) -> None:
-        """Write what a trial that is kept has left behind to where the hunt looks for it."""
+        """Write what a trial that is kept has left behind to where the hunt looks for it.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
         scratch = self._settings.scratch
         folder = scratch_of(scratch, ended.number)
-        unpacked(ended.files, folder)
-        common = self._maps.get(node.id)
-        if common is not None and not (folder / layout.MAP).exists():
-            unpacked({layout.MAP: common}, folder if (scratch / layout.MAP).exists() else scratch)
+        try:
+            unpacked(ended.files, folder)
+            common = self._maps.get(node.id)
+            if common is not None and not (folder / layout.MAP).exists():
+                unpacked({layout.MAP: common}, folder if (scratch / layout.MAP).exists() else scratch)
+        except OSError as error:
+            raise RecorderError(
+                f"what came back from {node.name} cannot be written here: {error.strerror or error}",
+                fix="free some space and run the same command again",
+                where=str(error.filename or ""),
+            ) from error
 
     def _lose(self, node: Node) -> None:
         """Go on without a node; what ran there runs again elsewhere."""

@@ -9,8 +9,9 @@ import stat
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
-__all__ = ["Folder"]
+__all__ = ["Folder", "owned", "remove_if_left"]
 
 _PREFIX, _LOCK = "chr-", "crashhunt.lock"
 _LONGEST = 40  # characters of a folder in which Ray can make its sockets
@@ -27,10 +28,9 @@ class Folder:
         usual = tempfile.gettempdir()
         parent = parent or Path(usual if len(usual) <= _LONGEST else "/tmp")
         for old in parent.glob(f"{_PREFIX}*"):
-            _remove_if_left(old)
+            remove_if_left(old / _LOCK)
         self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
-        self._lock = (self.path / _LOCK).open("w")
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._lock = owned(self.path / _LOCK)
 
     def fileno(self) -> int:
         """Return the descriptor of its lock: whoever inherits it owns the folder as well."""
@@ -42,10 +42,20 @@ class Folder:
         self._lock.close()
 
 
-def _remove_if_left(folder: Path) -> None:
+def owned(lock: Path) -> IO[str]:
+    """Make the lock of a folder, which nobody sees before it is held, and hold it for as long as it is open."""
+    part = lock.with_name(f".{lock.name}")
+    file = part.open("w")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    part.rename(lock)
+    return file
+
+
+def remove_if_left(lock: Path) -> None:
+    """Remove the folder of a lock that nobody holds; without one, it is not of ours, or a moment old."""
     with suppress(OSError):
-        found = folder.lstat()
+        found = lock.parent.lstat()
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid():
-            with (folder / _LOCK).open("r+") as lock:  # without one, it is not of ours, or a moment old
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
+            with lock.open("r+") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(lock.parent, ignore_errors=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import stat
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
@@ -70,7 +71,7 @@ class Parcel:
         Raises:
             OSError: a file cannot be read.
         """
-        return digest_of_data({place: digest_of_file(path) for place, path in self.files.items()})
+        return digest_of_data({place: _described(path) for place, path in self.files.items()})
 
     def packed(self) -> bytes:
         """Return it as it travels.
@@ -124,11 +125,18 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
                 path = root / place
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(archive.read(entry))
-                found[entry.filename] = digest_of_file(path)
+                if entry.external_attr >> 16 & stat.S_IXUSR:
+                    path.chmod(0o755)
+                found[entry.filename] = _described(path)
         if digest_of_data(found) != digest:
             raise ValueError("its digest is another one")
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise BundleError(f"the parcel {digest} is damaged: {error}", fix="have it sent again") from None
+
+
+def _described(path: Path) -> str:
+    """What is in a file, and whether it can be run, as an agent may do with a program that lies beside it."""
+    return digest_of_file(path) + ("*" if path.stat().st_mode & stat.S_IXUSR else "")
 
 
 def _modules(folder: Path) -> Iterator[tuple[str, Path]]:

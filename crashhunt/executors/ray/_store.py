@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import stat
@@ -11,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from crashhunt.base.errors import BundleError
+from crashhunt.executors.ray._folder import owned, remove_if_left
 from crashhunt.executors.ray._parcel import unpack
 
 __all__ = ["Place", "Store"]
@@ -73,9 +73,7 @@ class Store:
             OSError: the disk is full.
         """
         for old in self._folder.glob("hunt-*"):
-            with suppress(OSError), (old / _LOCK).open("a") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(old, ignore_errors=True)
+            remove_if_left(old / _LOCK)
         return Place(Path(tempfile.mkdtemp(prefix="hunt-", dir=self._folder)))
 
     def _file(self, digest: str) -> Path:
@@ -105,9 +103,8 @@ class Place:
         self.path = path
         self.code = path / "parcel"
         self.scratch = path / "scratch"
+        self._lock = owned(path / _LOCK)
         self.scratch.mkdir()
-        self._lock = (path / _LOCK).open("a")
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
 
     def unpack(self, packed: bytes, digest: str) -> bool:
         """Unpack a parcel, which is verified; return whether it is as it should be."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 import time
 import zlib
@@ -170,8 +171,7 @@ class Work:
             for path in folder.iterdir():
                 if path.is_file() and not path.is_symlink():
                     files[path.name] = zlib.compress(self._content(path), 1)
-                path.unlink()
-            folder.rmdir()
+            shutil.rmtree(folder, ignore_errors=True)  # whatever else an agent has put there
         return Ended(ticket, result.spec.number, line, files)
 
     def _content(self, path: Path) -> bytes:
