@@ -9,6 +9,7 @@ import os
 import re
 import zipfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,34 @@ def test_what_can_be_run_can_be_run_there(settings, tmp_path):
     unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
     assert os.access(tmp_path / "there" / "code" / "0" / "mine" / "agent.py", os.X_OK)
     assert not os.access(tmp_path / "there" / "files" / "0-w.npz", os.X_OK)
+
+
+def test_what_stands_for_the_current_folder_is_that_of_the_other_machine(settings, tmp_path, monkeypatch):
+    """Where a snapshot has it: agents open their files by names that count from there."""
+    for name in ("proj/agents/weights.txt", "else/agents/other.txt", "code/@proj/agents/weights.txt"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text("w")
+    tree = tmp_path / "code" / "@proj"
+    settings = replace(settings, code=(str(tmp_path / "code"), str(tree), str(tree / "agents")))
+    homes = {}
+    for folder in ("proj", "proj/agents", "else/agents", "."):
+        monkeypatch.chdir(tmp_path / folder)
+        homes[folder] = Parcel.of(settings).home
+    assert homes == {"proj": "code/0/@proj", "proj/agents": "code/0/@proj/agents", "else/agents": "", ".": ""}
+
+
+def test_a_folder_of_code_that_is_in_another_one_travels_once(settings, tmp_path):
+    (tmp_path / "code" / "@proj" / "mine").mkdir(parents=True)
+    (tmp_path / "code" / "@proj" / "mine" / "of.py").write_text("y = 1")
+    inner = tmp_path / "code" / "@proj" / "mine"
+    settings = replace(settings, code=(str(inner), str(tmp_path / "code"), str(tmp_path / "code" / "@proj")))
+    parcel = Parcel.of(settings)
+    assert len({*map(str, parcel.files.values())}) == len(parcel.files) == 3
+    unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
+    there = settings_in(settings, parcel.folders, tmp_path / "there", tmp_path)
+    for here, folder in zip(settings.code, there.code, strict=True):
+        names = [sorted(path.relative_to(root) for path in Path(root).rglob("*.py")) for root in (here, folder)]
+        assert names[0] == names[1] != []
 
 
 def test_a_parcel_that_is_not_what_was_sent_is_refused(settings, tmp_path):
@@ -150,7 +179,7 @@ def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypat
     box = BlackBox(tmp_path / layout.BLACK_BOX)
     box.begin(pid=1, trial=0, started=0.0)
     box.append(Tag.ROSTER, 0, bytes(range(1, 200)))
-    job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "slots": 1}
+    job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "home": "", "slots": 1}
     content = Work(job)._content(tmp_path / layout.BLACK_BOX)
     assert len(content) < 1000
     (tmp_path / "there").write_bytes(content)
@@ -194,7 +223,7 @@ def work(settings, tmp_path, monkeypatch):
     made = []
 
     def make(*ending):
-        job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "slots": 4}
+        job = {"settings": settings.to_json(), "recycle_after": 0, "digest": "", "folders": {}, "home": "", "slots": 4}
         made.append(Work(job))
         made[-1]._place = made[-1]._store.place()
         made[-1]._pool = Pool(*ending)

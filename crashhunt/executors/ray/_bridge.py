@@ -255,6 +255,7 @@ class Bridge:
                 "recycle_after": self._job["recycle_after"],
                 "digest": self._digest,
                 "folders": self._parcel.folders,
+                "home": self._parcel.home,
                 "slots": node.slots,
             }
             self._ask(node, "begin", job)

@@ -36,12 +36,16 @@ class BridgeJob(TypedDict):
 
 
 class NodeJob(TypedDict):
-    """What a node needs to know: ``folders`` there to their places in the parcel, and how many trials at a time."""
+    """What a node needs to know: ``folders`` there to their places in the parcel, and how many trials at a time.
+
+    ``home`` is the place in the parcel where trials run, as they do in the current folder there; empty for none.
+    """
 
     settings: SettingsData
     recycle_after: int
     digest: str
     folders: dict[str, str]
+    home: str
     slots: int
 
 

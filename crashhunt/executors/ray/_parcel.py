@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.integrity import digest_of_data, digest_of_file
 
@@ -33,10 +34,12 @@ class Parcel:
     Args:
         files: place in the parcel to file.
         folders: folder or file here to the place that stands for it, for `settings_in`.
+        home: the place that stands for the current folder; empty where none does.
     """
 
     files: dict[str, Path]
     folders: dict[str, str]
+    home: str = ""
 
     @classmethod
     def of(cls, settings: WorkerSettings) -> Parcel:
@@ -48,7 +51,11 @@ class Parcel:
         """
         files = {f"{_SCENARIO}/{name}": settings.scenario.folder / name for name in settings.scenario.files()}
         folders = {str(settings.scenario.folder): _SCENARIO}
-        for index, folder in enumerate(settings.code):
+        for index, folder in enumerate(sorted(settings.code, key=len)):
+            outer = next((str(above) for above in Path(folder).parents if str(above) in settings.code), "")
+            if outer:  # with which it comes
+                folders[folder] = f"{folders[outer]}/{Path(folder).relative_to(outer).as_posix()}"
+                continue
             folders[folder] = f"{_CODE}/{index}"
             files |= {f"{_CODE}/{index}/{name}": path for name, path in _modules(Path(folder))}
         for index, file in enumerate(dict.fromkeys(settings.argument_files.values())):
@@ -63,7 +70,7 @@ class Parcel:
                 f"the largest file is {largest} ({sizes[largest] / _MEGABYTE:.0f} MB)",
                 fix="make it smaller, or have git ignore what the agent does not need",
             )
-        return cls(files, folders)
+        return cls(files, folders, next((folders[folder] for folder in settings.code if _is_here(Path(folder))), ""))
 
     def digest(self) -> str:
         """Return the digest of all that is in it.
@@ -132,6 +139,15 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
             raise ValueError("its digest is another one")
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise BundleError(f"the parcel {digest} is damaged: {error}", fix="have it sent again") from None
+
+
+def _is_here(folder: Path) -> bool:
+    """Whether a folder of a snapshot is what the current one was: of the same name, and all of it is here as well."""
+    here = Path.cwd()
+    _, tree, place = folder.as_posix().rpartition(f"/{layout.CODE}/@")
+    if not tree or not here.as_posix().endswith(f"/{place}"):
+        return False
+    return all((here / path.name).exists() for path in folder.iterdir())
 
 
 def _described(path: Path) -> str:

@@ -87,6 +87,8 @@ class Work:
         pairs = {str(self._place.code / place): folder for folder, place in self._job["folders"].items()}
         pairs[str(self._place.scratch)] = str(settings.scratch)
         self._renamed = sorted(pairs.items(), key=lambda pair: -len(pair[0]))
+        if self._job["home"]:  # an agent may open its files by names that count from there
+            os.chdir(self._place.code / self._job["home"])
         recycle_after = self._job["recycle_after"]
         self._pool = PoolExecutor(here, parallel=self._job["slots"], recycle_after=recycle_after)
         return True
