@@ -19,7 +19,7 @@ from crashhunt.episode._whereabouts import Whereabouts
 from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
 from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import FlattensObservations, HasMap
+from crashhunt.simulators import CountsSetUp, FlattensObservations, HasMap
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ class Episode(Copied, Ending, Whereabouts):
         result: None while it goes on.
         error: the exception that ended it, where one did; until it is closed.
         setup_s: wall time that `start` took, in s.
+        setup_steps: how many steps were simulated before the first one; None where the simulator does not say.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class Episode(Copied, Ending, Whereabouts):
         self.result: TrialResult | None = None
         self.error: BaseException | None = None
         self.setup_s = 0.0
+        self.setup_steps: int | None = None
         self._make_agent = make_agent
         self._crash_on = frozenset(crash_on)
         self._oracles = tuple(oracles)
@@ -324,7 +326,10 @@ class Episode(Copied, Ending, Whereabouts):
         spec, simulator = self.spec, self.simulator
         agent = ""
         try:
-            self._observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
+            try:
+                self._observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
+            finally:
+                self.setup_steps = simulator.setup_steps if offers(simulator, CountsSetUp) else None
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:

@@ -79,6 +79,7 @@ class Recorder(Observer):
             sample = form.encode(_any_action(form.space))
             shown = np.dtype(space.dtype).str, tuple(space.shape or ())
             channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
+        self._box.set_up(episode.setup_steps or 0)
         self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
 
     def observation(self, number: int, observation: NDArray[np.generic]) -> None:

@@ -144,6 +144,7 @@ def _result(
         wall_s=wall_s,
         worker=header.pid if header is not None else 0,
         kept=folder.is_dir(),
+        setup_steps=(header.setup_steps or None) if header is not None else None,
     )
     return in_effect(result, recording.disturbances if recording is not None else ())
 

@@ -41,7 +41,7 @@ from crashhunt.episode import (
 from crashhunt.executors._baseline import Baseline
 from crashhunt.executors._warm import WarmCopies
 from crashhunt.recording import BlackBox
-from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, TellsNotices, Tidies
+from crashhunt.simulators import BrakesFully, CountsSetUp, HasMap, LeavesOut, TellsNotices, Tidies
 from crashhunt.trial import Outcome
 from crashhunt.world import Lane
 
@@ -192,6 +192,8 @@ class Worker:
 
             def again(**_given: object) -> tuple[Observations, Info]:
                 set_generators(drawn)
+                if offers(simulator, CountsSetUp):
+                    simulator.setup_steps = 0  # they are the first trial's
                 return begun
 
             warm.keep(spec, partial(self._go_on, again), took_s=took_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -12,10 +13,11 @@ from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.hunts._workers import settings_again
+from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sized
+    from collections.abc import Iterable, Iterator, Sequence, Sized
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
@@ -39,6 +41,7 @@ class RunsAgain:
         settings: of the hunt.
         parallel: how many run at a time.
         notes: gets a line for whatever went wrong.
+        failed: gets what was to confirm something, and ended otherwise.
         stops: has something in it as soon as somebody wants to stop.
     """
 
@@ -47,6 +50,7 @@ class RunsAgain:
     settings: HuntSettings
     parallel: int
     notes: list[str]
+    failed: list[TrialResult]
     stops: Sized
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
@@ -78,6 +82,20 @@ class RunsAgain:
                             yield Again(result, self, digest, scratch, folder)
             finally:
                 shutil.rmtree(scratch, ignore_errors=True)
+
+    def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
+        """Run every crash that nobody has confirmed yet once more, and return them all, in their order."""
+
+        def confirmed(bundle: Bundle) -> Bundle:
+            if bundle.confirmed is None and not len(self.stops):
+                found = confirm(bundle, lambda: bool(len(self.stops)), failed=self.failed)
+                if found is not None:
+                    found.write()
+                    return found
+            return bundle
+
+        with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
+            return list(threads.map(confirmed, crashes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,10 +101,12 @@ class Audit:
 
     Args:
         settings: of the hunt; they say which trials.
+        failed: gets those that were not the same.
     """
 
-    def __init__(self, settings: WorkerSettings) -> None:
+    def __init__(self, settings: WorkerSettings, failed: list[TrialResult]) -> None:
         self._settings = settings
+        self._failed = failed
         self._scratch = settings.scratch / "audit"
         self._scratch.mkdir(exist_ok=True)
         again = replace(settings, scratch=self._scratch, audit=0.0, keep_trials=True)
@@ -158,6 +160,7 @@ class Audit:
             self._done += 1
             if difference is not None:
                 found.append(difference)
+                self._failed.append(result)
         self._differences += found
         return found
 

@@ -46,6 +46,7 @@ class Noted(TypedDict, total=False):
         kinds: of crashes, the most frequent first, where it collects them all.
         dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
         newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
+        failed_steps: how many steps were simulated to confirm something that was not confirmed.
     """
 
     owner: Owner | None
@@ -66,6 +67,7 @@ class Noted(TypedDict, total=False):
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
     newest_kind: float | None
+    failed_steps: int
     dropped: dict[str, list[int]]
 
 
@@ -88,6 +90,7 @@ class Seal(TypedDict):
     steps: int
     table: str
     dangers: NotRequired[str]
+    other_steps: NotRequired[int]
     events: int
     replaced: int
     proposals: NotRequired[int]

@@ -92,6 +92,7 @@ class FromTheStart:
             for one in self.again.run([one.spec for one in found], folder):
                 result, copy = one.result, wanted[one.result.spec.number]
                 if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
+                    self.again.failed.append(result)
                     continue
                 if self.disturber is not None:
                     result = replace(result, log_likelihood=self.disturber.log_likelihood_of(result))
@@ -103,8 +104,9 @@ class FromTheStart:
         return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}
 
     def _confirmed(self, bundle: Bundle) -> Bundle | None:
-        found = confirm(bundle, lambda: self.is_stopped)
+        found = confirm(bundle, lambda: self.is_stopped, failed=self.again.failed)
         if found is None or not found.confirmed:
+            self.again.failed.append(bundle.result)  # nothing has come of this run either
             shutil.rmtree(bundle.path, ignore_errors=True)
             return None
         found.write()

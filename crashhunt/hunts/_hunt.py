@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -34,7 +33,6 @@ from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_proces
 from crashhunt.hunts._surplus import give_up_surplus
 from crashhunt.hunts._workers import settings_of_workers
 from crashhunt.plans import core_of, disturber, sampler_of
-from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -42,7 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor
     from crashhunt.hunts._data import Facts
     from crashhunt.plans import HuntSettings
@@ -167,7 +164,9 @@ class Hunt:
             copies=copies_to_come(settings),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        again = RunsAgain(self._place, ledger, settings, self._parallel_here, progress.notes, self._stops)
+        again = RunsAgain(
+            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops
+        )
         copies = FromTheStart(again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
@@ -176,7 +175,7 @@ class Hunt:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
-        self._confirm(progress)
+        progress.replace(again.confirm(progress.crashes))
         near, (probes, branches) = keep_near_misses(again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
@@ -189,7 +188,8 @@ class Hunt:
             settings,
             stopped,
             ledger.outcomes(),
-            ledger.steps_total() + sum(asked.steps for asked in (probes, branches) if asked is not None),
+            ledger.trial_steps(),
+            ledger.steps_total(),
             time.monotonic() - progress.began,
             tuple(crashes),
             reason,
@@ -217,7 +217,7 @@ class Hunt:
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
-        audit, self._heard = Audit(worker_settings), Heard(settings, progress.outcomes)
+        audit, self._heard = Audit(worker_settings, progress.failed), Heard(settings, progress.outcomes)
         preflight = Preflight(
             settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code,
             listen=lambda: self._heard.hear(executor),
@@ -353,18 +353,6 @@ class Hunt:
         )
         progress.save(bundle)
         ledger.record(result, snapshot=snapshot.digest)
-
-    def _confirm(self, progress: Progress) -> None:
-        """Run every crash that nobody has confirmed yet once more, in a fresh process."""
-
-        def confirmed(bundle: Bundle) -> Bundle:
-            if bundle.confirmed is None and not self._stops and (found := confirm(bundle, lambda: bool(self._stops))):
-                found.write()
-                return found
-            return bundle
-
-        with ThreadPoolExecutor(self._parallel_here) as threads:  # which only wait for their process
-            progress.replace(list(threads.map(confirmed, progress.crashes)))
 
     @property
     def _parallel_here(self) -> int:

@@ -93,6 +93,7 @@ class Ledger(LedgerReader):
             snapshot,
             json.dumps(result.to_json()),
             _real(result.danger),
+            result.other_steps,
         )
         self._insert(row)
 

@@ -153,12 +153,23 @@ class LedgerReader:
         trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
         return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
 
-    def steps_total(self) -> int:
-        """Return how many steps were run in all."""
+    def trial_steps(self) -> int:
+        """Return how many steps trials have taken."""
         seal = self._seal()
         found = self._steps()
         self._compare_seal(seal, "steps", found)
         return found
+
+    def steps_total(self) -> int:
+        """Return how many steps were simulated in all.
+
+        Those of trials, those before their first, those of their copies, and those of runs that were to confirm
+        something and ended otherwise; what a ledger of before does not say is not in it.
+        """
+        seal = self._seal()
+        other = self._other_steps()
+        self._compare_seal(seal, "other_steps", other)
+        return self.trial_steps() + other + (self.facts().get("failed_steps") or 0)
 
     def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
         """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
@@ -339,6 +350,8 @@ class LedgerReader:
             for rows in self._chunks(_BY_DANGER):
                 ranked.update(_as_text(rows))
             seal["dangers"] = ranked.hexdigest()
+        if "other_steps" in self._shape.columns["trials"]:
+            seal["other_steps"] = self._other_steps()
         return seal
 
     def _fits(self, seal: Seal) -> bool:
@@ -360,6 +373,11 @@ class LedgerReader:
 
     def _steps(self) -> int:
         return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
+
+    def _other_steps(self) -> int:
+        if "other_steps" not in self._shape.columns["trials"]:
+            return 0
+        return int(next(self._select("SELECT coalesce(sum(other_steps), 0) FROM trials"))[0])
 
     def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:
         try:

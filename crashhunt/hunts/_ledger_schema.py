@@ -21,6 +21,7 @@ __all__ = [
     "DANGER_INDEX",
     "EVENTS_INDEX",
     "FIRST",
+    "OUTCOME_INDEX",
     "OWN_FACTS",
     "PROPOSALS",
     "SEAL",
@@ -33,7 +34,7 @@ __all__ = [
     "shape_of",
 ]
 
-VERSION = 4  # of the tables, as PRAGMA user_version
+VERSION = 5  # of the tables, as PRAGMA user_version
 _READER = 3  # the least version of a crashhunt that reads what this one writes
 _PROTECTED = 2  # the first version in which every row has a digest of its content
 _PROPOSING = 3  # the first version that has proposals
@@ -49,6 +50,11 @@ CREATE TABLE IF NOT EXISTS proposals (
 # Most trials have no traffic event, so that those that have some are counted without reading all the others.
 WITH_EVENTS = """instr(result, '"events": {"') > 0"""
 EVENTS_INDEX = f"CREATE INDEX IF NOT EXISTS trials_with_events ON trials (number) WHERE {WITH_EVENTS};"
+# What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
+OUTCOME_INDEX = (
+    "CREATE INDEX IF NOT EXISTS trials_by_outcome "
+    "ON trials (outcome, time_to_collision_s, number, steps, seed, other_steps);"
+)
 DANGER_INDEX = "CREATE INDEX IF NOT EXISTS trials_by_danger ON trials (outcome, danger, number);"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS trials (
@@ -64,10 +70,10 @@ CREATE TABLE IF NOT EXISTS trials (
     snapshot TEXT NOT NULL,
     result TEXT NOT NULL,
     digest INTEGER NOT NULL,
-    danger REAL
+    danger REAL,
+    other_steps INTEGER
 ) STRICT;
--- What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
-CREATE INDEX IF NOT EXISTS trials_by_outcome ON trials (outcome, time_to_collision_s, number, steps, seed);
+{OUTCOME_INDEX}
 {EVENTS_INDEX}
 {DANGER_INDEX}
 CREATE TABLE IF NOT EXISTS replaced (
@@ -92,7 +98,7 @@ FIRST = {
     "hunt": ("key", "value"),
 }  # fmt: skip
 # Columns that came later stand after the digest, where a migration puts them.
-_ADDED = {"trials": {"danger": 4}}  # table to column to the first version that has it
+_ADDED = {"trials": {"danger": 4, "other_steps": 5}}  # table to column to the first version that has it
 _LATER = {"proposals": ("turn", "number", "told", "spec")}
 
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.base.integrity import digest_of_row
-from crashhunt.hunts._ledger_schema import DANGER_INDEX, EVENTS_INDEX, FIRST, PROPOSALS, VERSION, note_reader
+from crashhunt.hunts._ledger_schema import (
+    DANGER_INDEX,
+    EVENTS_INDEX,
+    FIRST,
+    OUTCOME_INDEX,
+    PROPOSALS,
+    VERSION,
+    note_reader,
+)
 
 if TYPE_CHECKING:
     import sqlite3
@@ -37,10 +45,24 @@ def _add_danger(database: sqlite3.Connection) -> None:
     database.execute(DANGER_INDEX)
 
 
+def _add_other_steps(database: sqlite3.Connection) -> None:
+    """Of what is there, copies said how many steps they took; warm-ups did not, and nobody knows."""
+    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
+    database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
+    was = ", ".join((*FIRST["trials"], "danger"))
+    data = "iif(json_valid(result), result, '{}')"
+    copies = " + ".join(f"coalesce(json_extract({data}, '$.{name}.steps'), 0)" for name in ("stress", "branches"))
+    now = f"other_steps = {copies}, digest = digest_of_row({was}, {copies})"
+    database.execute(f"UPDATE trials SET {now} WHERE digest = digest_of_row({was})")
+    database.execute("DROP INDEX IF EXISTS trials_by_outcome")
+    database.execute(OUTCOME_INDEX)
+
+
 MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {
     1: _add_digests,
     2: _add_proposals,
     3: _add_danger,
+    4: _add_other_steps,
 }
 """Version to what makes of a ledger of it one of the next.
 

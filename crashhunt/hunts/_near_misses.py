@@ -44,6 +44,7 @@ def keep_near_misses(again: RunsAgain) -> tuple[Bundle, ...]:
             if (was.outcome, was.digest) == (now.outcome, now.digest):
                 one.write(was, confirmed=True)
             else:
+                again.failed.append(now)
                 what = f"trial {now.spec.number}, a near miss, is another one in a fresh process"
                 again.notes.append(f"{what}: it has no bundle")
     except CrashhuntError as error:

@@ -93,7 +93,6 @@ class Progress:
     until: float = math.inf  # no trial begins
     ended_here: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
-    steps_total: int = 0
     crashes: list[Bundle] = field(default_factory=list)
     found: dict[int, TrialResult] = field(default_factory=dict)  # crashes that are not saved yet
     copied: dict[int, Bundle] = field(default_factory=dict)  # what copies of trials have found, run from the start
@@ -102,6 +101,8 @@ class Progress:
     branched: int = 0
     last_invalid: TrialResult | None = None
     notes: list[str] = field(default_factory=list)
+    failed: list[TrialResult] = field(default_factory=list)  # what was to confirm something, and ended otherwise
+    failed_steps: int = 0  # of such runs, before this run of the hunt
     audit: AuditReport | None = None
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
@@ -110,6 +111,7 @@ class Progress:
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
         self.crashes = crashes
+        self.failed_steps = before.get("failed_steps", 0)
         if run.keep_going or run.only_at_fault:
             wanted = run.distinct if run.keep_going else 1
             newest = before.get("newest_kind")
@@ -192,7 +194,9 @@ class Progress:
         kinds: Noted = {}
         if self.kinds is not None:
             kinds = {"kinds": list(map(kind_data, self.kinds.groups())), "newest_kind": self.kinds.newest}
-        return {"heartbeat": time.time(), **nodes, **kinds}
+        failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
+        in_vain: Noted = {"failed_steps": failed} if failed else {}
+        return {"heartbeat": time.time(), **nodes, **kinds, **in_vain}
 
     def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the last three of `HuntStatus`."""

@@ -61,7 +61,9 @@ class HuntReport:
         settings: what was asked.
         stopped_because: why it ended.
         outcomes: how the trials ended.
-        steps_total: steps of all trials, and of the copies that were asked.
+        trial_steps: how many steps trials have taken.
+        steps_total: how many were simulated in all: theirs, those before their first, such as of traffic that warms up,
+            those of their copies, and those of runs that were to confirm something and ended otherwise.
         wall_s: wall time of this run.
         crashes: what was found, the one with the fewest steps first.
         reason: in words, where not one trial was valid.
@@ -80,6 +82,7 @@ class HuntReport:
     settings: HuntSettings
     stopped_because: StoppedBecause
     outcomes: dict[str, int]
+    trial_steps: int
     steps_total: int
     wall_s: float
     crashes: tuple[Bundle, ...]

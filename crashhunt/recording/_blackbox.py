@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 __all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
 
 _MAGIC = b"CRASHBB1"
-_HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, reserved, trial, started, committed, step, phase, agent
+_HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, set-up, trial, started, committed, step, phase, agent
 _WHERE = struct.Struct("<QqiI")  # the last four of them
 _WHERE_OFFSET = _HEADER.size - _WHERE.size
+_SETUP, _SETUP_OFFSET = struct.Struct("<I"), 12
 _FIRST = 64  # where records begin; the header has room to grow
 _HEAD = struct.Struct("<BxHI")
 _CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
@@ -75,7 +76,7 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BlackBoxHeader:
-    """Where a process was when it last wrote."""
+    """Where a process was when it last wrote, and how many steps it had simulated before the first one."""
 
     pid: int
     trial: int
@@ -84,6 +85,7 @@ class BlackBoxHeader:
     step: int
     phase: Phase
     agent: int
+    setup_steps: int = 0
 
 
 class BlackBox:
@@ -133,6 +135,10 @@ class BlackBox:
         self._roster = None
         self._trail.clear()
         self._aside.clear()
+
+    def set_up(self, steps: int) -> None:
+        """Note how many steps have been simulated before the first one."""
+        _SETUP.pack_into(self._map, _SETUP_OFFSET, min(steps, 2**32 - 1))
 
     def prologue(self, payload: bytes, agents: int) -> None:
         """Record what the trial consists of; ``agents`` is how many rewards each step has."""
@@ -281,8 +287,8 @@ class BlackBox:
 
     def delay(self, wall_s: float) -> None:
         """Count so much of the time since the trial began as not its own, in s."""
-        magic, pid, reserved, trial, started, *where = _HEADER.unpack_from(self._map, 0)
-        _HEADER.pack_into(self._map, 0, magic, pid, reserved, trial, started + wall_s, *where)
+        magic, pid, setup_steps, trial, started, *where = _HEADER.unpack_from(self._map, 0)
+        _HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
 
     def copy(self) -> None:
         """Go on in memory of this process's own: it is a copy of the one that records, and goes on recording."""
@@ -334,8 +340,8 @@ def read_header(path: Path) -> BlackBoxHeader | None:
         return None
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         return None
-    _, pid, _, trial, started, committed, step, phase, agent = _HEADER.unpack(data)
-    return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent)
+    _, pid, setup_steps, trial, started, committed, step, phase, agent = _HEADER.unpack(data)
+    return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent, setup_steps)
 
 
 def read_black_box(path: Path) -> Iterator[Record]:

@@ -53,12 +53,15 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
     return replace(shown, verdicts=Counter(report.verdict for report in reports))
 
 
-def confirm(bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle | None:
+def confirm(
+    bundle: Bundle, stopped: Callable[[], bool] = lambda: False, *, failed: list[TrialResult] | None = None
+) -> Bundle | None:
     """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
 
     Args:
         bundle: the crash.
         stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
+        failed: gets what came of the replay, where that is not the crash.
 
     Returns:
         None where it was given up.
@@ -73,6 +76,8 @@ def confirm(bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bund
         return replace(bundle, confirmed=False, divergence=failure)
     divergence = report.divergence.to_json() if report.divergence else None
     confirmed = report.verdict == "reproduced"
+    if not confirmed and failed is not None:
+        failed.append(report.replayed)
     result = replace(bundle.result, escape=report.replayed.escape if confirmed else None)
     return replace(bundle, result=result, confirmed=confirmed, divergence=divergence)
 

@@ -184,7 +184,7 @@ def _trials(directory: Path) -> dict[str, object]:
         return {
             "outcomes": outcomes,
             "categories": {name: Outcome(name).category for name in outcomes},
-            "steps": ledger.steps_total(),
+            "steps": ledger.trial_steps(),
             "trials": trials,
             "stress": stress,
             "thinned": share < 1.0,

@@ -16,14 +16,14 @@ def describe_probes(report: HuntReport) -> list[str]:
     found = report.probes
     if found is None or not found.margins:
         return []
-    steps = _of_trials(report)
+    steps = f"{found.steps} steps beside {report.trial_steps} of trials"
     safe = sum(margin == 1.0 for margin in found.margins)
     least, median = min(found.margins), statistics.median(found.margins)
     said = f"nothing plausible made {safe} of them crash"
     enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
     lines = [
         f"Stress margin of {_many(len(found.margins), 'trial')}: least {least:.2f}, median {median:.2f}; {said}.",
-        f"  copies were asked {_many(found.probes, 'time')}, with {found.steps} steps beside {steps} of trials{enough}",
+        f"  copies were asked {_many(found.probes, 'time')}, with {steps}{enough}",
     ]
     if found.run_again:
         lines.append(
@@ -47,7 +47,7 @@ def describe_branches(report: HuntReport) -> list[str]:
     crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
     lines = [
         f"Branches: copies went on with other disturbances {_many(found.branches, 'time')}, from {moments}; {crashed}.",
-        f"  they took {found.steps} steps beside {_of_trials(report)} of trials{enough}",
+        f"  they took {found.steps} steps beside {report.trial_steps} of trials{enough}",
     ]
     if found.run_again:
         lines.append(f"  of the {found.run_again} likeliest, {len(found.crashes)} crashed from the start as well:")
@@ -60,8 +60,3 @@ def describe_branches(report: HuntReport) -> list[str]:
 
 def _many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-def _of_trials(report: HuntReport) -> int:
-    """How many steps trials have taken themselves."""
-    return report.steps_total - sum(one.steps for one in (report.probes, report.branches) if one is not None)

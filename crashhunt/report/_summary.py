@@ -36,7 +36,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     ran = sum(report.outcomes.values())
     outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
     planned = report.settings.trials
-    count = f"{ran}{f' of {planned}' if planned else ''} trials, {report.steps_total} steps"
+    total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
+    count = f"{ran}{f' of {planned}' if planned else ''} trials, {report.trial_steps} steps{total}"
     lines = [f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"]
     if report.stopped_because == "no_valid_trial":
         lines.append(f"Not one trial was valid: {report.reason}")

@@ -11,6 +11,7 @@ from ._protocol import (
     ActionForm as ActionForm,
     AtOnce as AtOnce,
     BrakesFully as BrakesFully,
+    CountsSetUp as CountsSetUp,
     Disturbing as Disturbing,
     Disturbs as Disturbs,
     FlattensObservations as FlattensObservations,

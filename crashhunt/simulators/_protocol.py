@@ -23,6 +23,7 @@ __all__ = [
     "ActionForm",
     "AtOnce",
     "BrakesFully",
+    "CountsSetUp",
     "Disturbing",
     "Disturbs",
     "FlattensObservations",
@@ -108,8 +109,8 @@ class Simulator(Protocol):
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
     `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
-    `HoldsBack`, `LeavesOut`, `PlaysPaths` and `Tidies`. Nothing is registered: whoever has the methods and attributes
-    of one offers it.
+    `HoldsBack`, `LeavesOut`, `PlaysPaths`, `CountsSetUp` and `Tidies`. Nothing is registered: whoever has the methods
+    and attributes of one offers it.
     """
 
     @property
@@ -312,6 +313,16 @@ class PlaysPaths(Protocol):
         """Whether the others of this episode are moved along recorded ways."""
 
 
+class CountsSetUp(Protocol):
+    """A simulator that simulates before the first step, as for traffic to warm up, and says how much."""
+
+    setup_steps: int
+    """How many steps the last `Simulator.reset` has simulated, whether or not it set up an episode in the end.
+
+    Whoever goes on from such a place another time sets it to 0: those steps have been counted.
+    """
+
+
 class Tidies(Protocol):
     """A simulator whose episodes change something beyond itself, such as settings in classes of a library."""
 
@@ -381,6 +392,7 @@ FACULTIES: tuple[type, ...] = (
     LeavesOut,
     PlaysPaths,
     StepsAtOnce,
+    CountsSetUp,
     Tidies,
 )
 """Everything that a simulator may offer."""

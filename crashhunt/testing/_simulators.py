@@ -14,6 +14,7 @@ from crashhunt.base.faculties import members, offers
 from crashhunt.simulators import (
     FACULTIES,
     BrakesFully,
+    CountsSetUp,
     Disturbs,
     FlattensObservations,
     FullBraking,
@@ -280,6 +281,18 @@ class SimulatorContract:
             for notice in simulator.notices:
                 assert isinstance(notice, str)
                 assert len(notice.splitlines()) == 1
+        simulator.close()
+
+    def test_what_is_simulated_before_the_first_step_is_the_same_again(self, make: Make) -> None:
+        """`CountsSetUp`: a number of steps, after each reset."""
+        simulator = make()
+        simulator.reset(seed=1)
+        if offers(simulator, CountsSetUp):
+            steps = simulator.setup_steps
+            assert type(steps) is int
+            assert steps >= 0
+            self._drive(simulator, 1)
+            assert simulator.setup_steps == steps
         simulator.close()
 
     def test_tidying_changes_no_episode(self, make: Make) -> None:

@@ -164,3 +164,4 @@ class ResultData(TypedDict):
     danger: NotRequired[float | None]
     stress: NotRequired[StressData]
     branches: NotRequired[BranchesData]
+    setup_steps: NotRequired[int | None]

@@ -75,9 +75,10 @@ def check_plain(data: ResultData) -> None:
     for planned in (data.get("disturbances"), spec.get("disturbances")):
         check_disturbances(planned)
     typed_where_there(data, dict.fromkeys(("log_likelihood", "danger"), float | None))
+    typed_where_there(data, {"setup_steps": int | None})
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)
-    if min(data["steps"], spec["number"], spec["seed"], spec["max_steps"]) < 0:
+    if min(data["steps"], data.get("setup_steps") or 0, spec["number"], spec["seed"], spec["max_steps"]) < 0:
         raise ValueError("a number is below 0")
 
 

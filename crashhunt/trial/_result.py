@@ -49,6 +49,8 @@ class TrialResult:
         danger: how near to a crash it came, from 0 (nothing near) to 1 (touched); None where nobody measured it.
         stress: how little it would have taken; None where nobody asked.
         branches: what else might have happened where it came near to a crash; None where nobody asked.
+        setup_steps: how many steps were simulated before the first one, as for traffic to warm up; None where nobody
+            counted. Where trials share a warm-up, it is that of the first of them.
     """
 
     spec: TrialSpec
@@ -71,6 +73,7 @@ class TrialResult:
     danger: float | None = None
     stress: Stress | None = None
     branches: Branches | None = None
+    setup_steps: int | None = None
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -104,6 +107,8 @@ class TrialResult:
             data["stress"] = self.stress.to_json()
         if self.branches is not None:
             data["branches"] = self.branches.to_json()
+        if self.setup_steps is not None:
+            data["setup_steps"] = self.setup_steps
         return data
 
     @classmethod
@@ -133,12 +138,18 @@ class TrialResult:
             danger=data.get("danger"),
             stress=Stress.from_json(stress) if stress else None,
             branches=Branches.from_json(branches) if branches else None,
+            setup_steps=data.get("setup_steps"),
         )
 
     @property
     def steps_begun(self) -> int:
         """How many steps were begun: one more than were completed, where something failed in the next."""
         return self.steps + (self.failure is not None)
+
+    @property
+    def other_steps(self) -> int:
+        """How many steps were simulated for it beside its own: before the first one, and by copies of it."""
+        return (self.setup_steps or 0) + sum(one.steps for one in (self.stress, self.branches) if one is not None)
 
     @property
     def nearness(self) -> tuple[float, float]:

@@ -27,6 +27,8 @@ def test_a_difference_is_told_with_the_first_step_and_field(toy):
         assert found["step"] <= 3
         assert (found["agent"], found["field"]) == ("ego", "action[target_speed]")
         assert found["recorded"] < found["replayed"]
+    others = done.json["steps_total"] - 6 * 20  # of runs that ended otherwise, which are as long
+    assert others == 20 * len(audit["differences"])
     first = audit["differences"][0]
     line = f"trial {first['trial']} is another one in a fresh process: at step {first['step']}, action[target_speed]"
     assert line in done.err

@@ -142,6 +142,12 @@ def test_a_crash_that_does_not_come_again_is_called_flaky(toy):
     report = toy.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:SlowsDown", *TOY, "--json").json
     (found,) = report["crashes"]
     assert found["confirmed"] is False
+    again = toy.crashhunt("replay", "h", "--json", expect=1).json["steps_replayed"]
+    assert report["steps_total"] == found["step"] + again  # what was simulated to confirm it is in vain
+    assert (
+        toy.crashhunt("run", "h", "1", "1", "100", "--agent", "faulty:SlowsDown", *TOY, "--json").json["steps_total"]
+        == report["steps_total"]
+    )  # the same command, which finds it there
     crash = crash_of(toy.folder / "h")
     assert crash["divergence"]["step"] == 1
     assert crash["divergence"]["field"] == "action[target_speed]"

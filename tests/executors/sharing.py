@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import random
@@ -14,6 +15,7 @@ import numpy as np
 
 from crashhunt.base import forks
 from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors._remains import died
 from crashhunt.executors._warm import WarmCopies
 from crashhunt.executors._worker import Worker
 from crashhunt.recording import Recording, read_black_box
@@ -57,6 +59,7 @@ class Draws(ToySimulator):
     def reset(self, **asked):
         random.random()
         np.random.random()  # noqa: NPY002
+        self.setup_steps = 40
         return super().reset(**asked)
 
 
@@ -117,20 +120,21 @@ def turns(stage):
 
 
 def deaths(stage):
-    """How a worker ends whose trial dies in a copy, and what it has written by then."""
+    """How a worker ends whose trial dies, in a copy or not, and what it has written by then."""
     found = {}
-    for what in ("segfaults", "exits"):
-        place = stage / what
+    for what, most in itertools.product(("segfaults", "exits"), (2, 0)):
+        place = stage / f"{what}-{most}"
         place.mkdir()
         pid = os.fork()
         if pid == 0:
-            worker = worker_of(place, "toy", 2)
+            worker = worker_of(place, "toy", most)
             worker.run(spec(0, 1))
             worker.run(spec(1, 1, what))
             os._exit(0)
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        steps = Recording(read_black_box(scratch_of(place, 1) / "blackbox.bin")).steps
-        found[what] = [code, steps, (scratch_of(place, 1) / "stack.txt").read_text().count("Fatal Python error")]
+        result = died(spec(1, 1), place, code)
+        stack = (scratch_of(place, 1) / "stack.txt").read_text()
+        found[place.name] = [code, result.steps, result.setup_steps, stack.count("Fatal Python error")]
     return found
 
 

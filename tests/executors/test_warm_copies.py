@@ -39,6 +39,11 @@ def test_a_shared_warm_up_changes_nothing(ask, scenario):
     assert [one.pop("shared") for one in shared] == [False, False, True, True, True, True, True, *others]
     assert not any(one.pop("shared") for one in alone)
     assert len({one["digest"] for one in alone}) >= 4
+    whole = alone[0]["setup_steps"]
+    assert whole == (201 if scenario == "loop" else 40)
+    assert [one.pop("setup_steps") for one in alone] == [whole] * 8
+    paid = [True, True, *[False] * 5, scenario != "loop"]  # a warm-up that is shared is simulated once
+    assert [one.pop("setup_steps") for one in shared] == [whole * one for one in paid]
     assert shared == alone
     assert found["log"] == "here\n"
     assert found["kept"] == alone[5]["digest"]
@@ -53,7 +58,11 @@ def test_of_more_traffics_than_copies_some_are_kept(ask):
 
 
 def test_a_worker_ends_as_the_copy_did_that_ran_its_trial(ask):
-    assert ask("deaths") == {"segfaults": [-11, 4, 1], "exits": [7, 4, 0]}
+    killed, left = [-11, 4, 40, 1], [7, 4, 40, 0]
+    copied = [[code, steps, None, fatal] for code, steps, _, fatal in (killed, left)]  # the warm-up is another's
+    assert list(ask("deaths").items()) == [
+        ("segfaults-2", copied[0]), ("segfaults-0", killed), ("exits-2", copied[1]), ("exits-0", left),
+    ]  # fmt: skip
 
 
 def test_where_copies_are_lost_or_cannot_be_made_trials_are_run_without(ask):

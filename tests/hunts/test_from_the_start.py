@@ -19,7 +19,7 @@ FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
 
 def runs(tmp_path, stops, run):
     (tmp_path / "probes" / "000001-collision").mkdir(parents=True)
-    return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], parallel=2, run=run)
+    return SimpleNamespace(place=SimpleNamespace(path=tmp_path), stops=stops, notes=[], failed=[], parallel=2, run=run)
 
 
 def test_whoever_stops_keeps_what_there_was(tmp_path):
@@ -46,7 +46,9 @@ def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
         for spec in specs:
             yield SimpleNamespace(result=SimpleNamespace(spec=spec, outcome=outcome, steps=step))
 
-    assert FromTheStart(runs(tmp_path, [], another), None).crashes([FOUND], "probes") == ()
+    again = runs(tmp_path, [], another)
+    assert FromTheStart(again, None).crashes([FOUND], "probes") == ()
+    assert [result.steps for result in again.failed] == [step]
 
 
 class Copies:

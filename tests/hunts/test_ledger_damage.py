@@ -8,6 +8,7 @@ import sqlite3
 from contextlib import closing
 
 import pytest
+from columns import FEWER_COLUMNS
 
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Ledger
@@ -91,9 +92,10 @@ def change(path, *statements):
         "UPDATE trials SET result = replace(result, '6.5', '7.5') WHERE number = 5",
         "UPDATE trials SET digest = 1 WHERE number = 5",
         "UPDATE trials SET danger = 0.25 WHERE number = 5",
+        "UPDATE trials SET other_steps = 30 WHERE number = 5",
         "DELETE FROM trials WHERE number = 5",
         "UPDATE trials SET number = 500 WHERE number = 5",
-        "INSERT INTO trials SELECT 99, seed, outcome, steps, 1, 1, 1, 1, 1, '', result, digest, 0 FROM trials LIMIT 1",
+        "INSERT INTO trials SELECT 99, seed, outcome, steps, 1, 1, 1, 1, 1, '', result, 0, 0, 0 FROM trials LIMIT 1",
     ],
 )
 def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
@@ -101,7 +103,9 @@ def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
     change(copy, statement)
     found = answers(copy)
     assert found["trials"] is None
-    elsewhere = any(f"{name} =" in statement for name in ("result", "digest", "danger"))  # the table has none of them
+    elsewhere = any(
+        f"{name} =" in statement for name in ("result", "digest", "danger", "other_steps")
+    )  # the table has none of them
     assert found["table"] is None or elsewhere
     assert found["table"] in (None, right["table"])
     for name in ("results", "crashes", "outcomes", "steps", "one"):
@@ -114,7 +118,7 @@ def test_no_trial_that_was_changed_is_given_out(whole, copy, statement):
 @pytest.mark.parametrize(
     ("statement", "says"),
     [
-        ("ALTER TABLE trials DROP COLUMN digest", "it is not as version 4 is: digest of the table trials"),
+        ("ALTER TABLE trials DROP COLUMN digest", "it is not as version 5 is: digest of the table trials"),
         ("ALTER TABLE hunt DROP COLUMN digest", "digest of the table hunt"),
         ("DROP TABLE events", "without the table events"),
         ("DROP INDEX trials_by_outcome", "no such index"),
@@ -183,8 +187,7 @@ def as_version_1(path):
         path,
         "DROP TABLE proposals",
         "DROP INDEX trials_with_events",
-        "DROP INDEX trials_by_danger",
-        "ALTER TABLE trials DROP COLUMN danger",
+        *FEWER_COLUMNS,
         "DELETE FROM hunt WHERE key IN ('seal', 'reader')",
         *(f"ALTER TABLE {table} DROP COLUMN digest" for table in ("trials", "replaced", "events", "hunt")),
         "PRAGMA user_version = 1",

@@ -14,7 +14,8 @@ import pytest
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Ledger, Turn
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.hunts._ledger_schema import FIRST
+from crashhunt.trial import Branches, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 # Every version of the tables leaves one here, written by the crashhunt of then: `write` is what was called.
@@ -196,6 +197,38 @@ def test_a_row_that_was_changed_before_a_migration_is_still_known_to_be(tmp_path
         assert ledger.result(2) == result(2, danger=False)
         with pytest.raises(HuntDirectoryError, match="trial 4 is not as it was written"):
             ledger.result(4)
+
+
+def test_of_a_ledger_of_before_the_steps_of_copies_are_counted(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    shutil.copy(Path(__file__).parent / "ledgers" / "version-4.sqlite", path)
+    columns = f"{', '.join(FIRST['trials'])}, danger"
+    with closing(sqlite3.connect(path)) as database, database:  # as trials with probes and branches were
+        database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values))
+        for number, name, found in ((2, "stress", Stress(1.0, steps=30)), (4, "branches", Branches(steps=500))):
+            values = (f"$.{name}", json.dumps(found.to_json()), number)
+            database.execute("UPDATE trials SET result = json_set(result, ?, json(?)) WHERE number = ?", values)
+        database.execute(f"UPDATE trials SET digest = digest_of_row({columns})")
+    with closing(Ledger(path)) as ledger:
+        assert (ledger.trial_steps(), ledger.steps_total()) == (42, 42)
+    for _ in range(2):
+        Ledger(path, writable=True).close()
+        with closing(Ledger(path)) as ledger:
+            assert len(list(ledger.results())) == 9
+            assert (ledger.trial_steps(), ledger.steps_total()) == (42, 572)
+
+
+def test_what_trials_cost_besides_is_summed(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    write(path)
+    with closing(Ledger(path, writable=True)) as ledger:
+        ledger.record(replace(result(3), setup_steps=200, stress=Stress(1.0, steps=30)), snapshot="")
+        ledger.record(replace(result(4), setup_steps=0, branches=Branches(steps=500)), snapshot="")
+        ledger.note(failed_steps=7)
+        assert (ledger.trial_steps(), ledger.steps_total()) == (45, 45 + 200 + 30 + 500 + 7)
+    with closing(Ledger(path)) as ledger:
+        assert ledger.steps_total() == 782
+        assert [ledger.result(number).setup_steps for number in (2, 3, 4)] == [None, 200, 0]
 
 
 def test_what_ranks_trials_is_sealed(tmp_path):

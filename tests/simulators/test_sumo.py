@@ -143,6 +143,26 @@ def test_a_vehicle_that_never_enters_is_invalid(town):
     done = town.crashhunt(*words, expect=3)  # the flow has five
     assert done.json["stopped_because"] == "no_valid_trial"
     assert "'odd.name#1.7' was not on the road" in done.err
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="odd.name#1.7")
+    waited_s = scenario.agents["odd.name#1.7"].depart_s + scenario.insertion_timeout_s
+    assert done.json["steps_total"] == round(4 * waited_s / 0.2)  # none of which is a trial's own
+
+
+@pytest.mark.parametrize("only", [None, []])
+def test_what_is_simulated_before_the_first_step_is_counted(town, tmp_path, only):
+    scenario = load_scenario(town.folder / "town.sumocfg", ego="odd.name#1.3")
+    asked = {"options": {"arguments": {"scale": 1.0}, **({} if only is None else {"only": only})}}
+    with closing(SumoSimulator(replace(scenario, warmup_s=11.0), tmp_path)) as simulator:
+        for _ in range(2):  # it begins at 0 s each time
+            simulator.reset(seed=4, **asked)
+            assert simulator.setup_steps == round(simulator.scene().time_s / 0.2) > 11 / 0.2
+        simulator.step({agent: simulator.actions[agent].encode((8.0, 0)) for agent in simulator.agents})
+        assert simulator.setup_steps == round(simulator.scene().time_s / 0.2) - 1
+        (town.folder / "r.rou.xml").write_text("<routes")
+    with closing(SumoSimulator(scenario, tmp_path)) as simulator:
+        with pytest.raises(InvalidEpisodeError):
+            simulator.reset(seed=4, **asked)
+        assert simulator.setup_steps == 0
 
 
 @pytest.mark.parametrize("damage", ["</net", "<net><edge"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import libsumo
@@ -10,13 +11,14 @@ from libsumo import _libsumo as sumo
 from crashhunt.base.errors import InvalidEpisodeError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from crashhunt.scenario import AgentSetup, Scenario
+    from crashhunt.simulators import CountsSetUp
     from crashhunt.simulators.sumo._taking_part import TakingPart
     from crashhunt.trial import Value
 
-__all__ = ["enter", "replaced_by"]
+__all__ = ["enter", "replaced_by", "steps_counted"]
 
 
 def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]) -> dict[str, str]:
@@ -37,6 +39,17 @@ def replaced_by(agents: Mapping[str, AgentSetup], arguments: Mapping[str, Value]
             )
         found[vehicle] = agent
     return found
+
+
+@contextmanager
+def steps_counted(simulator: CountsSetUp, step_length_s: float) -> Iterator[None]:
+    """Count the steps that are simulated meanwhile, whatever becomes of them."""
+    began = libsumo.simulation.getTime()
+    try:
+        yield
+    finally:
+        with suppress(libsumo.TraCIException, libsumo.FatalTraCIError):  # of a simulation that has ended
+            simulator.setup_steps = round((libsumo.simulation.getTime() - began) / step_length_s)
 
 
 def enter(

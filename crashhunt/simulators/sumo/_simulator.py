@@ -23,7 +23,7 @@ from crashhunt.simulators._protocol import FullBraking
 from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._driving import Driving
-from crashhunt.simulators.sumo._entering import enter, replaced_by
+from crashhunt.simulators.sumo._entering import enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._holding import held_back
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
@@ -83,9 +83,8 @@ class SumoSimulator:
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
-        core = None
-        if scenario.table(SumoSetup).native is not False:
-            core = core_for(libsumo.__version__, sumo.__file__)
+        native = scenario.table(SumoSetup).native is not False
+        core = core_for(libsumo.__version__, sumo.__file__) if native else None
         self._sight = Sight(
             tuple(scenario.agents),
             scenario.step_length_s,
@@ -98,6 +97,7 @@ class SumoSimulator:
         self._program = ["sumo"]
         self._events = SumoEvents(scenario.step_length_s, scenario.events)
         self._taking_part: TakingPart | None = None
+        self.setup_steps = 0
         self.scripted = False
         self._setups = scenario.agents
         self._look_with: Sight | ScriptedSight = self._sight
@@ -136,6 +136,7 @@ class SumoSimulator:
         self._stop_going_ahead()
         options = options or {}
         arguments = options.get("arguments", {})
+        self.setup_steps = 0
         self._begin(options.get("only"), options.get("script"), arguments)
         command = self._files.arguments(seed, arguments)
         try:
@@ -145,7 +146,8 @@ class SumoSimulator:
                 libsumo.start([*self._program, *command])
                 _keep_xml_ready()
             _current = weakref.ref(self)
-            enter(self._scenario, self._setups, self._replaced, self._taking_part)
+            with steps_counted(self, self.step_length_s):
+                enter(self._scenario, self._setups, self._replaced, self._taking_part)
             if script := options.get("script"):
                 place_agents(script)
         except _TRACI_ERRORS as error:
