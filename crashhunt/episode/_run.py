@@ -92,8 +92,8 @@ def run_episode(
             one.close()
     for one in asking:
         result = one.result(result)
-    setup: dict[str, Any] = {"setup_s": episode.setup_s, "setup_steps": episode.setup_steps}
-    return replace(result, **setup, wall_s=time.monotonic() - began)
+    wall_s = time.monotonic() - began
+    return replace(result, setup_s=episode.setup_s, setup_steps=episode.setup_steps, wall_s=wall_s)
 
 
 def seed_everything(seed: int) -> None:
