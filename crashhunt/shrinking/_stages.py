@@ -189,8 +189,8 @@ class Search:
             if self.best is not best and not self._is_smaller(best):
                 self.best = best
                 del self.smaller[before:]
-        if self.best.script is not None:
-            self._until_nothing_helps(lambda: None)
+        if self.best.script is not None:  # where it begins later, or with plainer arguments, fewer may do
+            self._until_nothing_helps(self._fewer_moved)
 
     def _is_smaller(self, than: TrialSpec) -> bool:
         """Whether the best has fewer actors, agents or steps than one in which the others drive."""
@@ -201,6 +201,19 @@ class Search:
         if agents < len(than.arguments) or agents + others < len(than.arguments) + len(than.only):
             return True
         return not than.only and self.steps_cut > 0
+
+    def _fewer_moved(self) -> None:
+        """Leave out whom it does not take any more."""
+        best, script = self.best, self.best.script
+        assert script is not None
+        hit = self._rerun.bundle.result.collision
+        if len(script.agents) == len(script.names) == 1 and hit is not None and hit.other:
+            return  # an agent that is alone drives into nobody
+
+        def tried(some: Sequence[tuple[str, ...]]) -> int | None:
+            return self._try([replace(best, script=script.only(one)) for one in some])
+
+        fewest(script.names, tried)
 
     def _fewest_moved(self, scripting: Scripting) -> Part | None:
         """Leave out all of the others that it does not take; None where it does not come again in this form."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
@@ -83,14 +83,24 @@ RERUN = SimpleNamespace(
 )
 
 
+@dataclass(frozen=True)
+class Script:
+    """Who is moved, and who drives."""
+
+    names: tuple[str, ...]
+    agents: tuple[str, ...]
+
+    def only(self, names):
+        return replace(self, names=tuple(name for name in self.names if name in names))
+
+
 class Scripting:
     """Parts of a crash of 100 steps."""
 
     whole, steps = Part(("ego",), OTHERS), 100
 
     def spec(self, part):
-        script = SimpleNamespace(names=part.others, agents=part.agents)
-        return TrialSpec(0, 1, {"ego": {}}, {}, 110, script=script)
+        return TrialSpec(0, 1, {"ego": {}}, {}, 110, script=Script(part.others, part.agents))
 
     def begins(self, agents):
         return []
@@ -176,6 +186,26 @@ def test_fewer_are_enough_where_it_begins_later(monkeypatch, pair):
     search._scripting = FromLaterOn()
     assert search.run(lambda: False)[0] == "done"
     assert (set(search.best.script.names), search.best.max_steps) == ({*pair}, 60)
+
+
+class FewRuns(LaterRuns):
+    """From the start on it takes two others, and from step 60 on one of them."""
+
+    def first(self, specs, *, again=False):
+        for place, spec in enumerate(specs):
+            needed = {*(self.pair[:1] if spec.max_steps == 60 else self.pair)}
+            if spec.only is None if spec.script is None else needed <= {*spec.script.names} and spec.max_steps != 90:
+                return place
+        return None
+
+
+def test_whom_it_takes_no_more_where_it_begins_later_is_left_out_of_a_few_as_well(monkeypatch):
+    monkeypatch.setattr(_stages, "_nearest", lambda recording, agent: list(OTHERS))
+    monkeypatch.setattr(_stages, "can_be_scripted", lambda rerun: False)
+    search = _stages.Search(RERUN, FewRuns("gh"), "either")
+    search._scripting = FromLaterOn()
+    assert search.run(lambda: False)[0] == "done"
+    assert (search.best.script.names, search.best.max_steps) == (("g",), 60)
 
 
 @pytest.mark.parametrize(("escape", "begins"), [(None, [39, 29, 19, 9]), (25, [25, 19, 9]), (0, [])])
