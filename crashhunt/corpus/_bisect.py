@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.git import environment_of_git
 from crashhunt.corpus._store import add_case
 from crashhunt.plans import read_settings
 
@@ -164,14 +165,15 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
 def _environment(folder: Path, tree: Path) -> dict[str, str]:
     places = dict.fromkeys(map(str, (folder, tree, tree / "src")))
     paths = [*places, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**environment_of_git(), "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> str:
     """Return what git says; with ``skipped``, also where it ends with an error."""
     command: Sequence[str] = ["git", "-C", str(folder), *words]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"})
+        environment = {**environment_of_git(), "LC_ALL": "C"}
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     except OSError as error:
         raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
     if done.returncode and not skipped:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import SnapshotError
+from crashhunt.base.git import environment_of_git
 from crashhunt.base.plugins import import_module, locate
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def git(folder: Path, *arguments: str) -> bytes | None:
     """Return what git prints, without any change to its index; None where there is no git or no repository."""
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, check=False, timeout=60)
+        done = subprocess.run(command, capture_output=True, check=False, timeout=60, env=environment_of_git())
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout if done.returncode == 0 else None
