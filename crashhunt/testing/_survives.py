@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.api import run
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.names import one_of
 from crashhunt.base.text import visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
@@ -18,7 +20,7 @@ from crashhunt.shrinking import shrink
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import Driver, Spec
@@ -72,13 +74,14 @@ def assert_survives(
         seed: of all of them.
         arguments: of the agent, as `crashhunt.run` takes them: values or what to try.
         scenario_arguments: the same of the scenario.
-        example: the one trial to run.
+        example: the one trial to run; what it says of arguments goes before ``arguments``.
         budget: how many further trials may be run to make a crash smaller; 0 for none.
         parallel: trials at a time; 0 for one per core.
         directory: where to keep the hunt, such as pytest's ``tmp_path``; without, it is removed.
 
     Raises:
         AssertionError: it crashes.
+        UsageError: the example has something that no example has.
         CrashhuntError: nothing could be run.
     """
     __tracebackhide__ = True  # of pytest
@@ -87,7 +90,7 @@ def assert_survives(
     )
     call = f"{_word(agent)}, {str(scenario)!r}, max_steps={max_steps}"
     if example is not None:
-        result = _run_one(options, example, max_steps)
+        result = _run_one(_asking(options, example), example, max_steps)
         if result.outcome not in (Outcome.SURVIVED, Outcome.FINISHED):
             raise AssertionError(_told(result, call, ""))
         return
@@ -114,6 +117,35 @@ def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
         return shrink(bundle, budget=budget, parallel=parallel, form="traffic").small or bundle
     except CrashhuntError:  # it is told as it is
         return bundle
+
+
+def _asking(options: HuntOptions, example: Example) -> HuntOptions:
+    """Return the options of a hunt that has just the values of an example: an agent may need some, or not know one.
+
+    Raises:
+        UsageError: the example has another key, or arguments that are nobody's.
+    """
+    known = Example.__annotations__
+    for key in example:
+        if key not in known:
+            raise UsageError(f"example: there is no {key!r}", fix=one_of(key, known, give="it has"))
+    arguments: dict[str, Value] = {}
+    for agent, given in example.get("arguments", {}).items():
+        if not isinstance(given, Mapping):
+            raise UsageError(
+                f"example: the arguments of {agent!r} are {given!r}",
+                fix="give those of each agent by its id: {'ego': {'speed': 20.0}}",
+            )
+        arguments |= {f"{agent}.{name}": value for name, value in given.items()}
+    return replace(
+        options,
+        arguments={**(options.arguments or {}), **_one_each(arguments)},
+        scenario_arguments={**(options.scenario_arguments or {}), **_one_each(example.get("scenario_arguments", {}))},
+    )
+
+
+def _one_each(values: Mapping[str, Value]) -> dict[str, Spec]:
+    return {name: value for name, value in values.items() if not (isinstance(value, str) and "|" in value)}
 
 
 def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialResult:

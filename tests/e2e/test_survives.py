@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from crashhunt.errors import CrashhuntError
+from crashhunt.errors import ArgumentError, CrashhuntError, UsageError
 from crashhunt.testing import assert_survives
 
 
@@ -55,3 +55,33 @@ def test_an_example_may_have_disturbances(toy, monkeypatch):
     with pytest.raises(AssertionError) as again:
         exec(call, {"assert_survives": assert_survives})
     assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
+
+
+NEEDS = """
+class Needs:
+    def __init__(self, speed: float):
+        self.speed = speed
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return (self.speed, 0)
+"""
+
+
+def test_an_agent_that_needs_arguments_has_those_of_the_example_and_no_others(toy, monkeypatch):
+    monkeypatch.chdir(toy.folder)
+    monkeypatch.syspath_prepend(toy.folder)
+    (toy.folder / "needs_speed.py").write_text(NEEDS, encoding="utf-8")
+    example = {"seed": 1, "arguments": {"ego": {"speed": 21.0}}, "scenario_arguments": {"gap_m": 20.0}}
+    with pytest.raises(AssertionError, match="ego drove into leader at step"):
+        assert_survives("needs_speed:Needs", "toy", max_steps=80, example=example)
+    for wrong, error, said in (
+        ({"seeds": 1}, UsageError, "did you mean 'seed'"),
+        ({"arguments": {"speed": 21.0}}, UsageError, "of each agent by its id"),
+        ({"arguments": {"eg": {"speed": 21.0}}}, ArgumentError, "takes no argument 'eg.speed'"),
+        ({"scenario_arguments": {"gap": 20.0}}, ArgumentError, "no argument 'gap'; did you mean 'gap_m'"),
+    ):
+        with pytest.raises(error, match=said):
+            assert_survives("needs_speed:Needs", "toy", example={**example, **wrong})
