@@ -16,6 +16,7 @@ __all__ = ["CannotError", "Search", "Tried"]
 
 _FOR_BRAKING = 0.6  # of the runs; the rest is for changing lanes
 _STANDS = 0.1  # m/s²
+_TOO_FEW = "no runs were left for changing lanes"
 
 
 class CannotError(Exception):
@@ -86,8 +87,12 @@ class Search:
         if last == self._end - 1:
             return  # nothing can help any longer
         for side, share in (("left", 2), ("right", 1)):
-            if self._left > 0 and not self.why_not:
+            if self.why_not:
+                return
+            if self._left > 0:
                 self._try(side, self._left // share or 1, self._end - 1, first)
+            elif all(tries.last is None for tries in self._tries):  # else it would read as if nothing could help
+                self.why_not = _TOO_FEW
 
     def judgement(self) -> Judgement:
         """Return what has been found so far."""

@@ -31,7 +31,8 @@ def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str,
     sentences = []
     if best is not None:
         sentences = [_until(best, ago)]
-        sentences += [_until(other, ago) for other in judgement.attempts if other is not best and other.last_step]
+        rest = (attempt for attempt in judgement.attempts if attempt is not best and attempt.last_step is not None)
+        sentences += [_until(attempt, ago) for attempt in rest]
     elif judgement.avoidable is False:
         tried = " nor ".join(_BY.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
         sentences = [f"None of {runs} avoided it, from the first step on: neither {tried}."]

@@ -70,6 +70,16 @@ def test_changing_lanes_is_tried_only_where_braking_helps_no_more():
     assert [one.manoeuvre for one in found(Runs({"brake": range(40), "left": range(40)})).attempts] == ["brake"]
 
 
+@pytest.mark.parametrize(("most", "verdict"), [(1, "unknown"), (2, "unknown"), (3, "invalid")])
+def test_nobody_is_said_to_have_been_put_there_where_no_runs_were_left_to_change_lanes(most, verdict):
+    helpless = {"brake": (), "left": (), "right": ()}
+    judgement = found(Runs(helpless), end=1, start=0, most=most)
+    assert judgement.verdict == verdict
+    assert judgement.avoidable is (False if verdict == "invalid" else None)
+    assert bool(judgement.why_not) is (verdict == "unknown")
+    assert not found(Runs({**helpless, "brake": [0]}), end=2, start=0, most=1).why_not
+
+
 @pytest.mark.parametrize("most", [1, 2, 5, 9])
 def test_no_more_is_said_than_the_runs_have_shown(most):
     judgement = found(Runs({"brake": range(21), "left": (), "right": ()}), start=39, most=most)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.crashes import Factor, LeftOut, Why
+from crashhunt.crashes import Attempt, Factor, Judgement, LeftOut, Why
+from crashhunt.report._judgement import about_judgement
 from crashhunt.report._why import about_why
 
 
@@ -13,3 +14,11 @@ def test_a_default_is_told_where_other_values_say_nothing(drawn):
     default = Factor("argument", "ego.speed", "default", was=9.0, runs=(LeftOut(5.0, "none"),))
     others = Factor("argument", "ego.speed", "drawn", was=9.0, runs=tuple(LeftOut(6.0, one) for one in drawn))
     assert about_why(Why((default, others), 100), str)[1:] == ["- ego.speed at its default 5: no crash."]
+
+
+def test_that_braking_helped_from_the_first_step_on_is_told_beside_what_helped_longer():
+    brake, left = Attempt("brake", 3, {0: "avoided", 1: "hit", 2: "hit"}), Attempt("left", 3, {2: "avoided"})
+    told = about_judgement(Judgement((brake, left)), lambda step: f"step {step}", "ego", "other")
+    assert [sentence.partition(",")[0] for sentence in told[:2]] == [
+        "It could be avoided until step 2", "It could be avoided until step 0",
+    ]  # fmt: skip
