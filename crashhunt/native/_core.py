@@ -26,7 +26,7 @@ __all__ = [
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 7
+_INTERFACE = 8
 """Raised whenever a function of the core changes; a core of another one is not used. scripts/build_core.py reads it."""
 _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""

@@ -607,8 +607,8 @@ bool find_nearest(const Scene &scene, size_t row, double below, size_t wanted) {
     for (size_t other = 0; other < scene.size; other++) {
         const double dx = scene.x(other) - x, dy = scene.y(other) - y;
         const double squared = dx * dx + dy * dy;
-        if (std::isnan(squared)) {
-            return false; // Python sorts these somehow
+        if (!std::isfinite(squared)) {
+            return false; // Python sorts what is not a number somehow, and what is too far away it cannot pack
         }
         if (other != row && squared < below) {
             nearest.emplace_back(squared, other);
@@ -629,6 +629,14 @@ PyObject *observed(const Scene &present, size_t row, size_t shown, double distan
         return nullptr;
     }
     const double heading = present.headings[row], speed = present.speeds[row];
+    const size_t seen = std::min(shown, nearest.size());
+    bool whole = std::isfinite(heading); // else Python's sine raises
+    for (size_t number = 0; number < seen; number++) {
+        whole = whole && std::isfinite(present.headings[nearest[number].second]);
+    }
+    if (!whole) {
+        return nullptr;
+    }
     const double own_cos = cos(heading), own_sin = sin(heading), half = lengths[row] / 2;
     const double center_x = present.x(row) - half * own_cos, center_y = present.y(row) - half * own_sin;
     const double own_vx = speed * own_cos, own_vy = speed * own_sin;
@@ -647,7 +655,6 @@ PyObject *observed(const Scene &present, size_t row, size_t shown, double distan
         }
     };
     put({1.0, distance, from_left, speed, lateral_speed, own_cos, -own_sin});
-    const size_t seen = std::min(shown, nearest.size());
     for (size_t number = 0; number < seen; number++) {
         const size_t other = nearest[number].second;
         const double c = cos(present.headings[other]), s = sin(present.headings[other]);
@@ -753,7 +760,7 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
     const double further = 2 * (1.5 * (fastest(present) + hardest * step_s) * step_s + 1.0); // as reachable_m has it
     const double most = 2 * *std::max_element(reaches.begin(), reaches.end()) + further;
     found.clear();
-    if (!find_nearest(present, row, most * most, present.size)) {
+    if (!std::isfinite(most * most) || !find_nearest(present, row, most * most, present.size)) {
         return false;
     }
     if (nearest.empty()) {
@@ -771,6 +778,9 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
         const Moved theirs = moved(previous, present, other, earlier);
         const double rx = mine.x - theirs.x, ry = mine.y - theirs.y;
         const double margin = sqrt(rx * rx + ry * ry) + mine.aside + theirs.aside;
+        if (!std::isfinite(margin)) {
+            return false; // such as where a heading is infinite, of which Python's cosine raises
+        }
         if (!(near.first < (reach + margin) * (reach + margin))) {
             continue;
         }
@@ -849,6 +859,7 @@ PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
 // ------------------------------------------------------------------------------------------------ the closest approach
 
 const double SLACK = 1e-6; // m, and relative: what NumPy rounds otherwise is far less
+const double MOST_KNOWN = 1e9; // of numbers beyond, what is rounded otherwise may be more
 
 // Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors).
 struct Part {
@@ -899,7 +910,17 @@ struct Part {
         held = true;
         const size_t length = static_cast<size_t>(buffer.len);
         scenes = length / (32 * actors);
-        return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors;
+        return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors &&
+               known();
+    }
+    // Whether all of it are numbers as there are in traffic.
+    bool known() const {
+        const double *values = static_cast<const double *>(buffer.buf);
+        size_t odd = 0;
+        for (size_t place = 0; place < scenes * 4 * actors; place++) {
+            odd += !(fabs(values[place]) <= MOST_KNOWN);
+        }
+        return !odd;
     }
     const double *scene(size_t number) const { return static_cast<const double *>(buffer.buf) + number * 4 * actors; }
 };

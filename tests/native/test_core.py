@@ -27,7 +27,7 @@ from crashhunt.world._tracks import Reach, ways
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
 
-coordinates = some.floats(-60, 60) | some.sampled_from([0.0, -0.0, 5.0, 1e-9, 1e12])
+coordinates = some.floats(-60, 60) | some.sampled_from([0.0, -0.0, 5.0, 1e-9, 9e8])
 headings = some.floats(-7, 7) | some.sampled_from([0.0, math.pi / 2, math.pi, 1e6])
 sizes = some.floats(0.1, 20)
 vehicles = some.tuples(coordinates, coordinates, headings, some.floats(-5, 60), sizes, sizes)
@@ -290,6 +290,34 @@ def test_the_closest_of_a_crowd_is_the_same_where_somebody_is_wider_than_long():
     theirs.measure([joined_frame(roster, columns, [None])])
     assert ours.closest == theirs.closest
     assert ours.closest.gap_m == 0.0
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -1e12, 1e155])
+@pytest.mark.parametrize("place", ["x", "heading", "speed"])
+def test_of_numbers_that_no_traffic_has_comes_what_comes_without(odd, place):
+    other = {"x": 5.5, "heading": 0.0, "speed": 3.0}
+    roster = Roster(tuple(Actor(name, "passenger", 5.0, 2.0) for name in "ab"))
+    before, now = (
+        Scene(time_s, roster, [(0.0, 0.0), (x, 0.0)], [0.0, heading], [9.0, speed], swept=True)
+        for time_s, (x, heading, speed) in ((0.0, other.values()), (0.1, (other | {place: odd}).values()))
+    )
+    part = (now.frame.columns, 0, roster.lengths, roster.widths, [0, 1])
+    assert core.may_be_near([part], 50.0, 10.0, math.inf, math.inf, 0.0, True) is None
+    assert core.tracks([part], 1, 20.0, 0.0, 0.0, 0.0) is None
+    now.follow(before)
+    kinematics = Kinematics(ObservationSetup(vehicles=3))
+    where = {"distance": 1.0, "from_left": 2.0, "lateral_speed": 0.0, "lanes": 2}
+    for ask in (lambda: _within_reach(now, before, 0), lambda: kinematics.observe(now, 0, **where).tobytes()):
+        ours, theirs = both_ways(now, lambda ask=ask: said(ask))
+        assert ours == theirs
+
+
+def said(ask):
+    """What comes of a call, such as an error."""
+    try:
+        return ask()
+    except (OverflowError, ValueError) as error:
+        return repr(error)
 
 
 @settings(deadline=None, max_examples=60)
