@@ -191,6 +191,14 @@ def test_where_there_is_no_lane_nobody_cuts_in(drive):
     assert watch.told == [planned(2, "cut_in", "right ahead", 0.0, 1.0)]
 
 
+@pytest.mark.parametrize("who", ["ahead", "behind"])
+def test_who_is_in_the_lane_of_the_agent_does_not_cut_in(drive, who):
+    episode, watch = drive(planned(2, "cut_in", who, 0.0, 1.0))
+    advance(episode, 6)
+    assert watch.told == [planned(2, "cut_in", who, 0.0, 1.0)]
+    assert {libsumo.vehicle.getLaneID(name) for name in ("lead", "follow")} == {"west_0"}
+
+
 def test_who_leaves_while_it_errs_is_let_go(drive):
     short = AHEAD.replace('departPos="60"', 'departPos="120"') + '<vehicle id="last" type="car" route="up" depart="9"/>'
     episode, watch = drive(planned(2, "dawdle", strong=0.2, long=60.0), traffic=short, agent=Steady(6.0))

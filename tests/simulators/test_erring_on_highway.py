@@ -147,6 +147,9 @@ def test_somebody_cuts_in_and_nobody_into_a_side(begin):
     follow(episode, other, 6)
     assert idle.told[0].vehicle
     assert other.lane_index[2] == 0
+    episode, idle = begin(planned(2, "cut_in", "ahead", 2.0, 3.0))  # who is there already
+    follow(episode, place(episode, 1, 15.0), 3)
+    assert [one.vehicle for one in idle.told] == [""]
 
 
 @pytest.mark.parametrize("observation", [None, ObservationSetup(vehicles=3, features=("presence", "x", "y"))])

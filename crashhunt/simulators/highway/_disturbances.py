@@ -113,9 +113,9 @@ class HighwayDisturbances:
                 return None
             errs = _MergesLate(vehicle, self._let_go, min(strong, left))
         else:
-            same_road = vehicle.lane_index[:2] == agent.lane_index[:2]
-            if not same_road or vehicle.lane_index != vehicle.target_lane_index:
-                return None  # as it is on another road, or changes lanes already
+            beside = vehicle.lane_index[:2] == agent.lane_index[:2] and vehicle.lane_index != agent.lane_index
+            if not beside or vehicle.lane_index != vehicle.target_lane_index:
+                return None  # as it is on another road, in the lane of the agent, or changes lanes already
             errs = _CutsIn(vehicle, self._let_go, hardest, agent.lane_index)
         self._erring.append(errs)
         return errs

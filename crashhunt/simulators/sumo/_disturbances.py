@@ -84,6 +84,8 @@ class SumoDisturbances:
             if disturbance.what == "speed":
                 return _Speeds(vehicle, strong)
             if disturbance.what == "cut_in":
+                if disturbance.who in ("ahead", "behind"):
+                    return None  # as it is in the lane of the agent already
                 # Lanes are counted from the side that traffic keeps to.
                 side = 1 if disturbance.who.startswith("left") == self._driving.left_hand else -1
                 return _cut_in(vehicle, side, disturbance.how_long, min(strong, decel), self._dt)
