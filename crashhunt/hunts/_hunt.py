@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from contextlib import suppress
@@ -32,7 +31,7 @@ from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
 from crashhunt.hunts._surplus import give_up_surplus
 from crashhunt.hunts._workers import settings_of_workers
-from crashhunt.plans import core_of, disturber, sampler_of
+from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -288,7 +287,7 @@ class Hunt:
 
     def _lag(self, before: Facts) -> int:
         """By how many trials a sampler that learns is told late."""
-        under_way = _under_way(self._parallel_here)
+        under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way
 
     def _listen(
@@ -357,7 +356,7 @@ class Hunt:
     @property
     def _parallel_here(self) -> int:
         """How many trials at a time this machine runs again, whatever else the executor has."""
-        return self.settings.run.parallel or len(os.sched_getaffinity(0))
+        return parallel_here(self.settings.run.executor, self.settings.run.parallel)
 
     def _status(
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None

@@ -1,6 +1,6 @@
 from ._declaration import Given as Given, HuntOption as HuntOption
 from ._duration import seconds_of as seconds_of
-from ._executor import SizesItself as SizesItself, executor_of as executor_of
+from ._executor import SizesItself as SizesItself, executor_of as executor_of, parallel_here as parallel_here
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,

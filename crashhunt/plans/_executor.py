@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from crashhunt.base.errors import UsageError
@@ -11,7 +12,7 @@ from crashhunt.base.plugins import locate, registered
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["SizesItself", "executor_of", "sizes_itself"]
+__all__ = ["SizesItself", "executor_of", "parallel_here", "sizes_itself"]
 
 
 @runtime_checkable
@@ -55,6 +56,17 @@ def sizes_itself(word: str) -> bool:
     """Whether the executor that is meant finds out itself what PARALLEL 0 stands for."""
     factory = locate("executors", _parts(word)[0])
     return isinstance(factory, SizesItself) and factory.sizes_itself
+
+
+def parallel_here(word: str, parallel: int) -> int:
+    """Return how many trials at a time this machine runs beside the executor that is meant, such as confirmations.
+
+    Args:
+        word: as for `executor_of`.
+        parallel: PARALLEL; of many machines, this one has not got as many cores.
+    """
+    cores = len(os.sched_getaffinity(0))
+    return min(parallel or cores, cores) if sizes_itself(word) else parallel or cores
 
 
 def _parts(word: str) -> tuple[str, str | None]:
