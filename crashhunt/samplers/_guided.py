@@ -8,6 +8,9 @@ That danger grows does not yet mean that it leads to a crash, which nobody knows
 signs that it does not: strategies leave the unguided trials behind, and then come no nearer; or they never come near,
 as dangers from 0 to 1 are measured. Then they have little, so that a hunt is never much worse than an even search, and
 a part of that little goes to other peaks of danger than the highest.
+
+After the first crash, what counts is other kinds of crashes: the fewer of them a trial strategies have found than
+chance has, the less they have.
 """
 
 from __future__ import annotations
@@ -50,6 +53,7 @@ _LATELY = 0.1  # what the last one counts in that
 _CREDIT = 3.0  # trials with a payoff of 2, which everybody begins with
 _FORGET = 0.96  # of what a strategy has earned, at each of its trials
 _INHERITED = 0.3  # what a trial counts that has its danger from the seed of its parent
+_KINDS, _TRIALS = 0.5, 25.0  # so many new kinds in so many trials everybody begins with
 _REMEMBERED = 200  # trials from which strategies begin anew after a crash
 _TRIES = 4
 
@@ -71,6 +75,7 @@ class Portfolio:
         self._best = Elites(_REMEMBERED)
         self._known = KnownCrashes(cube.dimensions)
         self._earned = dict.fromkeys((_MODEL, _MUTATION), (2.0 * _CREDIT, _CREDIT))  # sum and count, forgotten slowly
+        self._kinds = {True: (_KINDS, _TRIALS), False: (_KINDS, _TRIALS)}  # new ones and trials: guided, and not
         self._model = Model(cube)
         self._begin()
 
@@ -99,11 +104,14 @@ class Portfolio:
             self._earned[told.origin] = (total * _FORGET + payoff * weight, count * _FORGET + weight)
         elif told.origin != _NICHE:
             insort(self._unguided, told.score)
+        is_guided = told.origin in self._strategies or told.origin == _NICHE
+        kinds, trials = self._kinds[is_guided]
+        self._kinds[is_guided] = (kinds + (told.crashed and self._known.is_new(told)), trials + 1.0)
         if told.crashed:
             if self._known.add(told):
                 self._begin()
             return
-        if self._known.cover(told.point):
+        if self._known.cover(told.point, told.seed):
             return
         self._best.add(told)
         for strategy in self._strategies.values():
@@ -122,7 +130,7 @@ class Portfolio:
                 for _ in range(_TRIES):
                     strategy = self._niches if name == _NICHE else self._strategies[name]
                     draft = strategy.propose(place, rng)
-                    if draft is not None and not self._known.cover(draft.point):
+                    if draft is not None and not self._known.cover(draft.point, draft.seed):
                         return Draft(draft.point, draft.seed, draft.parent, origin=name)
         return Draft(self._even.point(place), origin=_EVEN)
 
@@ -163,6 +171,9 @@ class Portfolio:
         gains = {name: max(total / count - 1.0, 0.05) ** 2 for name, (total, count) in self._earned.items()}
         most = _STUCK if self._is_stuck else _CLIMBING if self._record > _NEAR else _FAR
         whole = most * min(1.0, max(gains.values()))
+        if self._known:
+            (ours, of), (theirs, among) = self._kinds[True], self._kinds[False]
+            whole *= min(1.0, ours * among / (theirs * of)) ** 2
         return {name: max(whole * gain / sum(gains.values()), _PROBING) for name, gain in gains.items()}
 
     @property

@@ -18,6 +18,7 @@ __all__ = ["KnownCrashes"]
 
 _MOST = 32  # crashes around which nothing more is looked for
 _KINDS = 256  # that are remembered
+_SEEDS = 1024  # likewise
 _AROUND = 0.1  # of a crash, times the square root of the dimensions: there, nothing more is looked for
 _JUST_THERE = 0.02  # likewise, for as long as the next crash there may be of another kind
 _AGAIN = 3  # crashes in a row there that are of known kinds: then the next one is new in one of five, at most
@@ -31,6 +32,8 @@ class KnownCrashes:
     all there is, and nothing more is looked for around it. Where it does, a crash keeps next to nothing away, as the
     same arguments may lead to others, until several in a row there were of known kinds.
 
+    The same traffic leads to the same crash again even where arguments are others, so nothing keeps the seed of one.
+
     Args:
         dimensions: of the space.
     """
@@ -40,22 +43,27 @@ class KnownCrashes:
         self._points = np.empty((0, dimensions))
         self._radii = np.empty(0)
         self._kinds: dict[str, None] = {}
+        self._seeds: dict[int, None] = {}
         self._again: list[NDArray[np.float64]] = []  # the latest crashes of known kinds, but where a new one followed
 
     def __bool__(self) -> bool:
         return bool(len(self._radii))
 
-    def cover(self, point: NDArray[np.float64]) -> bool:
-        """Whether a crash is known near to it."""
-        return bool((self._away(point) < self._radii).any())
+    def cover(self, point: NDArray[np.float64], seed: int | None = None) -> bool:
+        """Whether a crash is known near to it, or with that seed."""
+        return seed in self._seeds or bool((self._away(point) < self._radii).any())
+
+    def is_new(self, told: Told) -> bool:
+        """Whether its kind is not known; where nobody knows its kind, whether no crash is known near to it."""
+        return told.kind not in self._kinds if told.kind else not self.cover(told.point)
 
     def outside(self, trials: Sequence[Told]) -> list[Told]:
-        """Return the trials that no crash is known near to."""
+        """Return the trials that no crash is known near to, nor with the same seed."""
         if not trials:
             return []
         points = np.array([told.point for told in trials])
         covered = np.any(self._away(points[:, None]) < self._radii, axis=1).tolist()
-        return [told for told, near in zip(trials, covered, strict=True) if not near]
+        return [told for told, near in zip(trials, covered, strict=True) if not near and told.seed not in self._seeds]
 
     def add(self, told: Told) -> bool:
         """Take in a crash; return whether more or less is known by it than before."""
@@ -63,6 +71,9 @@ class KnownCrashes:
         self._kinds[told.kind] = None
         if len(self._kinds) > _KINDS:
             del self._kinds[next(iter(self._kinds))]
+        self._seeds[told.seed] = None
+        if len(self._seeds) > _SEEDS:
+            del self._seeds[next(iter(self._seeds))]
         away = self._away(told.point)
         around = away < self._radii
         if new:  # so there is more to find here than was thought

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from spaces import ask, spec_of
 
-from crashhunt.samplers import Cube, HuntFacts
+from crashhunt.samplers import Cube, GuidedSampler, HuntFacts
 from crashhunt.samplers._guided import Portfolio
+from crashhunt.samplers._model import Model
+from crashhunt.samplers._niches import Niches
 from crashhunt.samplers._told import Told
-from crashhunt.space import Range
+from crashhunt.space import Choice, Range
+from crashhunt.trial import Outcome, TrialResult
 
 SPACE = {("ego", name): Range(0.0, 1.0) for name in "xy"}
 PLACES = np.random.default_rng(1).random((400, 2))
@@ -73,3 +78,87 @@ def test_no_strategy_goes_where_a_crash_is_known_and_the_even_search_does():
     assert any(even)
     assert others
     assert not any(others)
+
+
+def test_after_a_crash_strategies_have_the_less_the_fewer_new_kinds_they_find_than_chance():
+    made = portfolio_told(*[("random", 0.01 * number) for number in range(10)], *[("model", 0.45)] * 12)
+    made._earned["mutation"] = (0.0, 1.0)  # it has probes
+    assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)
+    made.tell(Told(22, PLACES[22], 22, 1.0, "random", kind="rear end"))
+    made.tell(Told(23, PLACES[23], 23, 1.0, "model", kind="rear end"))  # nothing new
+    few = (0.5 / 38) / (1.5 / 36)  # with half a kind in 25 trials, with which everybody begins
+    assert made._shares() == pytest.approx({"model": 0.35 * few**2, "mutation": 0.02}, rel=0.01)
+    made.tell(Told(24, PLACES[24], 24, 1.0, "niche", kind="side swipe"))
+    made.tell(Told(25, PLACES[25], 25, 1.0, "niche", kind="head-on"))
+    assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)  # no more than without
+    for number in range(26, 41):
+        made.tell(Told(number, PLACES[number], number, 1.0, "halton", kind=f"{number}"))
+    assert made._shares() == {"model": 0.02, "mutation": 0.02}
+
+
+def test_without_manner_and_place_a_crash_is_new_where_none_is_known_near_to_it():
+    made = portfolio_told(*[("random", 0.01 * number) for number in range(60)])
+    for number, place in enumerate((PLACES[7], PLACES[7] + 0.01, np.array([0.99, 0.99]) - PLACES[7]), start=60):
+        made.tell(Told(number, place, number, 1.0, "model"))
+    assert made._kinds == {True: (2.5, 28.0), False: (0.5, 85.0)}
+
+
+def test_nothing_keeps_the_traffic_of_a_crash_that_is_known():
+    made = portfolio_told(*[("random", 0.6 if number == 7 else 0.005 * number) for number in range(40)])
+
+    def seeds(first):
+        return [made.propose(place, np.random.default_rng(place)).seed for place in range(first, first + 60)]
+
+    assert 7 in seeds(40)
+    made.tell(Told(40, np.clip(PLACES[7] + 0.4, 0.0, 1.0), 7, 1.0, "model", parent=7, kind="rear end"))
+    assert not made._known.cover(PLACES[7])
+    made.tell(Told(41, PLACES[7] + 0.05, 7, 0.9, "model", parent=7))  # which was under way
+    assert {7, 41}.isdisjoint(told.number for told in made._strategies["mutation"]._corpus)
+    again = seeds(42)
+    assert any(seed is not None for seed in again)
+    assert 7 not in again
+    made.tell(Told(42, PLACES[9], 100, 0.95, "random"))
+    assert 100 in seeds(43)
+    strategies = [*made._strategies.values()]
+    made.tell(Told(43, np.clip(PLACES[7] + 0.41, 0.0, 1.0), 100, 1.0, "model", parent=42, kind="rear end"))
+    assert [*made._strategies.values()] == strategies  # nothing new, so that they go on
+    assert 100 not in seeds(44)
+
+
+def test_where_all_trials_are_as_dangerous_there_is_no_other_peak():
+    cube = Cube(SPACE)
+    niches = Niches(cube, Model(cube))
+    for number in range(40):
+        niches.tell(Told(number, PLACES[number], number, 0.0))
+    niches.begin()
+    assert niches.propose(40, np.random.default_rng(1)) is None
+
+
+def test_what_is_proposed_before_the_first_crash_is_what_it_was():
+    """The published figures rest on it. All strategies have their turn, and danger leads nowhere in the end."""
+    space = {("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(1.0, 100.0, log=True)}
+    space |= {("", "n"): Range(1, 9, integer=True), ("", "w"): Choice(("a", "b", "c"))}
+    sampler, asked = GuidedSampler(space, hunt=HuntFacts(5)), []
+    for number in range(160):
+        asked.append(ask(sampler, number))
+        spec = spec_of(number, asked[-1])
+        (n, w), (x, y) = (tuple(of.values()) for of in (spec.scenario_arguments, spec.arguments["ego"]))
+        away = 0.4 * abs(x - 0.3) + 0.2 * abs(np.log10(y) - 1.5) + 0.02 * abs(n - 6) + 0.1 * (w != "b")
+        danger = round(0.85 - away - 0.15 * (spec.seed * 7919 % 101) / 101, 3)
+        sampler.tell(TrialResult(spec, Outcome.SURVIVED, danger=danger))
+    words = {"random": "r", "halton": "h", "model": "M", "mutation": "m", "niche": "n"}
+    assert "".join(words[one.origin] for one in asked) == (
+        "rhhhhrhhhhrmMmhrhhhhrhMhhrMhhhrMMmMrhMMMrMMMMrMMMMrMhhhrMMMMrMhMMrMMhmrMMMMrmMMMrMmhhrmMMhrMMhMrhhhhrhhhnrhhhMrh"
+        "hhhrhhhhrhhhMrhhmhrhhhhrhhhhrhhhhrnhhhrhnMhrhhhh"
+    )
+    for number, seed, parent, n, w, x, y in (
+        (13, None, 0, 1, "c", 0.24074255165, 19.5090923431),
+        (39, 30, 30, 7, "b", 0.35665864263, 34.4014150346),
+        (79, 30, 73, 6, "b", 0.61368500209, 25.5226060218),
+        (128, None, 29, 6, "b", 0.41851476557, 35.3121566944),
+        (153, 30, 67, 6, "b", 0.28516669240, 29.2664842603),
+    ):
+        one = asked[number]
+        assert (one.seed, one.parent) == (seed, parent)
+        wanted = {("", "n"): n, ("", "w"): w, ("ego", "x"): pytest.approx(x), ("ego", "y"): pytest.approx(y)}
+        assert dict(one.arguments) == wanted

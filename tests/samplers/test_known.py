@@ -15,8 +15,8 @@ from crashhunt.world import Event
 UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
 
 
-def crash(x, kind=""):
-    return Told(0, np.array([x, x, x, x]), 0, 1.0, kind=kind)
+def crash(x, kind="", seed=0):
+    return Told(0, np.array([x, x, x, x]), seed, 1.0, kind=kind)
 
 
 def at(x):
@@ -31,7 +31,7 @@ def test_without_manner_and_place_arguments_are_all_there_is():
     assert known
     assert known.cover(at(0.59))
     assert not known.cover(at(0.61))
-    trials = [crash(x) for x in (0.61, 0.59, 0.1)]
+    trials = [crash(x, seed=1) for x in (0.61, 0.59, 0.1)]
     assert known.outside(trials) == [trials[0], trials[2]]
     assert known.outside([]) == []
     assert not known.add(crash(0.55))  # nothing new
@@ -92,6 +92,20 @@ def test_the_oldest_of_many_crashes_is_forgotten():
         assert known.add(crash(float(number)))
     assert not known.cover(at(0.0))
     assert all(known.cover(at(float(number))) for number in range(1, 33))
+
+
+def test_the_traffic_of_a_crash_is_known_wherever_its_arguments_are():
+    known = KnownCrashes(4)
+    assert known.add(crash(0.5, "rear end", seed=7))
+    assert known.cover(at(0.9), 7)
+    assert not known.cover(at(0.9), 8)
+    assert not known.cover(at(0.9))
+    trials = [crash(0.9, seed=seed) for seed in (7, 8)]
+    assert known.outside(trials) == [trials[1]]
+    for seed in range(8, 8 + 1024):
+        known.add(crash(0.5, "rear end", seed))
+    assert not known.cover(at(0.9), 7)  # the oldest are forgotten
+    assert known.cover(at(0.9), 8)
 
 
 def kind_of(**evidence):
