@@ -13,7 +13,7 @@ from crashhunt.trial import Stress, in_turn
 if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, CrashSummary
     from crashhunt.hunts._from_the_start import FromTheStart
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import Disturbance, TrialResult
 
 __all__ = ["ProbeData", "ProbeReport", "look_at_probes", "mildest"]
 
@@ -45,6 +45,7 @@ class ProbeReport:
         left_out: how many questions were left out, because copies had taken enough steps.
         run_again: how many of the mildest were run from the start.
         crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+        by: what each of these was probed with, as it took place; others may have been drawn besides.
     """
 
     margins: tuple[float, ...]
@@ -53,6 +54,7 @@ class ProbeReport:
     left_out: int
     run_again: int
     crashes: tuple[Bundle, ...]
+    by: tuple[Disturbance, ...]
 
     def to_json(self) -> ProbeData:
         """Return the shape that ``run --json`` prints."""
@@ -93,14 +95,26 @@ def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
         if stress.disturbance is not None:
             found.append((stress.margin, plain["spec"]["number"]))
     kept = copies.kept.get(layout.PROBES, {})
-    specs = [
-        one
+    results = [
+        result
         for _, number in sorted(found, key=lambda pair: (pair[1] not in kept, pair[0]))[:_MILDEST]
-        if (result := ledger.result(number)) is not None and (one := mildest(result)) is not None
+        if (result := ledger.result(number)) is not None
     ]
+    specs = [one for result in results if (one := mildest(result)) is not None]
     crashes = copies.crashes(specs, layout.PROBES)
+    asked = {result.spec.number: result.stress for result in results}
+    by = tuple(_as_it_took_place(asked[bundle.result.spec.number], bundle.result) for bundle in crashes)
     probes, steps, left_out = sums
-    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(specs), crashes)
+    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(specs), crashes, by)
+
+
+def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance:
+    """What a trial was probed with, as it took place when it was run from the start."""
+    assert stress is not None
+    planned = stress.disturbance
+    assert planned is not None
+    key = planned.step, planned.agent, planned.what
+    return next((one for one in result.disturbances if (one.step, one.agent, one.what) == key), planned)
 
 
 def mildest(result: TrialResult) -> Found | None:

@@ -30,10 +30,8 @@ def describe_probes(report: HuntReport) -> list[str]:
             f"  of the {found.run_again} mildest disturbances with which a trial crashed, {len(found.crashes)} made it "
             "crash from the start as well:"
         )
-    for bundle in found.crashes:
-        last = max(bundle.result.disturbances, key=lambda one: one.step, default=None)
-        what = f", {last.words}" if last is not None else ""
-        lines.append(f"  {bundle.path}: {bundle.result.summary}{what}")
+    for bundle, by in zip(found.crashes, found.by, strict=True):
+        lines.append(f"  {bundle.path}: {bundle.result.summary}, {by.words}")
     return lines
 
 

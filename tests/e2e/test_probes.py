@@ -27,7 +27,8 @@ default = 15.0
 def test_a_hunt_tells_how_little_it_would_take_and_confirms_it_from_the_start(shell):
     (shell.folder / "toy.toml").write_text(TOY)
     words = ("run", "h", "1", "3", "60", "--scenario", "toy.toml", "--seed", "4", "--arg", "speed=9", "--keep-going")
-    done = shell.crashhunt(*words, "--probe", "2s", "--json")
+    besides = "--disturb", "noisy_observation@52=itself:0.01:0.1"  # after the probe, and before the crash
+    done = shell.crashhunt(*words, *besides, "--probe", "2s", "--json")
     found = done.json["probes"]
     assert done.json["crashes"] == []
     assert done.json["outcomes"] == {"survived": 3}
@@ -42,6 +43,7 @@ def test_a_hunt_tells_how_little_it_would_take_and_confirms_it_from_the_start(sh
     assert (
         "of the 3 mildest disturbances with which a trial crashed, 3 made it crash from the start as well" in done.err
     )
+    assert done.err.count(", leader brakes with ") == 3
     rows = list(csv.DictReader(io.StringIO(shell.crashhunt("trials", "h", "--format", "csv").out)))
     assert min(float(row["stress_margin"]) for row in rows) == found["least"]
     assert "reproduced" in shell.crashhunt("replay", crash["path"]).out
