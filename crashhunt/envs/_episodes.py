@@ -95,7 +95,10 @@ class Episodes:
         self._episode.start()
         _raise_error(self._episode)
         self._crash_step, self._borders = -1, None
-        return self._episode.observations[self.agent], {"sim_time_s": self._trail.scenes[-1].time_s}
+        info: dict[str, object] = {"sim_time_s": self._trail.scenes[-1].time_s}
+        if self._trail.disturbances:
+            info["disturbances"] = [one.words for one in self._trail.disturbances]
+        return self._episode.observations[self.agent], info
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""

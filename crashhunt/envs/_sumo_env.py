@@ -47,7 +47,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             one of their own each.
         disturb: how often a second which mistake of others begins, as ``--disturb`` has it: ``brake=0.02,cut_in=0.01``.
             They follow from the seed of the episode, and need ``max_steps``; ``info["disturbances"]`` says in words
-            what begins in a step.
+            what has begun in a step, and what begins with the observation that it returns.
 
     Raises:
         CrashhuntError: the scenario, the agent or a disturbance does not exist, or SUMO cannot do it.

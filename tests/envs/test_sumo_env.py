@@ -119,6 +119,15 @@ def test_others_err_where_it_is_asked_for():
     assert not np.array_equal(first[-1], undisturbed[-1][0])
 
 
+def test_what_disturbs_the_first_observation_is_told_with_it():
+    env = SumoEnv("loop", disturb="late_observation@1=itself:0.2:1,late_action@2=itself:0.2:1", max_steps=5)
+    _, told = env.reset(seed=4)
+    *_, then = env.step((8.0, 0))
+    env.close()
+    assert told["disturbances"] == ["ego sees everything 0.2 s late for 1 s"]
+    assert then["disturbances"] == ["what ego does takes effect 0.2 s late for 1 s"]
+
+
 def test_what_cannot_disturb_is_refused():
     with pytest.raises(UsageError, match="disturb needs to know how long"):
         SumoEnv("loop", disturb="brake=1")
