@@ -58,10 +58,10 @@ class Probed:
     grade: Literal["strength", "length", "whether"] = "strength"
 
     def shares(self, step_length_s: float) -> tuple[float, ...]:
-        """Return how much of it may be asked for, from the mildest on; all of it is not.
+        """Return how much of it is asked for, from the mildest on, up to a sixteenth less than all of it.
 
         Where it is graded in s, that are as many as differ in whole steps: with steps of 1 s, nothing comes a sixteenth
-        of a second late.
+        of a second late. What is more than the worst by that is not asked for, and the worst is as if a sixteenth less.
         """
         if self.grade == "whether":
             return (_HALF,)
@@ -71,7 +71,8 @@ class Probed:
             return sixteenths
         worst = self.how_long if self.grade == "length" else self.most
         steps = dict.fromkeys(steps_of(share * worst, step_length_s) for share in sixteenths)
-        return tuple(share for one in steps if (share := one * step_length_s / worst) < 1 - _NOTHING)
+        shares = (one * step_length_s / worst for one in steps)
+        return tuple(min(share, sixteenths[-1]) for share in shares if share <= 1 + _NOTHING)
 
     def disturbance(self, share: float, who: str, agent: str, step: int) -> Disturbance:
         """Return one.

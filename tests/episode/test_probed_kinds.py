@@ -6,7 +6,7 @@ import math
 
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import PROBED
-from crashhunt.trial import CELLS, KINDS, OF_AGENT
+from crashhunt.trial import CELLS, KINDS, OF_AGENT, steps_of
 
 
 def test_every_kind_is_asked_for():
@@ -49,13 +49,17 @@ def test_what_is_graded_in_seconds_is_asked_for_in_whole_steps():
         return [one.how_long if kind.grade == "length" else one.how_strong for one in some]
 
     assert asked("late_action", 0.1) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
-    assert asked("late_observation", 0.25) == [0.25, 0.5, 0.75]
-    assert asked("late_action", 1.0) == []  # one step late is the worst already, and nothing is milder
-    assert asked("unseen", 1.0) == [1.0, 2.0, 3.0]
+    assert asked("late_observation", 0.25) == [0.25, 0.5, 0.75, 0.9375]
+    assert asked("late_action", 1.0) == [0.9375]  # one step, which is the worst already
+    assert asked("late_action", 2.0) == []  # one step is more than the worst
+    assert asked("unseen", 1.0) == [1.0, 2.0, 3.0, 3.75]
     assert asked("brake", 1.0) == [6.0 * share / 16 for share in range(1, 16)]
     assert len(asked("unseen", 0.01)) == 15
     for kind in PROBED:
         for dt in (0.02, 0.1, 0.2, 0.5, 1.0, 2.0):
             shares = kind.shares(dt)
             assert list(shares) == sorted(set(shares))
-            assert all(0 < share < 1 for share in shares)
+            assert all(0 < share <= 15 / 16 for share in shares)
+            if kind.grade == "length":
+                some = [kind.disturbance(share, "ahead", "ego", 7).how_long for share in shares]
+                assert len({steps_of(long, dt) for long in some}) == len(some)
