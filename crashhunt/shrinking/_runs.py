@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
+from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
@@ -165,9 +165,14 @@ class Runs:
         self._next += 1
         self.count += 1
         results: list[TrialResult] = []
-        while not results:
-            results = [one for one in self._executor.completed(_LOOK_EVERY_S) if one.spec.number == number]
-            self._stop_if_asked()
+        try:
+            while not results:
+                results = [one for one in self._executor.completed(_LOOK_EVERY_S) if one.spec.number == number]
+                self._stop_if_asked()
+        except RecorderError:
+            raise
+        except CrashhuntError:  # some older crashhunts in a snapshot refuse what they do not know
+            return ()
         folder = scratch_of(self._scratch, number)
         names: list[str] = []
         self.steps += results[0].steps

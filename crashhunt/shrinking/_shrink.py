@@ -225,12 +225,21 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
             told: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
             if search.steps_cut:
                 told["steps_cut"] = search.steps_cut
-            small = replace(small, added={**small.added, "shrunk": told})
-            small = confirm(small) or small
-            small.write()
-            return small
+            return _kept(replace(small, added={**small.added, "shrunk": told}))
         shutil.rmtree(small.path)
     return None
+
+
+def _kept(small: Bundle) -> Bundle:
+    """Have it confirmed; what is left says of what it is left before that, which may take a minute."""
+    try:
+        small.write()
+        small = confirm(small) or small
+        small.write()
+    except BaseException:  # else it would pass for a crash of the hunt, or for one that nobody has looked at
+        shutil.rmtree(small.path, ignore_errors=True)
+        raise
+    return small
 
 
 def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from crashhunt.crashes import find_bundle, list_bundles, write_bundle
+from crashhunt.crashes import find_bundle, list_bundles, read_bundle, write_bundle
 from crashhunt.errors import BundleError, UsageError
 from crashhunt.shrinking import shrink
 from crashhunt.triage import signature_of
@@ -90,6 +90,10 @@ def test_a_full_disk_is_told_and_what_came_of_the_trials_is_remembered(hunt, mon
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return write_bundle(hunt_folder, result, trial, **how)
 
+    def full_later(small):
+        assert "shrunk" in read_bundle(small.path).added  # whoever kills it now leaves what says what it is
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
     with monkeypatch.context() as patched:
         patched.setattr("crashhunt.shrinking._shrink.write_bundle", full)
         with pytest.raises(BundleError, match=r"small' cannot be written: No space left") as raised:
@@ -97,6 +101,11 @@ def test_a_full_disk_is_told_and_what_came_of_the_trials_is_remembered(hunt, mon
     assert "run the same command again" in raised.value.fix
     (memory,) = folder.glob(".*")
     assert memory.stat().st_size > 0
+    with monkeypatch.context() as patched:  # only after it has been written as a whole
+        patched.setattr("crashhunt.shrinking._shrink.confirm", full_later)
+        with pytest.raises(BundleError, match=r"small' cannot be written: No space left"):
+            shrink(bundle, parallel=1)
+    assert not list(folder.glob("*.small"))
     run_again = []
     monkeypatch.setattr("crashhunt.shrinking._runs.Runs._remember", lambda _, spec, ran: run_again.append(spec))
     found = shrink(bundle, parallel=1)
