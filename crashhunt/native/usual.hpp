@@ -203,22 +203,21 @@ struct Steps {
         return counted;
     }
 
-    // The lanes of everybody, as a record has them; false where they are not plain text.
+    // The lanes of everybody, as a record has them; false where they are not plain text, or nobody is on one.
     static bool note_lanes(std::string &text, const Roster &roster) {
         text.clear();
+        bool first = true;
         for (const std::string &id : roster.ids) {
-            const std::string where = sumo.lane(id);
+            const std::string where = sumo.lane(id); // nothing of who is parked
             for (unsigned char letter : where) {
                 if (letter >= 128 || letter == '\n') {
                     return false;
                 }
             }
-            if (!text.empty()) {
-                text += '\n';
-            }
-            text += where;
+            text.append(first ? "" : "\n").append(where);
+            first = false;
         }
-        return true;
+        return !text.empty();
     }
 
     // What the agent will be shown; null with or without an exception.

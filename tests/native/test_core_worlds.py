@@ -75,11 +75,16 @@ BACK_TO_TRAMS = JAM.replace('duration="6"', 'duration="999"').replace(
     '<stop lane="ce_0" endPos="43" duration="999"/>',
     '<stop lane="ce_0" endPos="43" duration="6"/><stop lane="ce_0" endPos="45" duration="999" parking="true"/>',
 )
+# Whoever is parked is on no lane, and names are in order: nobody's lane is told first.
+PARKED = EGO + STAND.format("beside", 60, "wc", "wc_0", 999, "DEFAULT_VEHTYPE").replace(
+    "/></veh", ' parking="true"/></veh'
+)
 WORLDS = {
     "crash": ("street", CRASH, 0.1, 80),
     "come and go": ("street", COME_AND_GO, 0.1, 75),
     "walkers": ("street", WALKERS, 0.1, 80),
     "long steps": ("street", WALKERS, 1.0, 30),
+    "parked": ("street", PARKED, 0.1, 30),
     "bridge": ("bridge", BRIDGE, 0.1, 60),
     "bend": ("rail", BEND, 0.1, 120),
     "jam": ("street", JAM, 0.1, 110),
