@@ -26,9 +26,9 @@ PyObject *text_of(const std::string &text) {
     return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
 }
 
-void keep(PyObject *&place, PyObject *value) {
+template <typename Kept> void keep(Kept *&place, PyObject *value) {
     Py_INCREF(value);
-    Py_XSETREF(place, value);
+    Py_XDECREF(reinterpret_cast<PyObject *>(std::exchange(place, reinterpret_cast<Kept *>(value))));
 }
 
 struct Steps {
@@ -252,7 +252,7 @@ struct Steps {
             PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
             return false;
         }
-        keep(reinterpret_cast<PyObject *&>(place.vehicles), vehicles);
+        keep(place.vehicles, vehicles);
         keep(place.ids, ids);
         place.row = static_cast<size_t>(row);
         return true;
@@ -370,7 +370,7 @@ struct Steps {
         }
         Py_XSETREF(observation, seen);
         if (before_vehicles != sight.vehicles) {
-            keep(reinterpret_cast<PyObject *&>(before_vehicles), reinterpret_cast<PyObject *>(sight.vehicles));
+            keep(before_vehicles, reinterpret_cast<PyObject *>(sight.vehicles));
         }
         if (!earlier.empty()) {
             std::swap(sight, entered);
@@ -455,7 +455,7 @@ PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
     keep(steps.array, array);
     keep(steps.shape, shape);
     keep(steps.dtype, dtype);
-    keep(reinterpret_cast<PyObject *&>(steps.eyes), eyes);
+    keep(steps.eyes, eyes);
     steps.others = static_cast<size_t>(others);
     steps.step_s = step_s;
     steps.lateral = lateral;
@@ -540,7 +540,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     if (!Steps::set_sight(steps.sight, vehicles, ids, row, controlled)) {
         return nullptr;
     }
-    keep(reinterpret_cast<PyObject *&>(steps.before_vehicles), vehicles);
+    keep(steps.before_vehicles, vehicles);
     keep(steps.observation, observation);
     steps.now.values = *reinterpret_cast<Columns *>(columns)->values;
     steps.now.time_s = time_s;
