@@ -83,6 +83,8 @@ def find_sources(
             _take_tree(*listing, found, imports=[place], without=without)
     for root in roots:
         _take_root(root, found, without)
+    for odd in [name for name in found.files if "\\" in name]:
+        found.left_out.append(f"{found.files.pop(odd)}: its name has a backslash, which elsewhere parts folders")
     return found
 
 
