@@ -71,6 +71,10 @@ def listener(answer):
         ("a:b", "--executor ray:a:b is no address HOST:PORT; write --executor ray:a:6379"),
         (".x:1", "--executor ray:.x:1: no machine can have that name; start one with"),
         ("ray://x:10001", "--executor ray:ray://x:10001 is an address of the Ray Client, which a hunt does not use"),
+        (
+            "http://x:8265",
+            "--executor ray:http://x:8265 is an address of a service such as Ray's dashboard, which a hunt",
+        ),
         ("auto", "--executor ray:auto: no Ray cluster runs on this machine; start one"),
     ],
 )

@@ -67,6 +67,16 @@ def test_what_can_be_run_can_be_run_there(settings, tmp_path):
     assert not os.access(tmp_path / "there" / "files" / "0-w.npz", os.X_OK)
 
 
+def test_a_name_is_any_that_a_file_can_have(settings, tmp_path):
+    names = [os.fsdecode(name) for name in (b"not Unicode \xff", "übung".encode(), b"two\nlines", b"back\\slash")]
+    for name in names:
+        (tmp_path / "code" / "mine" / name).write_text(name, errors="surrogateescape")
+    parcel = Parcel.of(settings)
+    unpack(parcel.packed(), parcel.digest(), tmp_path / "there")
+    there = (tmp_path / "there" / "code" / "0" / "mine").iterdir()
+    assert {path.name for path in there} == {*names, "agent.py"}
+
+
 def test_what_stands_for_the_current_folder_is_that_of_the_other_machine(settings, tmp_path, monkeypatch):
     """Where a snapshot has it: agents open their files by names that count from there."""
     for name in ("proj/agents/weights.txt", "else/agents/other.txt", "code/@proj/agents/weights.txt"):

@@ -92,9 +92,10 @@ def cluster_of(argument: str) -> Meant:
             raise UsageError("--executor ray:auto: no Ray cluster runs on this machine", fix=_START)
         return ours
     whence = f"--executor ray:{wanted}" if argument == wanted else f"RAY_ADDRESS={wanted}"
-    if wanted.startswith("ray://"):
+    if "://" in wanted:
+        what = "the Ray Client" if wanted.startswith("ray://") else "a service such as Ray's dashboard"
         raise UsageError(
-            f"{whence} is an address of the Ray Client, which a hunt does not use",
+            f"{whence} is an address of {what}, which a hunt does not use",
             fix="run the hunt on a machine of the cluster, with the address that 'ray start' was given there",
         )
     host, colon, port = wanted.rpartition(":")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import stat
 import zipfile
 import zlib
@@ -78,7 +79,7 @@ class Parcel:
         Raises:
             OSError: a file cannot be read.
         """
-        return digest_of_data({place: _described(path) for place, path in self.files.items()})
+        return digest_of_data({_as_sent(place): _described(path) for place, path in self.files.items()})
 
     def packed(self) -> bytes:
         """Return it as it travels.
@@ -89,7 +90,7 @@ class Parcel:
         buffer = io.BytesIO()
         with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
             for place, path in self.files.items():
-                archive.write(path, place)
+                archive.write(path, _as_sent(place))
         return buffer.getvalue()
 
 
@@ -126,7 +127,7 @@ def unpack(packed: bytes, digest: str, root: Path) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             for entry in archive.infolist():
-                place = PurePosixPath(entry.filename)
+                place = PurePosixPath(os.fsdecode(entry.filename.encode("latin-1")))
                 if place.is_absolute() or ".." in place.parts:
                     raise ValueError(f"the name {entry.filename!r} leads out of it")
                 path = root / place
@@ -148,6 +149,11 @@ def _is_here(folder: Path) -> bool:
     if not tree or not here.as_posix().endswith(f"/{place}"):
         return False
     return all((here / path.name).exists() for path in folder.iterdir())
+
+
+def _as_sent(place: str) -> str:
+    """A name as it is in an archive, which takes none that is not Unicode: a character for each of its bytes."""
+    return os.fsencode(place).decode("latin-1")
 
 
 def _described(path: Path) -> str:
