@@ -220,6 +220,8 @@ if __name__ == "__main__":
     del sys.modules["warm"]  # else a snapshot would have it, as whatever has been imported and is not installed
     crashhunt.base.keeper.subprocess = Warm(socket.socket(fileno=int(sys.argv[2])), json.loads(sys.argv[3])).subprocess
     crashhunt.suites._processes.subprocess = types.SimpleNamespace(Popen=Hunt, DEVNULL=subprocess.DEVNULL)
+    PARSER = crashhunt.cli.make_parser()
+    crashhunt.cli.make_parser = lambda: PARSER  # which every command would make again, and is the same in all of them
     AT_FIRST, PATH = frozenset(sys.modules), sys.path[1:]
     crashhunt.snapshots.environment()  # which looks through all that is installed
     crashhunt.base.plugins.registered("agents")

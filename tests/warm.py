@@ -1,8 +1,9 @@
-"""What a command starts, in processes that are there already: of what is installed, all is imported; of ours, nothing.
+"""What a command starts, in processes that are there already: what is installed is imported, and what is as it is here.
 
 A hunt starts a template for its workers, and a process for every confirmation; so does a replay. They are forks of a
-process that has imported NumPy, and where a simulator is needed that one. crashhunt, whichever the snapshot has, and
-the agents each of them imports as ever; only that a file of crashhunt which is the same here need not be compiled.
+process that has imported NumPy, and where a simulator is needed that one. The agents each of them imports as ever, and
+crashhunt, whichever the snapshot has; only that a file of it which is the same here need not be compiled, and where
+all files are that such a process begins with, what they define is there, as if it had been imported from the snapshot.
 Keepers, lifelines, signals and exit codes are real; what this does not show is how Python starts, which every command
 that a test starts by `Shell.process` or `Shell.start` does.
 """
@@ -46,6 +47,18 @@ _FREE = 500  # where a process has no files of its own
 _compiled: dict[bytes | str, types.CodeType] = {}  # what a file of crashhunt says, to what Python makes of it
 _given: set[bytes | str] = set()  # the texts whose code has become that of a module
 _read: dict[tuple[str, str], str | None] = {}  # what a file says of something that is installed
+_made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhunt is made from
+# What is there when one of these has been imported: modules, their code, and what their files say.
+_imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
+_BEGIN_WITH = ("crashhunt.executors._template", "crashhunt.executors._fresh")
+# What these import as soon as they have read what is to be done.
+_SCENARIO = "crashhunt.scenario._load"
+_GO_ON_WITH = {
+    "": (_SCENARIO, "crashhunt.scenario.backends.toy", "crashhunt.simulators.toy"),
+    "gym": (_SCENARIO,),
+    "highway": (_SCENARIO,),  # whose accelerator knows the folder that it was imported from
+    "sumo": (_SCENARIO, "crashhunt.scenario.backends.sumo._backend", "crashhunt.simulators.sumo._simulator"),
+}
 
 
 def at_start(environment: Mapping[str, str]) -> dict[str, str]:
@@ -183,14 +196,16 @@ class _Known(SourceFileLoader):
         if known is None:
             return super().get_code(fullname)
         if text in _given:  # another file says the same
-            return _of_file(known, self.path)
-        _given.add(text)
-        _imp._fix_co_filename(known, self.path)  # type: ignore[attr-defined] - as importlib does it, in C
+            known = _of_file(known, self.path)
+        else:
+            _given.add(text)
+            _imp._fix_co_filename(known, self.path)  # type: ignore[attr-defined] - as importlib does it, in C
+        _made[fullname] = known, text
         return known
 
     @classmethod
     def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
-        if name.partition(".")[0] != "crashhunt":
+        if not _is_ours(name):
             return None
         spec = PathFinder.find_spec(name, path)
         if spec is not None and type(spec.loader) is SourceFileLoader:
@@ -211,6 +226,34 @@ def _compile() -> None:
             code = SourceFileLoader("", str(file)).get_code("")
             if code is not None:
                 _compiled[file.read_bytes()] = code
+
+
+def _import_ours(simulator: str = "") -> None:
+    """Import what processes of crashhunt begin with, each by itself, and put it aside."""
+    for name in filter(_is_ours, [*sys.modules]):
+        del sys.modules[name]
+    sys.meta_path.insert(0, _Known)
+    for begins_with in _BEGIN_WITH:
+        for name in (begins_with, *_GO_ON_WITH[simulator]):
+            importlib.import_module(name)
+        found = _imported[begins_with] = {}
+        for name in filter(_is_ours, [*sys.modules]):
+            module = sys.modules.pop(name)
+            code, text = _made[name]
+            files = {".py": text}
+            if hasattr(module, "__path__"):
+                stub = Path(module.__path__[0], "__init__.pyi")
+                files = {"/__init__.py": text, **({"/__init__.pyi": stub.read_bytes()} if stub.exists() else {})}
+            found[name] = module, code, files
+        del found[begins_with]  # which knows its process, as no other does
+        _given.clear()
+    sys.meta_path.remove(_Known)
+    gc.collect()
+    gc.freeze()
+
+
+def _is_ours(name: str) -> bool:
+    return name.partition(".")[0] == "crashhunt"
 
 
 def _serve(control: socket.socket, simulator: str = "") -> None:
@@ -253,7 +296,9 @@ def _with_simulator(simulator: str) -> socket.socket:
         if os.fork() == 0:
             os.closerange(3, theirs.fileno())
             os.closerange(theirs.fileno() + 1, _FREE)
-            leave_after(lambda: (_import(_OF_SIMULATORS[simulator]), _serve(theirs, simulator)))
+            leave_after(
+                lambda: (_import(_OF_SIMULATORS[simulator]), _import_ours(simulator), _serve(theirs, simulator))
+            )
     return ours
 
 
@@ -262,7 +307,7 @@ def _import(*names: str) -> None:
         importlib.import_module(name)
     if "crashhunt.base.plugins" in sys.modules:
         sys.modules["crashhunt.base.plugins"].registered("agents")
-    for name in [name for name in sys.modules if name.partition(".")[0] == "crashhunt"]:
+    for name in filter(_is_ours, [*sys.modules]):
         del sys.modules[name]
     gc.collect()
     gc.freeze()
@@ -304,6 +349,8 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
     if "numpy" in sys.modules:
         sys.modules["numpy"].random.seed()
     sys.meta_path.insert(0, _Known)
+    if len(request["words"]) > 2:
+        _put_back(request["words"][2])
     spec = importlib.util.spec_from_file_location("__main__", script)
     assert spec is not None
     assert spec.loader is not None
@@ -312,9 +359,38 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
     leave_after(lambda: loader.exec_module(module))
 
 
+def _put_back(begins_with: str) -> None:
+    """Have what a module imports, if what there is to import is the same, as if it had been imported from there."""
+    spec = PathFinder.find_spec("crashhunt")
+    if spec is None or spec.origin is None:
+        return
+    found = _imported.get(begins_with, {})
+    folder = Path(spec.origin).parent.parent
+    stems = {name: f"{folder}/{name.replace('.', '/')}" for name in found}
+    try:
+        for name, (_, _, files) in found.items():
+            for end, text in files.items():
+                with open(stems[name] + end, "rb", buffering=0) as file:
+                    if file.read() != text:
+                        return
+    except OSError:
+        return
+    for name, (module, code, files) in found.items():
+        file, *_ = (stems[name] + end for end in files)
+        _imp._fix_co_filename(code, file)  # type: ignore[attr-defined]
+        _given.add(next(iter(files.values())))
+        module.__loader__ = loader = _Known(name, file)
+        module.__spec__ = spec = importlib.util.spec_from_file_location(name, file, loader=loader)
+        module.__file__ = file
+        if hasattr(module, "__path__"):
+            module.__path__ = spec.submodule_search_locations
+        sys.modules[name] = module
+
+
 if __name__ == "__main__":
     _remember()
     _compile()
+    _import_ours()
     _import(
         "crashhunt.executors._template",
         "crashhunt.executors._fresh",

@@ -8,10 +8,34 @@ import re
 import pytest
 
 WORDS = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=5", "--seed", "1", "--json")
+TELLS = """
+import inspect, json, pathlib, sys
+
+from faulty import Raises
+
+class Agent(Raises):
+    def __init__(self):
+        super().__init__(at=5)
+        ours = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == "crashhunt"}
+        files = {
+            name: [found.__file__, found.__spec__.origin, found.__loader__.path, list(getattr(found, "__path__", []))]
+            for name, found in ours.items()
+        }
+        code = {
+            f"{name}.{inner}": function.__code__.co_filename
+            for name, module in ours.items()
+            for inner, function in vars(module).items()
+            if inspect.isfunction(function) and function.__module__ == name
+        }
+        said = ours["crashhunt.world"].__doc__
+        pathlib.Path(f"{sys.argv[0]}.json").write_text(json.dumps([files, code, said]))
+"""
+TEMPLATE, FRESH = "crashhunt.executors._template", "crashhunt.executors._fresh"
 
 
 def told(shell, hunt: str, run) -> tuple:
-    done = run("run", hunt, "1", "1", "9", *WORDS)
+    (shell.folder / "tells.py").write_text(TELLS)
+    done = run("run", hunt, "1", "1", "9", "--scenario", "toy", "--agent", "tells:Agent", "--seed", "1", "--json")
     (snapshot,) = (shell.folder / hunt / "snapshots").iterdir()
     manifest, environment = (
         json.loads((snapshot / f"{name}.json").read_text()) for name in ("manifest", "environment")
@@ -19,7 +43,13 @@ def told(shell, hunt: str, run) -> tuple:
     (crash,) = done.json["crashes"]
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
     err = re.sub(r"^hunting: .*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
-    return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err
+    imported = [imported_by(shell, process, hunt) for process in (TEMPLATE, FRESH)]
+    return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err, imported
+
+
+def imported_by(shell, process: str, hunt: str) -> list:
+    """What a process of the hunt had of crashhunt, where it was from, and what one of it said."""
+    return json.loads((shell.folder / f"{process}.json").read_text().replace(f"/{hunt}/", "/h/"))
 
 
 def test_its_snapshot_output_and_digests_are_the_same(toy):
@@ -27,6 +57,12 @@ def test_its_snapshot_output_and_digests_are_the_same(toy):
     # Of what is installed, a fork has imported what other commands need as well.
     assert set(forked[2].pop("loaded")) >= set(started[2].pop("loaded")) > {"numpy"}
     assert forked == started
+    # And if what is in a snapshot is not what is here, it is what runs.
+    (file,) = (toy.folder / "forked" / "snapshots").glob("*/code/crashhunt/world/__init__.py")
+    file.write_text(file.read_text(encoding="utf-8").replace('"""', '"""Not here. ', 1), encoding="utf-8")
+    toy.crashhunt("replay", "forked", "--force", expect=None)
+    *_, said = imported_by(toy, FRESH, "forked")
+    assert said.startswith("Not here. ")
 
 
 @pytest.mark.parametrize("words", [("--help",), ("run", "h"), ("status", "nowhere", "--json"), ("--version",)])
