@@ -10,13 +10,14 @@ import gc
 import importlib
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import types
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, NoReturn
 
@@ -51,7 +52,6 @@ class Commands:
 
         started = {**environment, **worker_environment()}
         self.warm, self._kept = Warm.start(started)
-        self._lock = threading.Lock()
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _MESSAGE)
         descriptors = [theirs.fileno(), self.warm.control.fileno()]
@@ -71,6 +71,16 @@ class Commands:
             for name in ("sitecustomize", "usercustomize", "crashhunt")
         )
 
+    def begin(
+        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], *, terminal: int | None = None,
+        start_new_session: bool = False,
+    ) -> Begun:  # fmt: skip
+        """Begin a command; its standard error is the terminal, where one is given, and then not returned."""
+        request = {
+            "words": words, "folder": str(folder), "environment": dict(environment), "apart": start_new_session,
+        }  # fmt: skip
+        return Begun(self._control, request, terminal)
+
     def run(
         self,
         words: Sequence[str],
@@ -82,27 +92,16 @@ class Commands:
     ) -> tuple[int, str, str]:
         """Run a command to its end; return its exit code, or minus its signal, and what it has printed.
 
-        Its standard error is the terminal, where one is given, and then not returned.
-
         Raises:
             subprocess.TimeoutExpired: it took too long, and was killed.
         """
-        request = json.dumps({"words": words, "folder": str(folder), "environment": dict(environment)}).encode()
-        with self._lock, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-            socket.send_fds(self._control, [request], [out.fileno(), terminal or err.fileno()])
-            self._control.settimeout(None)
-            pid = json.loads(self._control.recv(_MESSAGE))
-            self._control.settimeout(timeout_s)
-            try:
-                code = json.loads(self._control.recv(_MESSAGE))
-            except TimeoutError:
-                os.kill(pid, 9)
-                self._control.settimeout(None)
-                self._control.recv(_MESSAGE)
-                raise subprocess.TimeoutExpired(["crashhunt", *words], timeout_s) from None
-            for file in (out, err):
-                file.seek(0)
-            return code, _text(out.read()), _text(err.read())
+        begun = self.begin(words, folder, environment, terminal=terminal)
+        try:
+            return begun.wait(timeout_s), *begun.communicate()
+        except BaseException:
+            begun.kill()
+            begun.communicate()
+            raise
 
     def close(self) -> None:
         """End it."""
@@ -116,30 +115,99 @@ class Commands:
             self._kept.wait()
 
 
-def _text(data: bytes) -> str:
+class Begun:
+    """A command that has begun, as far as tests use a `subprocess.Popen`."""
+
+    def __init__(self, control: socket.socket, request: Mapping[str, object], terminal: int | None = None) -> None:
+        self.returncode: int | None = None
+        self._words = request["words"]
+        self._files = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - closed when they are read
+        self._printed: tuple[str, str] | None = None
+        self._reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        out, err = (file.fileno() for file in self._files)
+        with theirs:
+            socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), out, terminal or err])
+        self.pid = int(self._reply.recv(_MESSAGE))
+
+    def poll(self) -> int | None:
+        """Return how it has ended, if it has."""
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end, and return its exit code, or minus its signal."""
+        if self.returncode is None:
+            if not select.select([self._reply], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired(["crashhunt", *self._words], timeout or 0)
+            self.returncode = int(self._reply.recv(_MESSAGE))
+            self._reply.close()
+        return self.returncode
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Wait for its end, and return what it has printed."""
+        self.wait(timeout)
+        if self._printed is None:
+            out, err = map(_text_of, self._files)
+            self._printed = out, err
+        return self._printed
+
+    def send_signal(self, number: int) -> None:
+        """Tell it something, if it is there."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Kill it, if it is there."""
+        self.send_signal(signal.SIGKILL)
+
+    def terminate(self) -> None:
+        """Ask it to end, if it is there."""
+        self.send_signal(signal.SIGTERM)
+
+
+def _text_of(file: IO[bytes]) -> str:
     """As `subprocess` has it where it is asked for text."""
-    return data.decode().replace("\r\n", "\n").replace("\r", "\n")
+    with file:
+        file.seek(0)
+        return file.read().decode().replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _serve(control: socket.socket) -> None:
+    """Fork for whoever asks, and tell how the forks end."""
     global AT_FIRST
+    running: dict[int, tuple[int, socket.socket]] = {}  # what the kernel tells the end of a process by
     while True:
-        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 2)
+        ready, _, _ = select.select([control, *running], [], [])
+        for ended in running.keys() & set(ready):
+            pid, reply = running.pop(ended)
+            _, status = os.waitpid(pid, 0)
+            os.close(ended)
+            with reply, suppress(OSError):  # whoever asked has gone
+                reply.send(str(os.waitstatus_to_exitcode(status)).encode())
+        if control not in ready:
+            continue
+        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 3)
         if not data:
             return
         request = json.loads(data)
         for name in _FOR_COMMAND.get(next(iter(request["words"]), ""), ()):
             importlib.import_module(name)
             AT_FIRST |= sys.modules.keys()
+        asker, *streams = descriptors
         pid = os.fork()
         if pid == 0:
             control.close()
-            _be_command(request, *descriptors)
-        for descriptor in descriptors:
+            os.close(asker)
+            for descriptor, (_, other) in running.items():
+                os.close(descriptor)
+                other.close()
+            _be_command(request, *streams)
+        for descriptor in streams:
             os.close(descriptor)
-        control.send(json.dumps(pid).encode())
-        _, status = os.waitpid(pid, 0)
-        control.send(json.dumps(os.waitstatus_to_exitcode(status)).encode())
+        reply = socket.socket(fileno=asker)
+        reply.send(str(pid).encode())
+        running[os.pidfd_open(pid)] = pid, reply
 
 
 def _be_command(request: dict, out: int, err: int) -> NoReturn:
@@ -147,6 +215,8 @@ def _be_command(request: dict, out: int, err: int) -> NoReturn:
     for descriptor, copy in ((out, 1), (err, 2)):
         os.dup2(descriptor, copy)
         os.close(descriptor)
+    if request["apart"]:
+        os.setsid()
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["folder"])

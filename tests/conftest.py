@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
-from commands import CRASHHUNT, Commands
+from commands import CRASHHUNT, Begun, Commands
 
 from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.native import _core
@@ -133,8 +133,14 @@ class Shell:
         )  # fmt: skip
         return _ended(words, Done(done.returncode, done.stdout, done.stderr), expect)
 
+    def begin(self, *words: str, start_new_session: bool = False) -> Begun | subprocess.Popen[str]:
+        """Begin a command, in a fork where that is the same; the caller ends it."""
+        if not _commands().fits(self.environment):
+            return self.start(*words, start_new_session=start_new_session)
+        return _commands().begin(words, self.folder, self.environment, start_new_session=start_new_session)
+
     def start(self, *words: str, **options: Any) -> subprocess.Popen[str]:
-        """Start a command; the caller ends it."""
+        """Start a command as a shell does it, with nobody between it and its keepers; the caller ends it."""
         return subprocess.Popen(
             [str(CRASHHUNT), *words],
             cwd=self.folder,

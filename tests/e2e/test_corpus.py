@@ -206,7 +206,7 @@ def test_two_add_the_same_at_once(kept, monkeypatch):
 def test_ctrl_c_ends_all_and_tells_what_has_ended(kept):
     begun = kept.folder / "begun"
     drive(kept, DRIVER.replace("return", f"import time; open({str(begun)!r}, 'w'); time.sleep(60); return"))
-    running = kept.start("corpus", "run", "kept crashes", "--parallel", "1")
+    running = kept.begin("corpus", "run", "kept crashes", "--parallel", "1")
     deadline = time.monotonic() + 60
     while not begun.exists() and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -99,7 +99,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     words = ("run", "h", "3", "30", "2000", "--agent", "faulty:HangsUnlessFirst", "--arg", "number=0:100")
     # Trial 0 of this seed gets number 0 with the grid; all others hang in C with the interpreter held.
     words = (*words, "--sampler", "grid", "--points", "101", "--scenario", "toy", "--set", "gap_m=30")
-    process = toy.start(*words, "--timeout", "120", "--json")
+    process = toy.begin(*words, "--timeout", "120", "--json")
     crashes = toy.folder / "h" / "crashes"
     out, err = process.communicate(timeout=90)
     assert process.returncode == 0, err
@@ -116,7 +116,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
 )
 def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, number, hunted, trials):
     words = ("run", "h", "2", str(trials), "300", *hunted, "--json")
-    process = toy.start(*words, start_new_session=True)
+    process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.send_signal(number)
     out, err = process.communicate(timeout=90)
@@ -144,7 +144,7 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, after_s):
 
 def test_a_killed_hunt_leaves_no_process_and_goes_on(toy):
     words = ("run", "h", "2", "30", "300", *FINE, "--json")
-    process = toy.start(*words, start_new_session=True)
+    process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.kill()
     process.communicate()
@@ -157,7 +157,7 @@ def test_a_killed_hunt_leaves_no_process_and_goes_on(toy):
 
 def test_a_killed_worker_costs_its_own_trial_only(toy):
     words = ("run", "h", "2", "30", "300", *FINE, "--crash-on", "hang", "--json")
-    process = toy.start(*words, start_new_session=True)
+    process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 3)
     os.kill(running_worker(toy.folder / "h"), signal.SIGKILL)
     out, err = process.communicate(timeout=90)
@@ -195,7 +195,7 @@ def test_other_settings_are_refused_and_overwrite_begins_anew(toy):
 
 
 def test_a_second_hunt_on_one_directory_is_refused(toy):
-    process = toy.start("run", "h", "1", "500", "300", *FINE)
+    process = toy.begin("run", "h", "1", "500", "300", *FINE)
     try:
         wait_for(lambda: count(toy.folder / "h") >= 1)
         done = toy.crashhunt("run", "h", "1", "500", "300", *FINE, expect=2)

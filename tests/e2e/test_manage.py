@@ -26,7 +26,7 @@ def state(shell, hunt: str = "h") -> dict:
 
 
 def started(shell, *words: str):
-    process = shell.start("run", "h", "2", "500", "50", *KEEP, "--set", "step_wall_s=0.001", *words)
+    process = shell.begin("run", "h", "2", "500", "50", *KEEP, "--set", "step_wall_s=0.001", *words)
     deadline = time.monotonic() + 60
     while not (shell.folder / "h/ledger.sqlite").exists() or state(shell)["trials_run"] < 5:
         assert time.monotonic() < deadline

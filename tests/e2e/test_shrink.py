@@ -173,7 +173,7 @@ def test_of_several_agents_one_is_left_in_traffic(shell):
 
 @pytest.mark.nightly
 def test_ctrl_c_leaves_the_best(hunt):
-    running = hunt.start("shrink", "h", "--parallel", "1")
+    running = hunt.begin("shrink", "h", "--parallel", "1")
     deadline = time.monotonic() + 60
     while not list((hunt.folder / "h" / "crashes").glob(".*")) and time.monotonic() < deadline:
         time.sleep(0.02)  # until a candidate has been run

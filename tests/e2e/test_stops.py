@@ -122,7 +122,7 @@ def test_a_killed_replay_leaves_no_process(toy):
 
 def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
     words = ("run", "h", "1", "1", "20", "--scenario", "toy", "--agent", "faulty:Hangs", "--arg", "at=5")
-    process = toy.start(*words, "--timeout", "3", "--json")
+    process = toy.begin(*words, "--timeout", "3", "--json")
     wait_for(lambda: list((toy.folder / "h" / "crashes").glob("*-hang")))
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=90)
@@ -132,7 +132,7 @@ def test_an_interrupt_while_a_hang_is_confirmed_ends_it_at_once(toy):
 
 
 def test_a_ledger_that_is_removed_is_written_anew(toy):
-    process = toy.start("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
+    process = toy.begin("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 3)
     before = rows(toy.folder / "h")
     for path in (toy.folder / "h").glob("ledger.sqlite*"):
@@ -147,7 +147,7 @@ def test_a_ledger_that_is_removed_is_written_anew(toy):
 
 
 def test_another_ledger_in_its_place_ends_the_hunt(toy):
-    process = toy.start("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
+    process = toy.begin("run", "h", "2", "1000", "20", *FINE, *SLOW, "--json")
     wait_for(lambda: len(rows(toy.folder / "h")) >= 1)
     (toy.folder / "other").write_bytes(b"")
     (toy.folder / "other").rename(toy.folder / "h" / "ledger.sqlite")

@@ -143,7 +143,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
 @pytest.mark.long
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     written(toy, SLOW.replace("80", "36"))
-    process = toy.start("suite", "run", "suite.toml", "out", "2")
+    process = toy.begin("suite", "run", "suite.toml", "out", "2")
     wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
@@ -176,8 +176,8 @@ def test_a_damaged_plan_leaves_the_others_untouched(toy):
 @pytest.mark.long
 def test_two_at_once_do_not_disturb_each_other(toy):
     written(toy, SLOW.replace("80", "10").replace('[[hunts]]\nid = "c"\n', ""))
-    first = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
-    second = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
+    first = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
+    second = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
     for process in (first, second):
         _, err = process.communicate(timeout=120)
         assert process.returncode == 0, err
