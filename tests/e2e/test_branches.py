@@ -51,6 +51,7 @@ def test_a_hunt_branches_where_trials_come_near_and_confirms_what_it_finds_from_
     assert f"branches {found['branches']} (moments {found['moments']}), crashed {found['crashed']} (in 1 of 1" in told
 
 
+@pytest.mark.long
 def test_a_hunt_stops_at_what_a_branch_has_found(shell):
     """As it does at any other crash: with --deterministic at the same one, and when it is resumed, at once."""
     (shell.folder / "toy.toml").write_text(TOY)

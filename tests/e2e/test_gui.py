@@ -78,6 +78,7 @@ def test_nobody_at_the_terminal_is_not_waited_for_and_sleep_slows_it_down(crash,
     assert '"steps_replayed": 5' in out
 
 
+@pytest.mark.long
 def test_a_closed_window_is_no_divergence(crash, screen):
     crash.environment["DISPLAY"] = screen
     process = crash.start("replay", "h", "--gui", "--sleep", "0.3", stdin=subprocess.DEVNULL)

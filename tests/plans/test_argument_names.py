@@ -124,6 +124,7 @@ def asked(shell, hunt):
     }
 
 
+@pytest.mark.long
 def test_run_rerun_suite_and_replay_mean_the_same(two):
     where = ("--scenario", "toys", "--seed", "1", "--crash-on", "collision")
     two.crashhunt("run", "h", "1", "1", "90", *where, "--arg", "other.speed=25", "--arg", "ego.speed=4")

@@ -31,7 +31,7 @@ def browser(tmp_path_factory):
     options.binary_location = program
     for word in (
         "headless=new", "no-sandbox", "disable-gpu", "no-first-run", "disable-background-networking",
-        "disable-component-update", "disable-sync", "window-size=1280,2200", "disable-dev-shm-usage",
+        "disable-component-update", "disable-sync", "window-size=1280,1000", "disable-dev-shm-usage",
         f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
     ):  # fmt: skip
         options.add_argument(f"--{word}")

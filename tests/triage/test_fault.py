@@ -61,6 +61,7 @@ def case_of(data):
     )
 
 
+@pytest.mark.long
 def test_what_is_said_is_what_a_person_says_or_nothing():
     said = [(data, fault_in(case_of(data))) for data in cases()]
     wrong = [
