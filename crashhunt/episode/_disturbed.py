@@ -208,8 +208,9 @@ class Disturbed:
 
     def _begin_of_agent(self, planned: Disturbance, observations: Observations) -> None:
         """Have an agent see or act late from the next step on, where it does not already."""
-        agent = planned.agent
-        already = any(going.vehicle == agent and going.what == planned.what for going in self._going)
+        agent, kind = planned.agent, planned.what
+        going_on = (going for going in self._going if going.last > self._step)  # others are let go in the next step
+        already = any(going.vehicle == agent and going.what == kind for going in going_on)
         made = self._filter(planned) if agent in observations and agent in self._simulator.agents else None
         if made is None or already:
             self._tell(planned)

@@ -118,6 +118,13 @@ def test_a_vehicle_errs_once_at_a_time_and_right_after_again(run):
     assert [(one.step, one.vehicle) for one in result.disturbances] == [(5, "leader"), (15, "leader")]
 
 
+@pytest.mark.parametrize("what", ["late_observation", "late_action", "noisy_observation"])
+def test_so_do_the_eyes_and_hands_of_an_agent(run, what):
+    some = [planned(step, what, "itself", 0.3, long) for step, long in ((5, 1.0), (10, 1.0), (15, 0.5))]
+    result, _ = run(*some)
+    assert [(one.step, one.vehicle) for one in result.disturbances] == [(5, "ego"), (15, "ego")]
+
+
 def test_a_late_observation_is_recorded_as_it_is_shown(run):
     _, without = run(steps=30)
     late = planned(11, "late_observation", "itself", 0.3, 1.0)
