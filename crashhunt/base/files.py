@@ -51,12 +51,10 @@ def sync_tree(folder: Path) -> None:
     Raises:
         OSError: the disk is full, or broken.
     """
-    folders, files = [folder], []
-    for path in folder.rglob("*"):
-        if path.is_dir():
-            folders.append(path)
-        elif path.is_file():
-            files.append(path)
+    folders, files = [], []
+    for parent, _, names in os.walk(folder):
+        folders.append(parent)
+        files += [path for name in names if os.path.isfile(path := os.path.join(parent, name))]  # noqa: PTH113, PTH118
     # Several take a disk as long as one: a file system with a journal writes it once for all of them.
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         for _ in threads.map(_sync_all, [files[share::_AT_ONCE] for share in range(_AT_ONCE)]):
@@ -65,19 +63,19 @@ def sync_tree(folder: Path) -> None:
             pass
 
 
-def sync_folder(*folders: Path) -> None:
+def sync_folder(*folders: str | Path) -> None:
     """Have the names in folders on the disk, where the file system can do that."""
     with suppress(OSError):  # some network file systems cannot
         for folder in folders:
             _sync(folder)
 
 
-def _sync_all(paths: list[Path]) -> None:
+def _sync_all(paths: list[str]) -> None:
     for path in paths:
         _sync(path)
 
 
-def _sync(path: Path) -> None:
+def _sync(path: str | Path) -> None:
     opened = os.open(path, os.O_RDONLY)
     try:
         os.fsync(opened)

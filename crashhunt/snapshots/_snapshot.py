@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib.machinery
+import os
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
@@ -20,9 +21,6 @@ from crashhunt.base.tolerance import typed_where_there
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
 from crashhunt.snapshots._data import Environment, Manifest
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 __all__ = ["Snapshot", "latest_snapshot"]
 
@@ -161,13 +159,13 @@ class Snapshot:
         return (self.path / name).is_symlink() or any(name.endswith(suffix) for suffix in _IMPORTABLE)
 
     def _added(self) -> list[str]:
-        there = (
-            path.relative_to(self.path).as_posix()
-            for part in _PARTS
-            for path in (self.path / part).rglob("*")
-            if path.is_symlink() or not path.is_dir()
-        )
-        return sorted(name for name in there if name not in self.manifest["files"])
+        found = []
+        for part in _PARTS:
+            for parent, folders, files in os.walk(self.path / part):
+                below = Path(parent).relative_to(self.path).as_posix()
+                links = [name for name in folders if os.path.islink(os.path.join(parent, name))]  # noqa: PTH114, PTH118
+                found += [f"{below}/{name}" for name in (*files, *links)]
+        return sorted(name for name in found if name not in self.manifest["files"])
 
     def verify(self) -> None:
         """Check that everything is as it was.

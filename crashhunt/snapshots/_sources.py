@@ -131,7 +131,7 @@ def _take_module(name: str, found: Sources) -> None:
     file = getattr(module, "__file__", None)
     for folder in map(Path, getattr(module, "__path__", ())):
         for path in _walk(folder):
-            found.files[f"{layout.CODE}/{name}/{path.relative_to(folder).as_posix()}"] = path
+            found.files[f"{layout.CODE}/{name}/{path}"] = folder / path
         return
     if file is not None:
         found.files[f"{layout.CODE}/{Path(file).name}"] = Path(file)
@@ -141,14 +141,14 @@ def _is_page(place: str) -> bool:
     return place.startswith(f"{layout.CODE}/crashhunt/guide/") and place.endswith(".md")
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    """All files below a folder; links to folders are not followed."""
+def _walk(folder: Path) -> Iterator[str]:
+    """The names of all files below a folder; links to folders are not followed."""
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(set(folders) - _GENERATED)
+        below = Path(parent).relative_to(folder).as_posix()
         for name in sorted(files):
-            path = Path(parent, name)
-            if path.is_file() and path.suffix != ".pyc":
-                yield path
+            if os.path.splitext(name)[1] != ".pyc" and os.path.isfile(os.path.join(parent, name)):  # noqa: PTH113, PTH118, PTH122
+                yield name if below == "." else f"{below}/{name}"
 
 
 def _listing_that_has(place: Path, name: str, found: Sources) -> tuple[Path, list[str]] | None:
@@ -237,5 +237,5 @@ def _take_root(root: Path, found: Sources, without: Path | None) -> None:
         return
     if not path.is_dir():
         raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="mend the path")
-    names = list(_listed(path)) or [file.relative_to(path).as_posix() for file in _walk(path)]
+    names = list(_listed(path)) or list(_walk(path))
     _take_tree(path, names, found, imports=[path], without=without)
