@@ -294,6 +294,14 @@ def test_the_folder_of_a_cluster_is_removed_by_whoever_comes_after_its_owner(tmp
     assert [path.name for path in tmp_path.iterdir()] == ["chr-other"], "which is not of ours"
 
 
+@pytest.mark.parametrize("usual", ["/größer", "/a-name-that-is-too-long-for-the-sockets-of-ray"])
+def test_a_folder_in_which_ray_cannot_work_is_not_used(usual, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", usual)
+    folder = Folder()
+    folder.remove()
+    assert folder.path.parent == Path("/tmp")
+
+
 def test_a_folder_of_somebody_else_is_not_used(tmp_path):
     (tmp_path / "open").mkdir(mode=0o777)
     (tmp_path / "open").chmod(0o777)

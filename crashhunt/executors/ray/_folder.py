@@ -18,15 +18,15 @@ _LONGEST = 40  # characters of a folder in which Ray can make its sockets
 
 
 class Folder:
-    """A new folder with a short name; those whose owners are gone are removed first.
+    """A new folder with a short name, of letters that Ray knows; those whose owners are gone are removed first.
 
     Args:
-        parent: of it; the folder for temporary files by default, where its name is not too long.
+        parent: of it; the folder for temporary files by default, where its name is such.
     """
 
     def __init__(self, parent: Path | None = None) -> None:
         usual = tempfile.gettempdir()
-        parent = parent or Path(usual if len(usual) <= _LONGEST else "/tmp")
+        parent = parent or Path(usual if len(usual) <= _LONGEST and usual.isascii() else "/tmp")
         for old in parent.glob(f"{_PREFIX}*"):
             remove_if_left(old / _LOCK)
         self.path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
