@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import hashlib
 import json
+import os
 import socket
 import stat
 import tempfile
@@ -90,7 +91,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
         index: ArchiveIndex = {
             "schema": SCHEMA,
             "crash": bundle.id,
-            "made_by": f"{getpass.getuser()}@{socket.gethostname()}",
+            "made_by": f"{_user()}@{socket.gethostname()}",
             "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
             "files": entries,
         }
@@ -188,6 +189,13 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
             copy.write(chunk)
     if size != listed["size"] or digest.hexdigest() != listed["blake2b"]:
         raise _refusal(path, f"{entry.filename!r} has changed")
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # as in a container that was given a user whom its files do not know
+        return str(os.getuid())
 
 
 def _refusal(path: Path, message: str) -> BundleError:

@@ -31,13 +31,16 @@ def signature(index: ArchiveIndex) -> str:
 
 def _key() -> bytes:
     """The secret of this user on this machine, made when it is first needed."""
-    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    key = secrets.token_bytes(32)
+    try:
+        state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    except RuntimeError:
+        return key  # a user without a home, as in a container; see below
     file = Path(state) / "crashhunt" / layout.ARCHIVE_KEY
     try:
         return file.read_bytes()
     except OSError:
         pass  # none yet, or it may not be read
-    key = secrets.token_bytes(32)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         temporary = file.with_name(f".{file.name}.{os.getpid()}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import stat
 import zipfile
@@ -150,6 +151,17 @@ def test_without_a_place_for_a_key_every_archive_is_a_strangers(crash, tmp_path,
     home.write_text("a file where the folder should be")
     export_crash(crash, tmp_path / "crash.zip")
     with open_archive(tmp_path / "crash.zip") as archive:
+        assert not archive.made_here
+
+
+def test_a_user_without_a_name_or_a_home_exports_as_well(crash, tmp_path, monkeypatch):
+    """As in a container that was started with ``--user 54321``."""
+    for name in ("HOME", "XDG_STATE_HOME", "USER", "LOGNAME", "LNAME", "USERNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 54321)
+    export_crash(crash, tmp_path / "crash.zip")
+    with open_archive(tmp_path / "crash.zip") as archive:
+        assert archive.made_by.startswith("54321@")
         assert not archive.made_here
 
 
