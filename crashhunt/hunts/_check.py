@@ -380,5 +380,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         hunt.glob(".scratch"),
     )
     for path in sorted({path for place in places for path in place}):
-        what = "somebody was killed while writing it; it may be removed"
+        remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
+        why = "shrink goes on from it" if remembers else "somebody was killed while writing it"
+        what = f"{why}; it may be removed"
         found.findings.append(Finding(str(path), what, damaged=False))

@@ -61,6 +61,7 @@ def test_a_budget_that_is_too_small_leaves_the_best_and_is_gone_on_from(hunt):
     assert part.ended == "budget"
     assert part.trials <= 3
     assert "larger --budget" in part.why
+    assert "000000-collision.small.jsonl: shrink goes on from it" in hunt.crashhunt("check", "h").out
     whole = shrink(bundle, parallel=1)
     assert whole.ended == "done"
     shutil.rmtree(whole.small.path)
