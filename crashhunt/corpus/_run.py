@@ -248,13 +248,26 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
         case = read_case(path)
         expected, was, note = case.expect, case.crash, case.note
         bundle = case.bundle()
-        snapshot = Snapshot(path / layout.SNAPSHOTS / bundle.snapshot)
-        snapshot.verify()
+        snapshot = _whole(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
         running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
     except CrashhuntError as error:
         return CaseReport(path, expected, "cannot_run", was, str(error), note)
     stack.callback(running.close)
     return running
+
+
+def _whole(snapshot: Snapshot) -> Snapshot:
+    """Return the snapshot of a case.
+
+    Raises:
+        BundleError: it is damaged; what a replay could do about it, nobody can here.
+    """
+    try:
+        snapshot.verify()
+    except BundleError as error:
+        fix = "get the case back from the repository, or add the crash anew"
+        raise BundleError(error.message, fix=fix, where=error.where) from None
+    return snapshot
 
 
 def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
