@@ -73,13 +73,13 @@ class Commands:
 
     def begin(
         self, words: Sequence[str], folder: Path, environment: Mapping[str, str], *, terminal: int | None = None,
-        start_new_session: bool = False,
+        start_new_session: bool = False, typed: str = "",
     ) -> Begun:  # fmt: skip
         """Begin a command; its standard error is the terminal, where one is given, and then not returned."""
         request = {
             "words": words, "folder": str(folder), "environment": dict(environment), "apart": start_new_session,
         }  # fmt: skip
-        return Begun(self._control, request, terminal)
+        return Begun(self._control, request, terminal, typed)
 
     def run(
         self,
@@ -118,15 +118,20 @@ class Commands:
 class Begun:
     """A command that has begun, as far as tests use a `subprocess.Popen`."""
 
-    def __init__(self, control: socket.socket, request: Mapping[str, object], terminal: int | None = None) -> None:
+    def __init__(
+        self, control: socket.socket, request: Mapping[str, object], terminal: int | None = None, typed: str = ""
+    ) -> None:
         self.returncode: int | None = None
         self._words = request["words"]
         self._files = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - closed when they are read
         self._printed: tuple[str, str] | None = None
         self._reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         out, err = (file.fileno() for file in self._files)
-        with theirs:
-            socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), out, terminal or err])
+        with theirs, tempfile.TemporaryFile() as file:
+            file.write(typed.encode())
+            file.seek(0)
+            files = [theirs.fileno(), file.fileno(), out, terminal or err]
+            socket.send_fds(control, [json.dumps(request).encode()], files)
         self.pid = int(self._reply.recv(_MESSAGE))
 
     def poll(self) -> int | None:
@@ -187,7 +192,7 @@ def _serve(control: socket.socket) -> None:
                 reply.send(str(os.waitstatus_to_exitcode(status)).encode())
         if control not in ready:
             continue
-        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 3)
+        data, descriptors, _, _ = socket.recv_fds(control, _MESSAGE, 4)
         if not data:
             return
         request = json.loads(data)
@@ -210,9 +215,9 @@ def _serve(control: socket.socket) -> None:
         running[os.pidfd_open(pid)] = pid, reply
 
 
-def _be_command(request: dict, out: int, err: int) -> NoReturn:
+def _be_command(request: dict, typed: int, out: int, err: int) -> NoReturn:
     """Do what the script `crashhunt` does, and end as a process of Python ends."""
-    for descriptor, copy in ((out, 1), (err, 2)):
+    for descriptor, copy in ((typed, 0), (out, 1), (err, 2)):
         os.dup2(descriptor, copy)
         os.close(descriptor)
     if request["apart"]:

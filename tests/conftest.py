@@ -133,11 +133,11 @@ class Shell:
         )  # fmt: skip
         return _ended(words, Done(done.returncode, done.stdout, done.stderr), expect)
 
-    def begin(self, *words: str, start_new_session: bool = False) -> Begun | subprocess.Popen[str]:
+    def begin(self, *words: str, start_new_session: bool = False, typed: str = "") -> Begun | subprocess.Popen[str]:
         """Begin a command, in a fork where that is the same; the caller ends it."""
-        if not _commands().fits(self.environment):
+        if not typed and not _commands().fits(self.environment):
             return self.start(*words, start_new_session=start_new_session)
-        return _commands().begin(words, self.folder, self.environment, start_new_session=start_new_session)
+        return _commands().begin(words, self.folder, self.environment, start_new_session=start_new_session, typed=typed)
 
     def start(self, *words: str, **options: Any) -> subprocess.Popen[str]:
         """Start a command as a shell does it, with nobody between it and its keepers; the caller ends it."""

@@ -125,8 +125,9 @@ class Warm:
         """Start a keeper as `subprocess.Popen` does, in a fork where that comes to the same."""
         environment, folders = options["env"], path_of(options["env"])
         there = {path.name.partition(".")[0] for folder in folders for path in Path(folder).glob("*")}
-        fits = at_start(environment) == self._at_start and options["start_new_session"]
-        if not fits or not there.isdisjoint({"sitecustomize", "usercustomize", "numpy", *sys.stdlib_module_names}):
+        if at_start(environment) != self._at_start or not there.isdisjoint(
+            {"sitecustomize", "usercustomize", "numpy", *sys.stdlib_module_names}
+        ):
             return subprocess.Popen(words, **options)
         return Forked(self.control, words, **options)
 
@@ -150,7 +151,7 @@ class Forked:
             ]  # fmt: skip
             request = {
                 "words": words[2:], "environment": dict(env), "folder": str(Path.cwd()), "numbers": numbers,
-                "simulator": _simulator_of(words[-1]),
+                "simulator": _simulator_of(words[-1]), "apart": start_new_session,
             }  # fmt: skip
             socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), *given, *pass_fds])
         self.pid = int(self._reply.recv(_MESSAGE))
@@ -339,7 +340,8 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
     for descriptor, number in zip(kept, request["numbers"], strict=True):
         os.dup2(descriptor, number)
         os.close(descriptor)
-    os.setsid()
+    if request["apart"]:
+        os.setsid()
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["folder"])

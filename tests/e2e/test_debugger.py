@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 
 import pytest
-from conftest import CRASHHUNT
+from conftest import CRASHHUNT, Done
 
 
 def hunted(shell):
@@ -18,13 +18,24 @@ def crash(shell, made_once):
     return made_once(hunted, shell)
 
 
-def typed(shell, text: str, *words: str) -> str:
-    done = subprocess.run(
-        [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.unmeasured, input=text,
-        capture_output=True, text=True, timeout=150, check=False,
-    )  # fmt: skip
-    assert "Traceback" not in done.stderr, done.stderr
-    return done.stdout
+def typed(shell, text: str, *words: str, fork: bool = False, expect: int | None = None) -> str:
+    """What a replay prints to whom that is typed; one starts as a shell does it, and those do not that fork.
+
+    Coverage is not measured, which needs what a debugger needs.
+    """
+    if fork and shell.environment == shell.unmeasured:
+        begun = shell.begin("replay", "h", *words, typed=text)
+        out, err = begun.communicate(timeout=150)
+        done = Done(begun.returncode, out, err)
+    else:
+        process = subprocess.run(
+            [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.unmeasured, input=text,
+            capture_output=True, text=True, timeout=150, check=False,
+        )  # fmt: skip
+        done = Done(process.returncode, process.stdout, process.stderr)
+    assert "Traceback" not in done.err, done.err
+    assert expect in (None, done.code)
+    return done.out
 
 
 @pytest.mark.long
@@ -34,14 +45,14 @@ def test_the_debugger_is_in_the_agents_act_at_the_step_before_the_crash(crash):
     first = (crash.folder / "faulty.py").read_text().splitlines().index("        self.step += 1") + 1
     assert f"code/faulty.py({first})act()" in out
     assert "reproduced: 29 of 29 steps" in out
-    out = typed(crash, "p 'at', step\nc\n", "--pdb", "--before", "10")
+    out = typed(crash, "p 'at', step\nc\n", "--pdb", "--before", "10", fork=True)
     assert "('at', 19)" in out
     assert "reproduced: 19 of 29 steps" in out
 
 
 def test_backwards_and_on_from_there_to_the_same_bits(crash):
     asked = "p 'at', step, self.step, scene.time_s\n"
-    out = typed(crash, f"{asked}back 5\n{asked}back\n{asked}back 99\nc\n", "--pdb")
+    out = typed(crash, f"{asked}back 5\n{asked}back\n{asked}back 99\nc\n", "--pdb", fork=True)
     (first, self_first, time_s), *others = [
         eval(line.removeprefix("(Pdb) "))[1:] for line in out.splitlines() if line.startswith("(Pdb) ('at'")
     ]
@@ -53,13 +64,7 @@ def test_backwards_and_on_from_there_to_the_same_bits(crash):
 
 
 def test_quitting_the_debugger_is_no_crash_of_ours(crash):
-    done = subprocess.run(
-        [CRASHHUNT, "replay", "h", "--pdb"], cwd=crash.folder, env=crash.unmeasured, input="q\n",
-        capture_output=True, text=True, timeout=150, check=False,
-    )  # fmt: skip
-    assert done.returncode == 130
-    assert "Traceback" not in done.stderr
-    assert "reproduced" not in done.stdout
+    assert "reproduced" not in typed(crash, "q\n", "--pdb", fork=True, expect=130)
 
 
 def test_a_breakpoint_in_the_users_code_works(crash):
