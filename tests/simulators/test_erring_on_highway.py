@@ -213,6 +213,28 @@ def test_who_crosses_the_agents_way(begin, road, who, found):
     assert places == ({who} if found else set())
 
 
+def test_who_is_steered_has_no_route_and_its_way_is_crossed_where_its_lane_leads(begin):
+    episode, _ = begin(**JUNCTION | {"env": "intersection-v1"})
+    env = episode.simulator._env
+    road, agent = env.road, env.vehicle
+    assert type(agent).__name__ == "BicycleVehicle"
+    places = {}
+    for road_of_agent in (
+        ("o0", "ir0"),
+        ("ir0", "il2"),
+    ):  # before the junction it may go anywhere, and in it straight on
+        lane, other = road.network.get_lane((*road_of_agent, 0)), road.network.get_lane(("o1", "ir1", 0))
+        agent.position, agent.heading = np.array(lane.position(2.0, 0.0)), lane.heading_at(2.0)
+        agent.on_state_update()
+        crosser = IDMVehicle(road, other.position(95.0, 0.0), other.heading_at(95.0), 9.0)
+        crosser.plan_route_to("o3")
+        road.vehicles[:] = [agent, crosser]
+        episode.simulator._look(())
+        found = [cell for cell in CELLS if episode.simulator.whom(planned(1, "ignore_priority", cell, 1.0))]
+        places[road_of_agent] = found
+    assert places == {("o0", "ir0"): [], ("ir0", "il2"): ["left ahead"]}
+
+
 def test_a_vehicle_merges_only_where_its_lane_ends(begin):
     episode, idle = begin(planned(2, "late_merge", "right ahead", 15.0, 9.0), env="merge-v0")
     road, agent = episode.simulator._env.road, episode.simulator._env.vehicle

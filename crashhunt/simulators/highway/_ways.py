@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from highway_env.vehicle.controller import ControlledVehicle
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,7 +63,9 @@ def _way(network: RoadNetwork, vehicle: Any) -> tuple[set[_Road], NDArray[np.flo
 def _lanes(network: RoadNetwork, vehicle: Any) -> Iterator[tuple[str, str, int]]:
     """Its lane and those after it, as far as there is no doubt; `RoadNetwork.next_lane` would draw where there is."""
     start, end, number = vehicle.lane_index
-    planned = {road[0]: road[1] for road in vehicle.route or ()}
+    # Nobody has planned where a vehicle goes that is steered and not told its lanes.
+    route = vehicle.route if isinstance(vehicle, ControlledVehicle) else None
+    planned = {road[0]: road[1] for road in route or ()}
     seen = set()
     while (start, end) not in seen:
         yield start, end, number
