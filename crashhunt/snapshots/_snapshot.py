@@ -178,7 +178,7 @@ class Snapshot:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise BundleError(
                 f"the snapshot is damaged: {faults[0]}{more}",
-                fix="get an undamaged copy of the hunt's directory, or give --force",
+                fix="get an undamaged copy of the hunt's directory; crashhunt replay --force takes it as it is",
                 where=str(self.path),
             )
 
