@@ -215,6 +215,12 @@ REAL = {
          "arguments": {"blind_spot_m": "4:14", "desired_speed": "24:34", "patience_s": "0.5:3"},
          "scenario_arguments": {"demand": "3000:4500"}}, warmup_s=8.0,
     ),
+    "highway-crowd": Real(
+        "the intelligent driver model in a crowd on highway-env", 1 / 25,
+        {"scenario": "highway", "agents": {"": "idm"}, "max_steps": 15,
+         "arguments": {"headway_s": "0.2:1.5", "politeness": "0:1", "desired_speed": "22:30"},
+         "scenario_arguments": {"vehicles_count": "10:25", "vehicles_density": "1:2"}},
+    ),
     "highway-calm": Real(
         "car following with a short delay and a fair headway on highway-env", 1 / 150,
         {"scenario": "highway", "agents": {"": "car-following"}, "max_steps": 15,
