@@ -19,6 +19,7 @@ from ._escape import (
     slowing as slowing,
 )
 from ._find import (
+    crash_folders as crash_folders,
     find_bundle as find_bundle,
     list_bundles as list_bundles,
     list_near_misses as list_near_misses,

@@ -16,22 +16,27 @@ if TYPE_CHECKING:
 
 from crashhunt.crashes._bundle import Bundle, read_bundle
 
-__all__ = ["find_bundle", "list_bundles", "list_near_misses"]
+__all__ = ["crash_folders", "find_bundle", "list_bundles", "list_near_misses"]
 
 
 def list_bundles(directory: Path) -> list[Bundle]:
     """Return the crashes of a hunt, in order of their trials."""
-    return [read_bundle(folder) for folder in _folders(directory)]
+    return [read_bundle(folder) for folder in crash_folders(directory)]
 
 
 def list_near_misses(directory: Path) -> list[Bundle]:
     """Return the near misses of a hunt, the most dangerous first."""
-    found = [read_bundle(folder) for folder in _folders(directory, layout.NEAR_MISSES)]
+    found = [read_bundle(folder) for folder in crash_folders(directory, layout.NEAR_MISSES)]
     return sorted(found, key=lambda bundle: (-(bundle.result.danger or 0.0), bundle.result.spec.number))
 
 
-def _folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
-    """The folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller."""
+def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
+    """Return the folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller.
+
+    Args:
+        directory: of the hunt.
+        place: the folder there that has them.
+    """
     folders = (directory / place).glob(layout.SHOWN)
     found = (path for path in folders if path.is_dir() and not path.name.endswith(layout.SMALL))
     return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
@@ -80,7 +85,9 @@ _PLACES = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANC
 
 
 def _of_copies(directory: Path) -> list[Bundle]:
-    return [read_bundle(folder) for place in (layout.PROBES, layout.BRANCHES) for folder in _folders(directory, place)]
+    return [
+        read_bundle(folder) for place in (layout.PROBES, layout.BRANCHES) for folder in crash_folders(directory, place)
+    ]
 
 
 def _made_smaller(directory: Path) -> list[Bundle]:
@@ -95,7 +102,7 @@ def _may_be(bundle: Bundle, crash: str) -> bool:
 def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle]:
     """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
     found = []
-    for path in (folder for place in places for folder in _folders(directory, place)):
+    for path in (folder for place in places for folder in crash_folders(directory, place)):
         try:
             found.append(read_bundle(path))
         except BundleError:

@@ -16,6 +16,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.integrity import read_object
 from crashhunt.base.names import near_path
+from crashhunt.crashes import crash_folders
 from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._ledger_file import damaged
@@ -176,8 +177,7 @@ def _state(directory: Path, facts: Facts, outcomes: dict[str, int], last: float 
     said = facts.get("state", "queued")
     owner = facts.get("owner")
     alive = owner is not None and _is_alive(owner, facts.get("heartbeat", 0.0))
-    found = (directory / layout.CRASHES).glob(f"{layout.SHOWN}/{layout.CRASH}")
-    crashes = sum(not path.parent.name.endswith(layout.SMALL) for path in found)
+    crashes = len(crash_folders(directory))
     state: State = ("running" if alive else "killed") if said == "running" else _ENDED.get(said, "error")
     if state == "finished" and crashes:
         state = "crashed"

@@ -75,6 +75,10 @@ def test_every_end_has_its_state(toy):
     }  # fmt: skip
     assert (found["crash"]["crashes"], found["none"]["errors"]) == (1, 5)
     assert "told to fail" in found["none"]["detail"]
+    (lost,) = (toy.folder / "crash/crashes").glob("*/crash.json")
+    lost.unlink()
+    (found,) = toy.crashhunt("status", "crash", "--json").json["hunts"]
+    assert (found["state"], found["crashes"]) == ("crashed", 1)
     # All below a folder, and one that nobody can read hides no other.
     (toy.folder / "fine/ledger.sqlite").write_bytes(b"nonsense" * 1000)
     found = {hunt["dir"]: hunt["state"] for hunt in toy.crashhunt("status", ".", "--json", expect=2).json["hunts"]}
