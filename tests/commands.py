@@ -19,9 +19,9 @@ import tempfile
 import types
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, NoReturn
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
-from warm import Warm, at_start, leave_after, path_of
+from warm import Process, Warm, at_start, leave_after, path_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -115,39 +115,22 @@ class Commands:
             self._kept.wait()
 
 
-class Begun:
-    """A command that has begun, as far as tests use a `subprocess.Popen`."""
+class Begun(Process):
+    """A command that has begun."""
 
     def __init__(
-        self, control: socket.socket, request: Mapping[str, object], terminal: int | None = None, typed: str = ""
+        self, control: socket.socket, request: Mapping[str, Any], terminal: int | None = None, typed: str = ""
     ) -> None:
-        self.returncode: int | None = None
-        self._words = request["words"]
         self._files = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115 - closed when they are read
         self._printed: tuple[str, str] | None = None
-        self._reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         out, err = (file.fileno() for file in self._files)
         with theirs, tempfile.TemporaryFile() as file:
             file.write(typed.encode())
             file.seek(0)
             files = [theirs.fileno(), file.fileno(), out, terminal or err]
             socket.send_fds(control, [json.dumps(request).encode()], files)
-        self.pid = int(self._reply.recv(_MESSAGE))
-
-    def poll(self) -> int | None:
-        """Return how it has ended, if it has."""
-        with suppress(subprocess.TimeoutExpired):
-            self.wait(0)
-        return self.returncode
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, and return its exit code, or minus its signal."""
-        if self.returncode is None:
-            if not select.select([self._reply], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired(["crashhunt", *self._words], timeout or 0)
-            self.returncode = int(self._reply.recv(_MESSAGE))
-            self._reply.close()
-        return self.returncode
+        super().__init__(["crashhunt", *request["words"]], reply)
 
     def communicate(self, timeout: float | None = None) -> tuple[str, str]:
         """Wait for its end, and return what it has printed."""
@@ -156,19 +139,6 @@ class Begun:
             out, err = map(_text_of, self._files)
             self._printed = out, err
         return self._printed
-
-    def send_signal(self, number: int) -> None:
-        """Tell it something, if it is there."""
-        if self.poll() is None:
-            os.kill(self.pid, number)
-
-    def kill(self) -> None:
-        """Kill it, if it is there."""
-        self.send_signal(signal.SIGKILL)
-
-    def terminate(self) -> None:
-        """Ask it to end, if it is there."""
-        self.send_signal(signal.SIGTERM)
 
 
 def _text_of(file: IO[bytes]) -> str:

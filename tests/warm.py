@@ -132,15 +132,57 @@ class Warm:
         return Forked(self.control, words, **options)
 
 
-class Forked:
-    """A fork, as far as crashhunt uses a `subprocess.Popen`."""
+class Process:
+    """A fork of a process that is there already, as far as somebody uses a `subprocess.Popen`.
+
+    Args:
+        words: what it was started with.
+        reply: from where its number comes, and then how it has ended.
+    """
+
+    def __init__(self, words: Sequence[str], reply: socket.socket) -> None:
+        self.returncode: int | None = None
+        self._words, self._reply = words, reply
+        self.pid = int(reply.recv(_MESSAGE))
+
+    def poll(self) -> int | None:
+        """Return how it has ended, if it has."""
+        with suppress(subprocess.TimeoutExpired):
+            self.wait(0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end, and return its exit code, or minus its signal."""
+        if self.returncode is None:
+            if not select.select([self._reply], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired([*self._words], timeout or 0)
+            self.returncode = int(self._reply.recv(_MESSAGE) or -signal.SIGKILL)
+            self._reply.close()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Tell it something, if it is there."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Kill it, if it is there."""
+        self.send_signal(signal.SIGKILL)
+
+    def terminate(self) -> None:
+        """Ask it to end, if it is there."""
+        self.send_signal(signal.SIGTERM)
+
+
+class Forked(Process):
+    """A process that crashhunt starts."""
 
     def __init__(
         self, control: socket.socket, words: Sequence[str], *, env: Mapping[str, str], pass_fds: Sequence[int],
         start_new_session: bool, **streams: Any,
     ) -> None:  # fmt: skip
-        self.returncode: int | None = None
-        self._reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        reply, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         numbers = [0, 1, 2, *pass_fds]
         with theirs, open(os.devnull, "r+b") as nothing:
             given = [
@@ -154,29 +196,7 @@ class Forked:
                 "simulator": _simulator_of(words[-1]), "apart": start_new_session,
             }  # fmt: skip
             socket.send_fds(control, [json.dumps(request).encode()], [theirs.fileno(), *given, *pass_fds])
-        self.pid = int(self._reply.recv(_MESSAGE))
-
-    def poll(self) -> int | None:
-        """Return how it has ended, if it has."""
-        with suppress(subprocess.TimeoutExpired):
-            self.wait(0)
-        return self.returncode
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end."""
-        if self.returncode is None:
-            ready, _, _ = select.select([self._reply], [], [], timeout)
-            if not ready:
-                raise subprocess.TimeoutExpired([], timeout or 0)
-            self.returncode = int(self._reply.recv(_MESSAGE) or -signal.SIGKILL)
-            self._reply.close()
-        return self.returncode
-
-    def kill(self) -> None:
-        """Kill it, if it is there."""
-        if self.poll() is None:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+        super().__init__(words, reply)
 
 
 def _simulator_of(job: str) -> str:
