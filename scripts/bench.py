@@ -24,6 +24,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from crashhunt.episode import WorkerSettings
     from crashhunt.trial import TrialResult, TrialSpec
 
 CRASHHUNT = Path(sys.executable).parent / "crashhunt"
@@ -73,6 +74,35 @@ def hunt(directory: Path, parallel: int, trials: int, max_steps: int, *options: 
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
     found: dict[str, float] = json.loads(done.stdout)
     return found
+
+
+class Slot:
+    """A supervisor in this process, with its zygote; counts the processor time that trials take.
+
+    Args:
+        settings: of the hunt.
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        from crashhunt.base.processes import children_of
+        from crashhunt.executors import Supervisor, fork_zygote, worker_environment
+
+        os.environ.update(worker_environment())
+        before = set(children_of(os.getpid()))
+        self._supervisor = Supervisor(settings, fork_zygote(settings))
+        (self.zygote,) = set(children_of(os.getpid())) - before
+
+    def run(self, spec: TrialSpec) -> TrialResult:
+        """Run a trial, which has to get as far as its first step."""
+        result = self._supervisor.run(spec).result
+        if not result.steps:
+            raise RuntimeError(f"the trial failed: {result.failure}")
+        return result
+
+    def cpu_s(self) -> float:
+        """Processor time of this process, of the zygote and of all trials that have ended, in s."""
+        fields = Path(f"/proc/{self.zygote}/stat").read_text().rpartition(")")[2].split()
+        return time.process_time() + sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 # Episodes in which nothing but the machinery and the traffic differ from a bare loop.
@@ -191,42 +221,89 @@ def bench_step() -> Iterator[Figure]:
 
 
 def child_core(scenario: str) -> dict[str, float]:
-    """Whole trials as a worker runs them, with the compiled core and without, in turns in one process."""
+    """Whole trials as a hunt runs them, with the compiled core and without, in turns."""
     from dataclasses import replace
 
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors import Worker
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.scenario.backends.sumo import SumoSetup
     from crashhunt.trial import TrialSpec
 
-    chosen, rounds, clock = load_scenario(scenario), 9, time.process_time
+    chosen, rounds, at_once = load_scenario(scenario), 6, 8  # the kernel counts in hundredths of a second
     arguments = {"ego": {"speed": 8.0}} if scenario == "loop" else {}  # of the agents that they name
-    answer = os.dup(1)  # the worker takes standard output over
     spent: dict[tuple[int, bool], list[float]] = {}
     with folder() as scratch:
-        workers = {}
+        slots = {}
         for native in (True, False):
             (place := scratch / str(native)).mkdir()
             one = chosen.with_table(replace(chosen.table(SumoSetup), native=None if native else False))
             oracles = ("reported-collision", "overlap", "off-road")
-            workers[native] = Worker(WorkerSettings(scenario=one, oracles=oracles, crash_on=(), scratch=place))
+            slots[native] = Slot(WorkerSettings(scenario=one, oracles=oracles, crash_on=(), scratch=place))
         for number in range(rounds + 1):
             for turn, steps in enumerate((85, 600)):
-                trial = 2 * number + turn
-                for native, worker in workers.items():
-                    began = clock()
-                    result = worker.run(TrialSpec(trial, number, arguments, argument_values(chosen), steps))
-                    if not result.steps:
-                        raise RuntimeError(f"the trial failed: {result.failure}")
+                for native, slot in slots.items():
+                    began = slot.cpu_s()
+                    for again in range(at_once if number else 1):
+                        trial = (2 * number + turn) * at_once + again
+                        slot.run(TrialSpec(trial, trial, arguments, argument_values(chosen), steps))
                     if number:  # the first warms everything up
-                        spent.setdefault((steps, native), []).append(clock() - began)
-        os.dup2(answer, 1)
+                        spent.setdefault((steps, native), []).append((slot.cpu_s() - began) / at_once)
     found = {f"{steps}_{native}": statistics.median(seconds) for (steps, native), seconds in spent.items()}
     for steps in (85, 600):
         pairs = zip(spent[steps, False], spent[steps, True], strict=True)
         found[f"{steps}_ratio"] = statistics.median(without / with_it for without, with_it in pairs)
     return found
+
+
+def child_isolation(scenario: str) -> dict[str, float]:
+    """Trials in processes of their own against the same ones after each other in one process, in turns."""
+    from crashhunt.episode import Parts, WorkerSettings, run_episode
+    from crashhunt.recording import BlackBox
+    from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
+    from crashhunt.trial import TrialSpec
+
+    toy, rounds = scenario == "toy", 6
+    chosen = (
+        Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")}) if toy else load_scenario(scenario)
+    )
+    oracles = ("overlap",) if toy else ("reported-collision", "overlap", "off-road")
+    arguments, values = {"ego": {"speed": 8.0}}, argument_values(chosen)
+    spent: dict[tuple[int, str], list[float]] = {}
+    with folder() as scratch:
+        settings = WorkerSettings(scenario=chosen, oracles=oracles, crash_on=(), scratch=scratch)
+        slot = Slot(settings)  # forked before this process runs anything
+        parts = Parts(settings)
+        parts.load()
+        simulator, box = parts.simulator(), BlackBox(scratch / "box")
+
+        def in_one_process(spec: TrialSpec) -> TrialResult:
+            box.begin(pid=os.getpid(), trial=spec.number, started=time.monotonic())
+            made = parts.oracles()
+            return run_episode(spec, simulator=simulator, make_agent=parts.agent, box=box, oracles=made, crash_on=())
+
+        for number in range(rounds + 1):
+            for steps, at_once in ((1, 100),) if toy else ((85, 8), (600, 4)):
+                for way, run in (("apart", slot.run), ("together", in_one_process)):
+                    began, wall = slot.cpu_s(), time.perf_counter()
+                    for again in range(at_once if number else 1):
+                        trial = number * 1000 + again
+                        run(TrialSpec(trial, trial, arguments, values, steps))
+                    if number:  # the first warms everything up
+                        spent.setdefault((steps, way), []).append((slot.cpu_s() - began) / at_once)
+                        spent.setdefault((steps, f"{way}_wall"), []).append((time.perf_counter() - wall) / at_once)
+    return {f"{steps}_{way}": statistics.median(seconds) for (steps, way), seconds in spent.items()}
+
+
+def bench_isolation() -> Iterator[Figure]:
+    """What it costs that every trial has a process of its own."""
+    found = in_child("child_isolation", "loop")
+    for steps, target in ((85, 1.15), (600, 1.05)):
+        apart, together = found[f"{steps}_apart"], found[f"{steps}_together"]
+        note = f"{apart * 1e3:.1f} ms of CPU a trial of {steps} steps on loop, {together * 1e3:.1f} ms in one process"
+        yield Figure(f"isolation_loop_{steps}", apart / together, "x", "lower", target, note)
+    found = in_child("child_isolation", "toy")
+    note = f"wall time of a trial of one step of the toy; {found['1_together_wall'] * 1e3:.2f} ms in one process"
+    yield Figure("isolation_toy", found["1_apart_wall"] * 1e3, "ms", "lower", 1.5, note)
 
 
 def bench_core() -> Iterator[Figure]:
@@ -401,32 +478,30 @@ def bench_help() -> Iterator[Figure]:
 
 
 def child_memory(trials: str) -> dict[str, float]:
-    """Resident memory of a worker after a tenth and after all of its trials."""
+    """Resident memory of a supervisor and its zygote after a tenth and after all of their trials."""
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors import Worker
     from crashhunt.scenario import argument_values, load_scenario
     from crashhunt.trial import TrialSpec
 
     scenario = load_scenario("loop")
     with folder() as scratch:
-        # The worker takes standard output over; the answer goes to where it was.
-        answer = os.dup(1)
         oracles = ("reported-collision", "overlap", "off-road")
-        worker = Worker(WorkerSettings(scenario=scenario, oracles=oracles, crash_on=(), scratch=scratch))
+        slot = Slot(WorkerSettings(scenario=scenario, oracles=oracles, crash_on=(), scratch=scratch))
         sizes = {}
         for number in range(1, int(trials) + 1):
             values = argument_values(scenario)
-            worker.run(TrialSpec(number, number, {"ego": {"speed": 8.0}}, values, max_steps=50))
+            slot.run(TrialSpec(number, number, {"ego": {"speed": 8.0}}, values, max_steps=50))
             if number in (int(trials) // 10, int(trials)):
-                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                pages = sum(
+                    int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in (os.getpid(), slot.zygote)
+                )
                 sizes[number] = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-        os.dup2(answer, 1)
     first, last = sizes.values()
     return {"first": first, "last": last}
 
 
 def bench_memory() -> Iterator[Figure]:
-    """A worker's memory over 2,000 trials."""
+    """The memory of a slot over 2,000 trials."""
     found = in_child("child_memory", "2000")
     note = f"{found['first']:.0f} MiB after 200 trials, {found['last']:.0f} MiB after 2,000"
     yield Figure("worker_memory_growth", found["last"] / found["first"], "x", "lower", 1.05, note)
@@ -897,6 +972,7 @@ def bench_ray() -> Iterator[Figure]:
 BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "core": bench_core,
+    "isolation": bench_isolation,
     "parallel": bench_parallel,
     "orchestration": bench_orchestration,
     "ceiling": bench_ceiling,

@@ -132,9 +132,9 @@ def test_a_command_imports_no_library_before_it_knows_that_it_needs_one():
     )
 
 
-def test_no_module_is_longer_than_four_hundred_lines():
+def test_no_module_is_longer_than_eight_hundred_lines():
     lengths = {file.relative_to(ROOT).as_posix(): len(file.read_text().splitlines()) for file in ROOT.rglob("*.py")}
-    assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
+    assert {name: lines for name, lines in lengths.items() if lines > 800} == {}
 
 
 def test_there_is_one_conftest():

@@ -50,7 +50,7 @@ _read: dict[tuple[str, str], str | None] = {}  # what a file says of something t
 _made: dict[str, tuple[types.CodeType, bytes]] = {}  # what a module of crashhunt is made from
 # What is there when one of these has been imported: modules, their code, and what their files say.
 _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]]] = {}
-_BEGIN_WITH = ("crashhunt.executors._template", "crashhunt.executors._fresh")
+_BEGIN_WITH = ("crashhunt.executors._fork_server", "crashhunt.executors._fresh")
 # What these import as soon as they have read what is to be done.
 _SCENARIO = "crashhunt.scenario._load"
 _GO_ON_WITH = {
@@ -414,7 +414,7 @@ if __name__ == "__main__":
     _compile()
     _import_ours()
     _import(
-        "crashhunt.executors._template",
+        "crashhunt.executors._fork_server",
         "crashhunt.executors._fresh",
         "crashhunt.simulators.toy",
         "crashhunt.recording._log",

@@ -5,7 +5,7 @@ from ._first_copy import FirstCopy as FirstCopy
 from ._nearness import Nearness as Nearness
 from ._observer import Observer as Observer
 from ._overruled import Braking as Braking, Keeping as Keeping, overruled_agent as overruled_agent
-from ._parts import Parts as Parts, require_origin as require_origin, seal as seal
+from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
 from ._probes import (
     BUDGET as BUDGET,
     BUDGET_BESIDE as BUDGET_BESIDE,
@@ -13,7 +13,7 @@ from ._probes import (
     Probed as Probed,
     Prober as Prober,
 )
-from ._recorder import Recorder as Recorder
+from ._recorder import Recorder as Recorder, ready_recorder as ready_recorder
 from ._run import (
     generators as generators,
     run_episode as run_episode,
@@ -26,3 +26,4 @@ from ._settings import (
     answer_file as answer_file,
     scratch_of as scratch_of,
 )
+from ._wiring import options_of as options_of

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Value
 
-__all__ = ["Parts", "require_origin", "seal"]
+__all__ = ["Parts", "require_origin", "seal", "stage_of"]
 
 
 class Parts:
@@ -76,8 +76,8 @@ class Parts:
 
     def simulator(self) -> Simulator:
         """Make a simulator, with a folder for files of its own."""
-        stage = self._settings.scratch / f"stage-{os.getpid()}"
-        stage.mkdir(exist_ok=True)
+        stage = stage_of(self._settings.scratch, os.getpid())
+        stage.mkdir(parents=True, exist_ok=True)
         scenario = self._settings.scenario
         made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
         return made
@@ -112,6 +112,11 @@ class Parts:
                 require_origin(factory.__module__, self._settings.code)
             found = self._factories[agent] = factory, signature_of(factory).given
         return found
+
+
+def stage_of(scratch: Path, pid: int) -> Path:
+    """Return the folder for files of the simulator that a process has made."""
+    return scratch / f"stage-{pid}"
 
 
 def seal(settings: WorkerSettings) -> None:

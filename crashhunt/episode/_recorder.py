@@ -29,16 +29,15 @@ from crashhunt.simulators import NamesObservations, TellsEvents
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from gymnasium import Space
     from numpy.typing import NDArray
 
     from crashhunt.episode._episode import Episode
     from crashhunt.native import UsualSteps
-    from crashhunt.simulators import Simulator
+    from crashhunt.simulators import ActionForm, Simulator
     from crashhunt.trial import Disturbance, TrialResult
     from crashhunt.world import Actor, Roster, Scene
 
-__all__ = ["Recorder"]
+__all__ = ["Recorder", "ready_recorder"]
 
 
 class Recorder(Observer):
@@ -76,7 +75,7 @@ class Recorder(Observer):
         channels = []
         for agent in episode.names:
             space, form = simulator.observation_spaces[agent], simulator.actions[agent]
-            sample = form.encode(_any_action(form.space))
+            sample = _sample_of(form)
             shown = np.dtype(space.dtype).str, tuple(space.shape or ())
             channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
         self._box.set_up(episode.setup_steps or 0)
@@ -141,7 +140,25 @@ class Recorder(Observer):
         return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
 
 
-def _any_action(space: Space[object]) -> object:
+_ready: dict[int, tuple[ActionForm, NDArray[np.generic]]] = {}  # by identity, which holds as long as the form is here
+
+
+def ready_recorder(simulator: Simulator) -> None:
+    """Encode an action of each agent ahead of the first episode, whose recorder then need not.
+
+    Seeding a space takes longer than many steps. A fork inherits the generators of the spaces as this leaves them, so
+    an agent that samples from its action space gets the same. Only for simulators whose `reset` leaves them alone.
+    """
+    for form in simulator.actions.values():
+        _ready[id(form)] = form, _encode_any(form)
+
+
+def _sample_of(form: ActionForm) -> NDArray[np.generic]:
+    ready = _ready.pop(id(form), None)  # for one episode: afterwards an agent may have sampled from the space
+    return _encode_any(form) if ready is None else ready[1]
+
+
+def _encode_any(form: ActionForm) -> NDArray[np.generic]:
     # Only the shape and type of the encoded action matter.
-    space.seed(0)
-    return space.sample()
+    form.space.seed(0)
+    return form.encode(form.space.sample())

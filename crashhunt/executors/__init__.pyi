@@ -1,4 +1,5 @@
 from ._environment import worker_environment as worker_environment
+from ._fork_server import fork_zygote as fork_zygote
 from ._fresh import FreshProcessExecutor as FreshProcessExecutor, fresh_environment as fresh_environment
 from ._make import make_executor as make_executor
 from ._pool import PoolExecutor as PoolExecutor
@@ -9,8 +10,6 @@ from ._protocol import (
     NodeFigures as NodeFigures,
     SizesItself as SizesItself,
 )
-from ._worker import (
-    LEFT_OUT as LEFT_OUT,
-    Worker as Worker,
-    read_map as read_map,
-)
+from ._remains import read_map as read_map
+from ._supervisor import Supervisor as Supervisor
+from ._trial_process import LEFT_OUT as LEFT_OUT

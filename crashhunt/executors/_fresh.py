@@ -17,25 +17,28 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.keeper import Kept
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
-from crashhunt.executors._baseline import OPEN_FILES
 from crashhunt.executors._environment import worker_environment
+from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
-from crashhunt.executors._worker import Worker
+from crashhunt.executors._remains import Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError
 from crashhunt.recording import Recording, read_black_box
+from crashhunt.simulators import FullBraking
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from crashhunt.executors._messages import Answer, FreshJob
+    from crashhunt.executors._supervisor import Ended
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import Escape
 
 __all__ = ["FreshProcessExecutor", "fresh_environment"]
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
+_DAMAGED = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
 _ESCAPE_S = 60.0  # for what is found out about a crash after its own trial has ended
 
 
@@ -157,20 +160,24 @@ class FreshProcessExecutor:
                     fix="read the whole message there",
                     where=str(log),
                 ) from None
-            if exit_code == DAMAGED:
-                return damaged(spec, scratch, "")
-            if why := running.attempt.again(scratch, exit_code):
-                self._notes.add(why)
-                self._waiting.appendleft(running.attempt)
-                return None
-            return died(spec, scratch, exit_code)
+            if exit_code == _DAMAGED:
+                return damaged(spec, scratch, "the process could not report what came of it, as it is damaged")
+            return self._again(running, exit_code)
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
-        if "result" not in answer:
-            raise KeyError("result")
+        if "lost" in answer:
+            return self._again(running, answer["lost"])
         return TrialResult.from_json(answer["result"])
+
+    def _again(self, running: _Running, exit_code: int) -> TrialResult | None:
+        """Account for a trial whose process is gone, or run it again."""
+        if why := running.attempt.again(self._settings.scratch, exit_code):
+            self._notes.add(why)
+            self._waiting.appendleft(running.attempt)
+            return None
+        return died(running.attempt.spec, self._settings.scratch, exit_code)
 
     def _job(self, number: int) -> Path:
         return self._settings.scratch / layout.numbered(number, layout.JOB)
@@ -191,57 +198,66 @@ def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
 
 def main() -> None:
     """Run the one trial that a file describes; what comes of it goes into another one."""
-    dumps, write, rename, leave = json.dumps, Path.write_text, os.replace, os._exit  # apart from what an agent damages
     job: FreshJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     temporary = Path(f"{job['answer']}.part")
 
     def answer(content: Answer) -> None:
-        write(temporary, dumps(content), encoding="utf-8")
-        rename(temporary, job["answer"])
+        temporary.write_text(json.dumps(content), encoding="utf-8")
+        temporary.replace(job["answer"])
 
-    code = DAMAGED
+    code = 1
     try:
-        result = None
-        try:
-            settings = WorkerSettings.from_json(job["settings"])
-            require_origin("crashhunt", settings.code)
-            seal(settings)
-            worker = Worker(settings)
-            result = worker.run(TrialSpec.from_json(job["spec"]))
-            answer({"result": result.to_json()})  # which counts, whatever becomes of what follows
-        except CrashhuntError as error:
-            answer(error.to_json())
-        escape = _escape(worker, settings, result) if result is not None and settings.find_escapes else None
-        if result is not None and escape is not None:
-            answer({"result": replace(result, escape=escape).to_json()})
-        code = 0
+        code = _run(job, answer)
     finally:
-        leave(code)
+        os._exit(code)
 
 
-def _escape(worker: Worker, settings: WorkerSettings, result: TrialResult) -> Escape | None:
-    """Until when braking would have avoided a crash, by trials in this process, whose simulator is warm."""
+def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
+    spec = TrialSpec.from_json(job["spec"])
+    try:
+        settings = WorkerSettings.from_json(job["settings"])
+        require_origin("crashhunt", settings.code)
+        seal(settings)
+        try:
+            supervisor = Supervisor(settings, fork_zygote(settings))
+            ended = supervisor.run(spec)
+        except UnfitZygoteError:
+            supervisor = Supervisor(settings, fork_zygote(settings, late=True))
+            ended = supervisor.run(spec)
+        answer({"result": ended.result.to_json()})  # which counts, whatever becomes of what follows
+        escape = _escape(supervisor, settings, ended) if settings.find_escapes else None
+        if escape is not None:
+            answer({"result": replace(ended.result, escape=escape).to_json()})
+    except LostTrialError as error:
+        answer({"lost": error.exit_code})
+    except CrashhuntError as error:
+        answer(error.to_json())
+    return 0
+
+
+def _escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) -> Escape | None:
+    """Until when braking would have avoided a crash, by further trials."""
     from crashhunt.crashes import find_escape
 
-    if result.collision is None:
+    result = ended.result
+    if result.collision is None or ended.braking is None or supervisor.retires:
         return None
-    braking = worker.full_braking(result.collision.agent)
-    if braking is None:
-        return None
+    braking = FullBraking(None, str(ended.braking["how"]), _number(ended.braking["deceleration"]))
     numbers = itertools.count(result.spec.number + 1)  # folders of their own
 
     def recording(number: int) -> Recording:
         return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        # A file that was left open is no matter for trials that have to be the same up to the step anyway.
-        if worker.change not in ("", OPEN_FILES):
-            raise BundleError(f"the trial before has changed {worker.change}")
         number = next(numbers)
-        done = worker.run(replace(spec, number=number))
+        done = supervisor.run(replace(spec, number=number)).result
         return done, recording(number)
 
     try:
         return find_escape(result, recording(result.spec.number), braking, run)
-    except BundleError:
+    except (BundleError, LostTrialError):
         return None
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) else None

@@ -13,26 +13,37 @@ if TYPE_CHECKING:
     from crashhunt.episode import SettingsData
     from crashhunt.trial import ResultData, SpecData
 
-__all__ = ["Answer", "Damaged", "Done", "FreshJob", "FromTemplate", "TemplateJob", "ToTemplate"]
+__all__ = [
+    "Answer",
+    "Done",
+    "ForkServerJob",
+    "FreshJob",
+    "FromForkServer",
+    "FromZygote",
+    "KillTrial",
+    "Lost",
+    "ToForkServer",
+]
 
 
 @final
 class Done(TypedDict):
-    """What came of a trial; ``change`` is what it has left behind in its process, empty where that is nothing."""
+    """What came of a trial; ``notices`` are for people, ``retires`` says that the supervisor runs no other trial."""
 
     result: ResultData
-    change: NotRequired[str]
+    notices: NotRequired[list[str]]
+    retires: NotRequired[bool]
 
 
 @final
-class Damaged(TypedDict):
-    """A worker that its trial has broken, and how that showed."""
+class Lost(TypedDict):
+    """A trial that was ended from outside: the exit code of its process."""
 
-    damaged: str
+    lost: int
 
 
-Answer: TypeAlias = Done | Damaged | ErrorData
-"""What a process says at the end of a trial."""
+Answer: TypeAlias = Done | Lost | ErrorData
+"""What a supervisor says at the end of a trial."""
 
 
 class FreshJob(TypedDict):
@@ -43,23 +54,23 @@ class FreshJob(TypedDict):
     answer: str
 
 
-class TemplateJob(TypedDict):
-    """What a template needs to know; ``late`` where its workers import agents themselves."""
+class ForkServerJob(TypedDict):
+    """What a fork server needs to know; ``late`` where every trial imports its agents itself."""
 
     settings: SettingsData
     sys_path: list[str]
     late: bool
 
 
-class ToTemplate(TypedDict, total=False):
-    """What the pool asks of its template: the worker of a slot to be forked, or to be killed."""
+class ToForkServer(TypedDict, total=False):
+    """What the pool asks of its fork server: the supervisor of a slot to be started, or to be killed."""
 
     slot: int
     kill: int
 
 
-class FromTemplate(TypedDict, total=False):
-    """What a template says: that it is ready, cannot fork, or fails; and which worker has ended, and how."""
+class FromForkServer(TypedDict, total=False):
+    """What a fork server says: that it is ready, cannot fork, or fails; and which supervisor has ended, and how."""
 
     ready: int
     unfit: bool
@@ -67,3 +78,23 @@ class FromTemplate(TypedDict, total=False):
     slot: int
     pid: int
     exit_code: int
+
+
+class KillTrial(TypedDict):
+    """A supervisor asks its zygote to kill the process of the trial that runs."""
+
+    kill: bool
+
+
+class FromZygote(TypedDict, total=False):
+    """What a zygote says: that it is ready or why it cannot be; how the process of a trial ended.
+
+    ``unfit`` says that files of the simulator have changed, so that no other trial may begin from this zygote.
+    """
+
+    ready: int
+    error: ErrorWords
+    pid: int
+    ended: int
+    unfit: bool
+    notices: list[str]

@@ -1,4 +1,4 @@
-"""A pool of warm worker processes: who runs which trial, and when a worker is replaced by another one."""
+"""A pool of slots: a supervisor each, which runs one trial after another, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ import selectors
 import signal
 import socket
 import threading
-import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import answer_file
-from crashhunt.executors._hang import has_hung
+from crashhunt.executors._fork_server_link import ForkServerLink
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
-from crashhunt.executors._template_link import TemplateLink
+from crashhunt.executors._remains import Attempt, died, where_it_is
 from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
@@ -32,49 +29,43 @@ if TYPE_CHECKING:
 
 __all__ = ["PoolExecutor"]
 
-_LOOK_EVERY_S = 0.1  # whether somebody hangs; those who end make themselves heard
+_LOOK_EVERY_S = 0.5  # whether the pool is closing, should nothing wake it up
 _RECEIVED = 1 << 16  # bytes at a time; a result is a few hundred
 
 
 @dataclass(slots=True, eq=False)
 class _Worker:
-    """A process, and what it is doing."""
+    """A supervisor, and the trial that it runs."""
 
     slot: int
     socket: socket.socket
     attempt: Attempt | None = None
-    given_at: float = 0.0
-    trials: int = 0
     received: bytearray = field(default_factory=bytearray)
     retired: bool = False  # it is not given any more trials
-    killed: bool = False  # at its time limit, by us
 
 
 class PoolExecutor:
-    """Runs trials on warm workers, each a process of its own; they are forked from a template.
+    """Runs every trial in a process of its own, a fork of one that has imported the agents and run nothing.
 
-    A thread hands trials out as soon as a worker is free, whatever the one that calls is busy with. A worker is
-    replaced where a trial has left anything in it that the next would find.
+    A thread hands trials out as soon as a slot is free, whatever the thread of the hunt is busy with.
 
     Args:
         settings: of the hunt.
-        parallel: how many workers.
-        recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
+        parallel: how many slots.
+        recycle_after: not used; no process runs two trials.
     """
 
     def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1000) -> None:
         self._settings = settings
         self._parallel = parallel
-        self._recycle_after = recycle_after
         self._lock = threading.RLock()
         self._waiting: deque[Attempt] = deque()
         self._workers: dict[int, _Worker] = {}
         self._slots = 0
-        self._looked = 0.0
         self._done: queue.SimpleQueue[TrialResult | Exception] = queue.SimpleQueue()
         self._notes = Notes(settings.scratch)
         self._selector = selectors.DefaultSelector()
-        self._link: TemplateLink | None = None
+        self._link: ForkServerLink | None = None
         self._wake_up, self._woken = socket.socketpair()
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._thread: threading.Thread | None = None
@@ -171,20 +162,19 @@ class PoolExecutor:
                             if key.data.slot in self._workers:  # which its end, heard of just now, has changed
                                 self._hear(key.data)
                         else:
-                            self._hear_template()
-                    self._look_after()
+                            self._hear_fork_server()
                     self._hand_out()
         except Exception as error:
             self._done.put(error)
 
     def _hand_out(self) -> None:
-        """Give trials to workers that have none, in the order of the queue."""
+        """Give trials to slots that have none, in the order of the queue."""
         while self._waiting:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
             if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
                 return
             if self._link is None:
-                self._link = TemplateLink(self._settings)
+                self._link = ForkServerLink(self._settings)
                 self._selector.register(self._link.control, selectors.EVENT_READ)
             free = next((worker for worker in self._workers.values() if not (worker.attempt or worker.retired)), None)
             if free is None:
@@ -196,7 +186,7 @@ class PoolExecutor:
                 free = self._hire(self._link)
             self._give(free, self._waiting.popleft())
 
-    def _hire(self, link: TemplateLink) -> _Worker:
+    def _hire(self, link: ForkServerLink) -> _Worker:
         ours, theirs = socket.socketpair()
         with theirs:
             self._slots += 1
@@ -207,11 +197,10 @@ class PoolExecutor:
         return worker
 
     def _give(self, worker: _Worker, attempt: Attempt) -> None:
-        worker.attempt, worker.given_at, worker.killed = attempt, time.monotonic(), False
-        worker.trials += 1
+        worker.attempt = attempt
         text = json.dumps(attempt.spec.to_json()).encode() + b"\n"
         worker.socket.setblocking(True)
-        with suppress(OSError):  # it has ended, which the template will tell
+        with suppress(OSError):  # it has ended, which the fork server will report
             worker.socket.sendall(text)
         worker.socket.setblocking(False)
 
@@ -235,41 +224,34 @@ class PoolExecutor:
             self._take(worker, line)
 
     def _take(self, worker: _Worker, line: bytes) -> None:
-        """Account for what a worker says about its trial."""
+        """Account for what a supervisor says about its trial."""
         attempt = worker.attempt
         if attempt is None:
             return  # it was given up meanwhile
-        try:
-            answer: Answer = json.loads(line)
-            if "error" in answer:
-                raise CrashhuntError.from_json(answer)
-            change: str | bool = True
-            if "result" in answer:
-                change = answer.get("change", True)
-                result = TrialResult.from_json(answer["result"])
-                if result.spec.number != attempt.spec.number:
-                    return
-            else:
-                result = damaged(attempt.spec, self._settings.scratch, f" ({answer['damaged']})")
-        except (ValueError, KeyError, TypeError):
-            return  # somebody else wrote that; the worker's own answer or its end is still to come
+        answer: Answer = json.loads(line)
+        if "error" in answer:
+            raise CrashhuntError.from_json(answer)
         worker.attempt = None
-        self._done.put(result)
+        if "lost" in answer:
+            self._end_attempt(attempt, answer["lost"])
+            self._retire(worker)
+            return
+        for notice in answer.get("notices", ()):
+            self._notes.add(notice)
+        self._done.put(TrialResult.from_json(answer["result"]))
         if self._link is not None:
             self._link.deaths = 0
-        if change and isinstance(change, str):
-            self._notes.add(f"trials change {change}, so that each has a worker of its own: none depends on another")
-        if change or (self._recycle_after and worker.trials >= self._recycle_after):
+        if answer.get("retires"):
             self._retire(worker)
 
     def _retire(self, worker: _Worker) -> None:
-        """Give a worker no more trials; when it has none, it ends."""
+        """Give a supervisor no more trials; when it has none, it ends."""
         worker.retired = True
         with suppress(OSError):
             worker.socket.shutdown(socket.SHUT_WR)
 
-    def _hear_template(self) -> None:
-        """Take what the template says about the ends of workers, and its own."""
+    def _hear_fork_server(self) -> None:
+        """Take what the fork server says about the ends of supervisors, and its own."""
         assert self._link is not None
         messages = self._link.receive()
         for message in messages or ():
@@ -278,7 +260,7 @@ class PoolExecutor:
             self._restart()
 
     def _restart(self) -> None:
-        """Start another template, and run everything again that was running when it, and every worker, ended."""
+        """Start another fork server, and run everything again that was running when it, and all below it, ended."""
         assert self._link is not None
         for worker in list(self._workers.values()):
             self._discard(worker)
@@ -297,19 +279,8 @@ class PoolExecutor:
             return
         self._hear(worker)  # what it said before it ended
         self._discard(worker)
-        attempt, scratch = worker.attempt, self._settings.scratch
-        if attempt is not None and exit_code == DAMAGED:
-            with suppress(OSError):
-                self._take(worker, answer_file(scratch, attempt.spec.number).read_bytes())
-            attempt = worker.attempt
-        if attempt is None:
-            return
-        if worker.killed:
-            self._done.put(hung(attempt.spec, scratch, self._settings.timeout_s))
-        elif exit_code == DAMAGED:
-            self._done.put(damaged(attempt.spec, scratch, ""))
-        else:
-            self._end_attempt(attempt, exit_code)
+        if worker.attempt is not None:  # an agent has killed it, or somebody from outside
+            self._end_attempt(worker.attempt, exit_code if exit_code < 0 else -signal.SIGKILL)
 
     def _end_attempt(self, attempt: Attempt, exit_code: int) -> None:
         """Account for a trial whose process is gone, or run it again."""
@@ -325,17 +296,3 @@ class PoolExecutor:
             self._selector.unregister(worker.socket)
         worker.socket.close()
         self._workers.pop(worker.slot, None)
-
-    def _look_after(self) -> None:
-        """Kill workers that hang."""
-        now = time.monotonic()
-        if now - self._looked < _LOOK_EVERY_S:
-            return
-        self._looked = now
-        for worker in self._workers.values():
-            if worker.attempt is None or worker.killed or self._link is None:
-                continue
-            number, limit_s = worker.attempt.spec.number, self._settings.timeout_s
-            if has_hung(self._settings.scratch, number, given_at=worker.given_at, limit_s=limit_s):
-                worker.killed = True
-                self._link.kill(worker.slot)

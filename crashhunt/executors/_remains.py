@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import scratch_of
-from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
 from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
-from crashhunt.world import ClosestApproach, DangerMeter, closest_approach
+from crashhunt.world import ClosestApproach, DangerMeter, Lane, closest_approach
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "signal_name", "where_it_is"]
+__all__ = ["Attempt", "damaged", "died", "hung", "read_map", "read_tail", "signal_name", "where_it_is"]
 
-DAMAGED = 79
-"""The exit code of a worker that has run its trial to the end, and could not say what came of it."""
+_TAIL = 4000  # bytes
 _FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
 _ATTEMPTS = 3  # of a trial whose process is killed from outside; then somebody means it
 
@@ -81,11 +82,21 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int) -> TrialResult:
     return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code)
 
 
-def damaged(spec: TrialSpec, scratch: Path, what: str) -> TrialResult:
-    """Return the result of a trial after which its process could not report any more."""
-    header = where_it_is(scratch, spec.number)
-    message = f"the process could not report what came of it, as something in it is damaged{what}"
-    return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None)
+def damaged(spec: TrialSpec, scratch: Path, message: str, *, recorded: bool = True) -> TrialResult:
+    """Return the result of a trial whose process damaged itself or its recording.
+
+    Args:
+        spec: the trial.
+        scratch: the folder in which it recorded.
+        message: what is damaged, as a sentence.
+        recorded: whether the recording can be read.
+    """
+    if recorded:
+        header = where_it_is(scratch, spec.number)
+        return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None)
+    output = read_tail(scratch_of(scratch, spec.number) / layout.RUN_LOG)
+    failure = Failure("damaged recording", message, last_output=output)
+    return TrialResult(spec, Outcome.AGENT_ERROR, failure=failure, kept=True)
 
 
 def hung(spec: TrialSpec, scratch: Path, timeout_s: float) -> TrialResult:
@@ -115,8 +126,10 @@ def _result(
     except BundleError:
         recording = None
     scenes = recording.scenes() if recording is not None else []
-    if recording is None or not scenes or phase == Phase.SETUP:
+    if phase == Phase.SETUP or (recording is not None and not scenes):
         outcome, message = Outcome.INVALID, f"{message} while the episode was being set up"
+    elif recording is None:
+        message = f"{message}, and its recording cannot be read"
     else:
         steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
         closest = closest_approach(scenes, recording.agents)
@@ -147,6 +160,26 @@ def _result(
         setup_steps=(header.setup_steps or None) if header is not None else None,
     )
     return in_effect(result, recording.disturbances if recording is not None else ())
+
+
+def read_map(scratch: Path, trial: Path) -> list[Lane]:
+    """Return the map of a trial that is kept, or that of its hunt; nothing where none has been written down."""
+    for folder in (trial, scratch):
+        with suppress(OSError, ValueError, TypeError):
+            data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))
+            return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+    return []
+
+
+def read_tail(path: Path) -> str:
+    """Return the last few thousand characters of a file; nothing where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _TAIL))
+            return file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
 
 
 def signal_name(exit_code: int) -> str:

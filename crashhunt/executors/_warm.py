@@ -1,17 +1,14 @@
-"""Warm-up once: copies of a worker that sleep where the traffic has warmed up, for trials that begin in the same way.
+"""Warming up once: forks of a zygote that have reset the simulator, for trials that begin in the same traffic.
 
-A worker that has reset its simulator leaves a copy of itself there, asleep, and goes on with its trial. The next trial
-with the same seed and arguments of the scenario is run by a copy of that copy, in the folder that the worker has
-prepared, and with the same generators: so nothing in its digest tells the difference. Where such a process dies, the
-worker dies in the same way, so that whoever looks after workers need not know.
+The zygote of a slot keeps some such processes suspended. A trial with the same seed and scenario arguments runs in a
+fork of one of them, with the random generators as the reset left them: nothing in its digest shows the difference.
 """
 
 from __future__ import annotations
 
-import faulthandler
 import json
 import os
-import signal
+import time
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,151 +16,159 @@ from functools import partial
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import forks
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.faculties import offers
 from crashhunt.base.memory import FREE, free_memory
-from crashhunt.base.processes import end_descendants, kill
-from crashhunt.episode import words_of
-from crashhunt.trial import TrialResult, TrialSpec
+from crashhunt.base.processes import adopt_orphans, children_of, end_descendants, kill
+from crashhunt.episode import generators, options_of, seed_everything, set_generators
+from crashhunt.simulators import CountsSetUp
+from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.trial import ResultData, SpecData
+    from crashhunt.executors._trial_process import Job, TrialProcess
+    from crashhunt.simulators import Info, Observations, Simulator
 
-__all__ = ["WarmCopies"]
+    Wait = Callable[[int | None, Callable[[], None]], None]
+
+__all__ = ["WarmTraffics"]
 
 _RECEIVED = 1 << 16
-_WORTH_S = 0.02  # a copy of a copy costs some ten milliseconds, half of them for its end
-_STALE = 8  # as many times as there are copies, trials go by without one before it makes room for another
+_WORTH_S = 0.02  # a fork of a fork costs some ten milliseconds, half of them for its end
+_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
 
-# Kept apart from what an agent may put in their place.
-_dumps, _loads, _leave, _write = json.dumps, json.loads, os._exit, os.write
-
-
-class _Job(TypedDict):
-    """What a sleeping copy is asked: a trial, and how much of its black box there is."""
-
-    spec: SpecData
-    reserved: int
+# Bound here, before any agent is imported that could replace them.
+_dumps, _loads, _write = json.dumps, json.loads, os.write
 
 
 class _Said(TypedDict, total=False):
-    """What comes of it: a result, or what was raised, or why it was not run; and how the process ended."""
+    """What a suspended process reports: how long its reset took, or that it failed; how a trial's process ended."""
 
-    number: int
-    result: ResultData
-    error: dict[str, str]
-    raised: str
+    took_s: float
     unfit: str
+    pid: int
     ended: int
 
 
-class WarmCopies:
-    """The copies that a worker keeps asleep.
-
-    They end with the worker, or when too many others have been used since.
+class WarmTraffics:
+    """The suspended processes of a zygote, one for each traffic.
 
     Args:
-        most: how many, at the same time.
-        tell: called with what people should know.
-        worth_s: wall time that a warm-up takes at least which is worth a copy, in s.
+        limit: how many there are at most.
+        notify: called with what people should know.
+        worth_s: wall time of a warm-up from which on a process is kept for it, in s.
     """
 
-    def __init__(self, most: int, tell: Callable[[str], None], *, worth_s: float = _WORTH_S) -> None:
+    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _WORTH_S) -> None:
         self._worth_s = worth_s
-        self._most = most
-        self._tell = tell
-        self._asleep: OrderedDict[str, _Asleep] = OrderedDict()  # the one that was used last is the last
+        self._limit = limit
+        self._notify = notify
+        self._suspended: OrderedDict[str, _Suspended] = OrderedDict()  # the most recently used is the last
         self._trials = 0
+        self._trial: TrialProcess | None = None
+        self._simulator: Simulator | None = None
 
-    def run(self, spec: TrialSpec, reserved: int) -> TrialResult | None:
-        """Run a trial in a copy of the copy for it; None where there is none.
+    def prepare(self, trial: TrialProcess, simulator: Simulator) -> None:
+        """Note what trials run with."""
+        self._trial, self._simulator = trial, simulator
+
+    @property
+    def processes(self) -> frozenset[int]:
+        """The suspended processes."""
+        return frozenset(one.pid for one in self._suspended.values())
+
+    def forget(self) -> None:
+        """Close what this process, which runs a trial, has of them."""
+        for one in self._suspended.values():
+            one.close()
+        self._suspended.clear()
+
+    def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
+        """Run a trial in a fork of the process for its traffic, which is made where there is none.
 
         Args:
-            spec: the trial; its folder has been prepared.
-            reserved: how much of its black box there is, in bytes.
+            job: the trial.
+            wait: waits until a descriptor can be read; its second argument kills what is waited for.
 
-        Raises:
-            CrashhuntError: as the trial said.
-            RuntimeError: the process that ran it is damaged, in words.
+        Returns:
+            The process that ran it and its exit code; None where the trial has to run in a fork of the zygote.
         """
+        if self._trial is None or self._limit == 0:
+            return None
         self._trials += 1
+        spec = TrialSpec.from_json(job["spec"])
         key = _key(spec)
-        found = self._asleep.get(key)
+        found = self._suspended.get(key) or self._make(key, spec, wait)
         if found is None:
             return None
-        self._asleep.move_to_end(key)
+        self._suspended.move_to_end(key)
         found.used = self._trials
-        said = found.ask({"spec": spec.to_json(), "reserved": reserved}, spec.number)
-        if said is None or "unfit" in said:
-            self._asleep.pop(key).end()
-            if said is not None:
-                self._stop(said["unfit"])
+        said = found.ask(_dumps(job).encode() + b"\n", wait)
+        if said is None:  # it was killed, and the trial with it
+            code = self._drop(key)
+            return found.pid, code or -9
+        if "unfit" in said:
+            self._stop(said["unfit"])
+            self._drop(key)
             return None
-        if "error" in said:
-            raise CrashhuntError(**said["error"])
-        if "raised" in said:
-            raise RuntimeError(said["raised"])
-        if "ended" in said:
-            _die(said["ended"])
-        return TrialResult.from_json(said["result"])
+        return said["pid"], said["ended"]
 
-    def keep(self, spec: TrialSpec, run: Callable[[TrialSpec, int], TrialResult], *, took_s: float) -> None:
-        """Leave a copy of this process asleep, where there is room, for trials that begin as this one has.
-
-        Args:
-            spec: the trial whose simulator has been reset just now.
-            took_s: wall time that it took, in s.
-            run: called in a copy of the copy, with a trial and how much of its black box there is.
-        """
-        if self._most == 0 or took_s < self._worth_s or not self._make_room():
-            return
+    def _make(self, key: str, spec: TrialSpec, wait: Wait) -> _Suspended | None:
+        if not self._make_room():
+            return None
         wakes, ours = os.pipe()
         theirs, says = os.pipe()
+        assert self._trial is not None
+        assert self._simulator is not None
+        be_suspended = partial(_be_suspended, wakes, says, self._trial, self._simulator, spec)
         try:
-            pid = forks.fork(lambda: _sleep(wakes, says, run), forks.held(), keeps=(wakes, says))
+            pid = forks.fork(be_suspended, forks.held(), keeps=(wakes, says))
         except forks.CannotForkError as error:
             self._stop(error.message)
             os.close(ours)
             os.close(theirs)
-        else:
-            self._asleep[_key(spec)] = _Asleep(pid, ours, theirs, self._trials)
+            return None
         finally:
             os.close(wakes)
             os.close(says)
+        made = self._suspended[key] = _Suspended(pid, ours, theirs, self._trials)
+        said = made.ask(b"", wait)
+        if said is not None and said.get("took_s", 0.0) >= self._worth_s:
+            return made
+        self._drop(key)
+        if said is not None and "took_s" in said:
+            self._limit = 0  # no warm-up here is worth it
+        return None
 
-    @property
-    def processes(self) -> frozenset[int]:
-        """The copies."""
-        return frozenset(one.pid for one in self._asleep.values())
+    def _drop(self, key: str) -> int:
+        return self._suspended.pop(key).end()
 
     def _stop(self, why: str) -> None:
-        self._most = 0
-        self._tell(f"trials in the same traffic do not share its warm-up: {why}")
+        self._limit = 0
+        self._notify(f"trials in the same traffic do not share its warm-up: {why}")
 
     def _make_room(self) -> bool:
         if free_memory() < FREE:
-            self._tell(
+            self._notify(
                 f"less than {FREE:.0%} of the memory is free: fewer warmed-up copies are kept than there might be"
             )
             return False
-        if len(self._asleep) < self._most:
+        if len(self._suspended) < self._limit:
             return True
-        key, oldest = next(iter(self._asleep.items()))
+        key, oldest = next(iter(self._suspended.items()))
         # Where trials take turns in more traffics than there are copies, the oldest one is the next to be used.
-        if self._trials - oldest.used < _STALE * self._most:
+        if self._trials - oldest.used < _STALE * self._limit:
             return False
-        del self._asleep[key]
-        oldest.end()
+        self._drop(key)
         return True
 
 
 @dataclass(slots=True, eq=False)
-class _Asleep:
-    """A sleeping copy, as its worker knows it.
+class _Suspended:
+    """A suspended process, as its zygote knows it.
 
     Args:
-        pid: its process.
+        pid: of the process.
         asks: the end of a pipe to it.
         says: the end of one from it.
         used: by which trial last.
@@ -174,83 +179,83 @@ class _Asleep:
     says: int
     used: int
 
-    def ask(self, job: _Job, number: int) -> _Said | None:
-        """Return what it says of a trial; None where it is not there."""
-        text = _dumps(job).encode() + b"\n"
+    def ask(self, text: bytes, wait: Wait) -> _Said | None:
+        """Return what it answers; None where it is gone."""
         try:
             while text:
                 text = text[_write(self.asks, text) :]
         except BrokenPipeError:
             return None
-        received = b""
-        while True:
-            *lines, received = received.split(b"\n")
-            for line in lines:
-                said: _Said = _loads(line)
-                if said["number"] == number:  # else how the one before has ended
-                    return said
+        received = bytearray()
+        while not received.endswith(b"\n"):
+            wait(self.says, self._kill)
             data = os.read(self.says, _RECEIVED)
             if not data:
-                _die(forks.ended(self.pid))
+                return None
             received += data
+        said: _Said = _loads(received)
+        return said
 
-    def end(self) -> None:
-        kill(self.pid)
-        forks.ended(self.pid)
+    def _kill(self) -> None:
+        """Kill the trial, or the process itself where it is still resetting the simulator."""
+        for pid in children_of(self.pid) or [self.pid]:
+            kill(pid)
+
+    def close(self) -> None:
+        """Close the pipes."""
         os.close(self.asks)
         os.close(self.says)
 
+    def end(self) -> int:
+        """Kill the process; return its exit code."""
+        for child in children_of(self.pid):
+            kill(child)
+        kill(self.pid)
+        code = forks.ended(self.pid)
+        self.close()
+        return code
 
-def _die(code: int) -> None:
-    """End as the process did that ran the trial."""
-    if code < 0:
-        faulthandler.disable()  # which process it was it has said itself
-        with suppress(OSError, ValueError):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    _leave(code)
 
+def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulator, spec: TrialSpec) -> None:
+    """Reset the simulator; then have a fork run each trial that is asked for."""
+    adopt_orphans()
+    began = time.monotonic()
+    try:
+        seed_everything(spec.seed)
+        begun = simulator.reset(seed=spec.seed, options=options_of(spec, simulator))
+    except BaseException:  # the trial itself will report it
+        _say(says, {})
+        return
+    _say(says, {"took_s": time.monotonic() - began})
+    drawn = generators()
 
-def _sleep(wakes: int, says: int, run: Callable[[TrialSpec, int], TrialResult]) -> None:
-    """Be a sleeping copy: whenever it is asked for a trial, have a copy run it."""
+    def again(**_given: object) -> tuple[Observations, Info]:
+        set_generators(drawn)
+        return begun
+
     with os.fdopen(wakes, "rb", closefd=False) as jobs:
         for line in jobs:
-            job: _Job = _loads(line)
-            number = job["spec"]["number"]
             try:
-                pid = forks.fork(partial(_run, job, says, run), forks.held(), keeps=(says,))
+                pid = forks.fork(partial(_run, trial, line, again), forks.held())
             except forks.CannotForkError as error:
-                _say(says, {"number": number, "unfit": error.message})
+                _say(says, {"unfit": error.message})
                 continue
             code = forks.ended(pid)
             end_descendants()
-            _say(says, {"number": number, "ended": code})
+            if offers(simulator, CountsSetUp):
+                simulator.setup_steps = 0  # they have been counted, with the first trial
+            _say(says, {"pid": pid, "ended": code})
 
 
-def _run(job: _Job, says: int, run: Callable[[TrialSpec, int], TrialResult]) -> None:
-    from crashhunt.executors._remains import DAMAGED
-
-    spec = TrialSpec.from_json(job["spec"])
-    said: _Said = {"number": spec.number}
-    place = os.fstat(says)
-    try:
-        said["result"] = run(spec, job["reserved"]).to_json()
-    except CrashhuntError as error:
-        said["error"] = {"message": error.message, "fix": error.fix, "where": error.where}
-    except BaseException as error:
-        said["raised"] = f"{type(error).__name__}: {words_of(error)}"
-    try:
-        if not os.path.samestat(os.fstat(says), place):  # the agent has closed it, and opened something else
-            _leave(DAMAGED)
-        _say(says, said)
-    except OSError:
-        _leave(DAMAGED)
+def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observations, Info]]) -> None:
+    trial.run(_loads(line), again)
 
 
 def _say(says: int, said: _Said) -> None:
     text = _dumps(said).encode() + b"\n"
-    while text:
-        text = text[_write(says, text) :]
+    with suppress(BrokenPipeError):
+        while text:
+            text = text[_write(says, text) :]
 
 
 def _key(spec: TrialSpec) -> str:

@@ -200,8 +200,8 @@ class RunOptions(_Options):
         flag="--no-native",
     )  # fmt: skip
     recycle_after: int = option(
-        1000, "trials after which a worker is replaced; 0 for never",
-        help="replace a worker after so many trials; 0: never",
+        1000, "not used any more: every trial has a process of its own",
+        help="not used any more: every trial has a process of its own",
         flag="--recycle-after", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
     warm_copies: int = option(

@@ -6,6 +6,7 @@ from ._blackbox import (
     read_black_box as read_black_box,
     read_header as read_header,
 )
+from ._blackbox_file import BlackBoxFile as BlackBoxFile
 from ._compare import first_divergence as first_divergence, values_around as values_around
 from ._digest import digest_of as digest_of
 from ._divergence import Divergence as Divergence, DivergenceData as DivergenceData

@@ -4,6 +4,9 @@ Nothing is encoded while the episode runs, and the pages belong to the kernel, s
 that is killed in the middle of a step. Layout: a header of 64 bytes, then records, each of 8 bytes of head (tag, aux,
 length) and its payload, padded to 8 bytes. Everything is little-endian. Only what lies before the header's
 ``committed`` offset counts. The header also says where the process was: which step, which phase, which agent.
+
+Behind the records, the process of a finished trial leaves one report, which the header announces by its length. It is
+no record: it belongs neither to the digest nor to the log.
 """
 
 from __future__ import annotations
@@ -34,17 +37,37 @@ if TYPE_CHECKING:
     from crashhunt.native import Core, UsualSteps
     from crashhunt.world import Frame, Roster, Scene
 
-__all__ = ["BlackBox", "BlackBoxHeader", "Phase", "Record", "read_black_box", "read_header"]
+__all__ = [
+    "CHUNK",
+    "FIRST",
+    "HEADER",
+    "MAGIC",
+    "MAPPED",
+    "REPORT",
+    "REPORT_OFFSET",
+    "UNREPORTABLE",
+    "BlackBox",
+    "BlackBoxHeader",
+    "Phase",
+    "Record",
+    "cannot_record",
+    "decode_header",
+    "read_black_box",
+    "read_header",
+]
 
-_MAGIC = b"CRASHBB1"
-_HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, set-up, trial, started, committed, step, phase, agent
+MAGIC = b"CRASHBB1"
+HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, set-up, trial, started, committed, step, phase, agent
 _WHERE = struct.Struct("<QqiI")  # the last four of them
-_WHERE_OFFSET = _HEADER.size - _WHERE.size
+_WHERE_OFFSET = HEADER.size - _WHERE.size
 _SETUP, _SETUP_OFFSET = struct.Struct("<I"), 12
-_FIRST = 64  # where records begin; the header has room to grow
+REPORT, REPORT_OFFSET = struct.Struct("<Q"), HEADER.size  # length of the report in bytes; 0 for none
+UNREPORTABLE = 2**64 - 1  # in place of that length: the process is damaged and cannot report
+FIRST = 64  # where records begin; the header has room to grow
+_DAMAGE_ANNOUNCED = REPORT.pack(UNREPORTABLE)
 _HEAD = struct.Struct("<BxHI")
-_CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
-_MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves every view
+CHUNK = 1 << 20  # bytes that the file grows by: each time asks the disk whether there is room
+MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves every view
 
 
 class Phase(IntEnum):
@@ -106,7 +129,7 @@ class BlackBox:
         self._reserved = begun
         self._mapped = 0
         self._map: mmap.mmap
-        self._offset = _FIRST
+        self._offset = FIRST
         self._step = 0
         self._agents = 0
         self._roster: Roster | None = None
@@ -116,7 +139,7 @@ class BlackBox:
         self._aside: list[tuple[int, int]] = []
         self._lent: UsualSteps | None = None
         try:
-            self._reserve(_FIRST)
+            self._reserve(FIRST)
         except RecorderError:
             os.close(self._file)
             raise
@@ -129,8 +152,9 @@ class BlackBox:
     def begin(self, *, pid: int, trial: int, started: float) -> None:
         """Forget the previous trial and open the next."""
         self._take_back()
-        _HEADER.pack_into(self._map, 0, _MAGIC, pid, 0, trial, started, _FIRST, 0, Phase.SETUP, 0)
-        self._offset = _FIRST
+        HEADER.pack_into(self._map, 0, MAGIC, pid, 0, trial, started, FIRST, 0, Phase.SETUP, 0)
+        REPORT.pack_into(self._map, REPORT_OFFSET, 0)
+        self._offset = FIRST
         self._step = 0
         self._roster = None
         self._trail.clear()
@@ -159,6 +183,19 @@ class BlackBox:
         if not is_evidence(tag):
             self._aside.append((offset, self._offset))
         self.mark(Phase.SETUP if self._roster is None else Phase.SIMULATE)
+
+    def report(self, report: bytes) -> None:
+        """Leave a report behind the records; nothing can be recorded after it."""
+        self._take_back()
+        end = self._offset + len(report)
+        if end > self._reserved:
+            self._reserve(end)
+        self._map[self._offset : end] = report
+        REPORT.pack_into(self._map, REPORT_OFFSET, len(report))
+
+    def announce_damage(self) -> None:
+        """Say that this process cannot report; needs nothing of Python that an agent may have damaged."""
+        self._map[REPORT_OFFSET:FIRST] = _DAMAGE_ANNOUNCED
 
     def note(self, payload: bytes) -> None:
         """Record what is no part of the digest."""
@@ -270,13 +307,13 @@ class BlackBox:
     def committed(self) -> memoryview:
         """The bytes of all records so far."""
         self._take_back()
-        return memoryview(self._map)[_FIRST : self._offset]
+        return memoryview(self._map)[FIRST : self._offset]
 
     def evidence(self) -> list[memoryview]:
         """The bytes of all records so far over which the digest runs."""
         self._take_back()
         whole = memoryview(self._map)
-        edges = [_FIRST, *chain.from_iterable(self._aside), self._offset]
+        edges = [FIRST, *chain.from_iterable(self._aside), self._offset]
         return [whole[begins:ends] for begins, ends in zip(edges[::2], edges[1::2], strict=True)]
 
     def detach(self) -> None:
@@ -287,8 +324,8 @@ class BlackBox:
 
     def delay(self, wall_s: float) -> None:
         """Count so much of the time since the trial began as not its own, in s."""
-        magic, pid, setup_steps, trial, started, *where = _HEADER.unpack_from(self._map, 0)
-        _HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
+        magic, pid, setup_steps, trial, started, *where = HEADER.unpack_from(self._map, 0)
+        HEADER.pack_into(self._map, 0, magic, pid, setup_steps, trial, started + wall_s, *where)
 
     def copy(self) -> None:
         """Go on in memory of this process's own: it is a copy of the one that records, and goes on recording."""
@@ -315,32 +352,44 @@ class BlackBox:
         # Written, not only made longer: a full disk must be an error here, not a SIGBUS at the first access.
         try:
             while self._reserved < end:
-                self._reserved += os.pwrite(self._file, bytes(_CHUNK), self._reserved)
+                self._reserved += os.pwrite(self._file, bytes(CHUNK), self._reserved)
             if self._reserved > self._mapped:
                 # The old mapping, where there is one, is unmapped when its last view is gone.
-                self._mapped = max(_MAPPED, 2 * self._reserved)
+                self._mapped = max(MAPPED, 2 * self._reserved)
                 os.ftruncate(self._file, self._mapped)
                 self._map = mmap.mmap(self._file, self._mapped)
         except OSError as error:
             if error.errno not in DISK:  # such as a file that the agent has closed
                 raise
-            raise RecorderError(
-                f"the trial cannot be recorded: {error.strerror}",
-                fix="free some space and run the same command again",
-                where=str(self._path),
-            ) from error
+            raise cannot_record(error, self._path) from error
+
+
+def cannot_record(error: OSError, path: Path) -> RecorderError:
+    """Return the error that a trial is ended by whose recording has no room."""
+    return RecorderError(
+        f"the trial cannot be recorded: {error.strerror}",
+        fix="free some space and run the same command again",
+        where=str(path),
+    )
 
 
 def read_header(path: Path) -> BlackBoxHeader | None:
     """Return the header of a black box, or None where there is none (yet)."""
     try:
         with path.open("rb") as file:
-            data = file.read(_HEADER.size)
+            data = file.read(HEADER.size)
     except OSError:
         return None
-    if len(data) < _HEADER.size or not data.startswith(_MAGIC):
+    return decode_header(data)
+
+
+def decode_header(data: bytes) -> BlackBoxHeader | None:
+    """Return the header that a black box begins with; None where that is damaged."""
+    if len(data) < HEADER.size or not data.startswith(MAGIC):
         return None
-    _, pid, setup_steps, trial, started, committed, step, phase, agent = _HEADER.unpack(data)
+    _, pid, setup_steps, trial, started, committed, step, phase, agent = HEADER.unpack(data)
+    if not Phase.SETUP <= phase <= Phase.DONE:
+        return None
     return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent, setup_steps)
 
 
@@ -354,8 +403,8 @@ def read_black_box(path: Path) -> Iterator[Record]:
     if header is None:
         raise BundleError("no black box here", fix="the trial left no recording", where=str(path))
     with path.open("rb") as file:
-        file.seek(_FIRST)
-        data = file.read(max(0, header.committed - _FIRST))
+        file.seek(FIRST)
+        data = file.read(max(0, header.committed - FIRST))
     yield from decode_records(data)
 
 

@@ -126,8 +126,8 @@ class Backend:
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
         right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
         plays_paths: whether it can move others along recorded ways.
-        watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
-            is not used again.
+        forkable: whether it is known that a process can be forked after it has made the simulator, which starts no
+            threads. Otherwise a fork finds out before the first trial.
     """
 
     title: str = ""
@@ -156,7 +156,7 @@ class Backend:
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
     plays_paths: bool = False
-    watched: tuple[str, ...] = ()
+    forkable: bool = False
 
     def __post_init__(self) -> None:
         if self.table is not None and not is_dataclass(self.table):

@@ -27,6 +27,7 @@ from ._protocol import (
     Observations as Observations,
     Options as Options,
     PlaysPaths as PlaysPaths,
+    ReadiesProcess as ReadiesProcess,
     Simulator as Simulator,
     StepResult as StepResult,
     StepsAtOnce as StepsAtOnce,

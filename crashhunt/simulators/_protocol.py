@@ -109,8 +109,8 @@ class Simulator(Protocol):
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
     What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
     `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
-    `HoldsBack`, `LeavesOut`, `PlaysPaths`, `CountsSetUp` and `Tidies`. Nothing is registered: whoever has the methods
-    and attributes of one offers it.
+    `HoldsBack`, `LeavesOut`, `PlaysPaths`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. Nothing is registered: a
+    simulator that has the methods and attributes of one offers it.
     """
 
     @property
@@ -330,6 +330,16 @@ class Tidies(Protocol):
         """Put it back as it was before the first episode. Called after each, and before the first; the next follows."""
 
 
+class ReadiesProcess(Protocol):
+    """A simulator that can do once what the first episode of every process would do again, such as loading tables.
+
+    Its `reset` does not draw from the action spaces.
+    """
+
+    def ready_process(self) -> None:
+        """Do it. Called once, before the first `Simulator.reset`, in a process whose forks run the episodes."""
+
+
 class HasMeanings(Protocol):
     """A discrete action space whose numbers stand for something."""
 
@@ -394,5 +404,6 @@ FACULTIES: tuple[type, ...] = (
     StepsAtOnce,
     CountsSetUp,
     Tidies,
+    ReadiesProcess,
 )
 """Everything that a simulator may offer."""

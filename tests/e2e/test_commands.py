@@ -30,7 +30,7 @@ class Agent(Raises):
         said = ours["crashhunt.world"].__doc__
         pathlib.Path(f"{sys.argv[0]}.json").write_text(json.dumps([files, code, said]))
 """
-TEMPLATE, FRESH = "crashhunt.executors._template", "crashhunt.executors._fresh"
+TEMPLATE, FRESH = "crashhunt.executors._fork_server", "crashhunt.executors._fresh"
 
 
 def told(shell, hunt: str, run) -> tuple:

@@ -96,5 +96,5 @@ BACKEND = Backend(
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,
     plays_paths=True,
-    watched=("highway_env",),  # in Python, with settings in classes
+    forkable=True,
 )

@@ -6,4 +6,10 @@ from crashhunt.scenario._backend import Backend
 
 __all__ = ["BACKEND"]
 
-BACKEND = Backend(title="the toy", told_events=(), disturbances=("brake", "stop", "unseen"), side_effect=lambda *_: "")
+BACKEND = Backend(
+    title="the toy",
+    told_events=(),
+    disturbances=("brake", "stop", "unseen"),
+    side_effect=lambda *_: "",
+    forkable=True,
+)

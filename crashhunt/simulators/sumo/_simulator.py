@@ -107,6 +107,10 @@ class SumoSimulator:
     told_events = BACKEND.told_events
     disturbing_kinds = BACKEND.disturbances or ()
 
+    def ready_process(self) -> None:
+        """Load the tables of SUMO's XML library."""
+        _keep_xml_ready()
+
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo brings along."""
         self._program = ["sumo-gui", "--start", "--delay", "0", "--window-size", "1200,800"]

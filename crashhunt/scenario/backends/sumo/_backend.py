@@ -133,6 +133,7 @@ BACKEND = Backend(
     actions=("continuous", "meta"),
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),
     plays_paths=True,
+    forkable=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
     explained=_explained,
     side_effect=_side_effect,

@@ -1,4 +1,4 @@
-"""The pool's end of its template: how the template is started, asked for workers, and listened to."""
+"""The pool's end of its fork server: how it is started, asked for supervisors, and listened to."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from crashhunt.executors._remains import signal_name
 
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors._messages import FromTemplate, TemplateJob
+    from crashhunt.executors._messages import ForkServerJob, FromForkServer
 
-__all__ = ["TemplateLink"]
+__all__ = ["ForkServerLink"]
 
-_MESSAGE = 1 << 16  # bytes, as in _template
+_MESSAGE = 1 << 16  # bytes, as in _fork_server
 _DEATHS = 3  # in a row, without a trial between them, before the pool gives up
 _END_S = 5.0  # for the template to say why it ended
 _FROM_OUTSIDE = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL)
 _numbers = itertools.count()
 
 
-class TemplateLink:
-    """A running template.
+class ForkServerLink:
+    """A running fork server.
 
     Args:
         settings: of the hunt.
-        late: whether workers import agents themselves, because the template could not be forked any more.
+        late: whether each trial imports its agents itself, because what has imported them cannot be forked.
         deaths: how often it was killed before.
     """
 
@@ -46,15 +46,15 @@ class TemplateLink:
         self.ready = False
         self.unfit = False
         number = next(_numbers)
-        job = settings.scratch / f"template-{number}.json"
-        content: TemplateJob = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
+        job = settings.scratch / f"fork-server-{number}.json"
+        content: ForkServerJob = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
         job.write_text(json.dumps(content), encoding="utf-8")
-        self._log = settings.scratch / f"template-{number}.log"
+        self._log = settings.scratch / f"fork-server-{number}.log"
         # Messages stay apart from each other, and file descriptors with theirs.
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, self._log.open("wb") as log:
             self._kept = Kept(
-                "crashhunt.executors._template",
+                "crashhunt.executors._fork_server",
                 [str(theirs.fileno()), str(job)],
                 environment={**os.environ, **worker_environment()},
                 inherited=[theirs.fileno()],
@@ -65,22 +65,22 @@ class TemplateLink:
         self.control.setblocking(False)
 
     def fork(self, slot: int, end: socket.socket) -> None:
-        """Ask for a worker, which is given one end of a socket."""
+        """Ask for a supervisor, which is given one end of a socket."""
         with suppress(OSError):  # it is gone, which shows when it is listened to
             socket.send_fds(self.control, [json.dumps({"slot": slot}).encode()], [end.fileno()])
 
     def kill(self, slot: int) -> None:
-        """Kill a worker, if it is still there."""
+        """Kill a supervisor, and with it what runs its trial, if it is still there."""
         with suppress(OSError):
             self.control.send(json.dumps({"kill": slot}).encode())
 
-    def receive(self) -> list[FromTemplate] | None:
-        """Return which workers have ended, and how; None where the template itself is gone.
+    def receive(self) -> list[FromForkServer] | None:
+        """Return which supervisors have ended, and how; None where the fork server itself is gone.
 
         Raises:
             CrashhuntError: what trials need cannot be imported.
         """
-        ended: list[FromTemplate] = []
+        ended: list[FromForkServer] = []
         while True:
             try:
                 data = self.control.recv(_MESSAGE)
@@ -90,7 +90,7 @@ class TemplateLink:
                 data = b""
             if not data:
                 return None
-            message: FromTemplate = json.loads(data)
+            message: FromForkServer = json.loads(data)
             if "error" in message:
                 raise CrashhuntError(**message["error"])
             if "slot" in message:
@@ -98,7 +98,7 @@ class TemplateLink:
             self.ready = self.ready or "ready" in message
             self.unfit = self.unfit or "unfit" in message
 
-    def anew(self) -> TemplateLink:
+    def anew(self) -> ForkServerLink:
         """Start another one in its place, after its end.
 
         Raises:
@@ -110,7 +110,7 @@ class TemplateLink:
             code = -signal.SIGKILL
         self.end()
         if self.unfit:
-            return TemplateLink(self._settings, late=True, deaths=self.deaths)
+            return ForkServerLink(self._settings, late=True, deaths=self.deaths)
         if -code not in _FROM_OUTSIDE or self.deaths + 1 >= _DEATHS:
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             how = f"was killed by {signal_name(code)}" if code < 0 else f"exited with {code}"
@@ -120,9 +120,9 @@ class TemplateLink:
                 f"the process that starts the workers {how}{again}{said}",
                 fix="see that the limits on memory and processes leave it room, and run the same command again",
             )
-        return TemplateLink(self._settings, late=self._late, deaths=self.deaths + 1)
+        return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1)
 
     def end(self) -> None:
-        """Kill it, its workers, and everything that they have started."""
+        """Kill it, and everything that it has started."""
         self._kept.end()
         self.control.close()

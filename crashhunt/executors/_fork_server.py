@@ -1,0 +1,248 @@
+"""The fork server of a pool: it starts supervisors and, apart from them, the processes whose forks run trials.
+
+::
+
+    hunt -- keeper -- fork server -+- supervisor, one a slot              (no foreign code)
+                                   +- template -- zygote, one a slot -- process of a trial
+
+The fork server and the supervisors are forked before anything foreign is imported. The template imports the agents and
+runs nothing. A zygote is a fork of the template that has made the simulator. Every trial runs in a fork of its slot's
+zygote, and that process ends with its trial, so that no trial finds anything that another one left behind. A zygote
+does what its supervisor says: fork, kill, report how a process ended.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import select
+import signal
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors._supervisor import be_supervisor
+from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
+
+if TYPE_CHECKING:
+    from crashhunt.base.plain import ErrorData
+    from crashhunt.executors._messages import ForkServerJob, FromForkServer, ToForkServer
+
+__all__ = ["fork_zygote", "main"]
+
+_MESSAGE = 1 << 16  # bytes; an order to start a supervisor is some hundred
+_ORPHANS_EVERY_S = 0.5  # looking for what dead trials left behind walks all of /proc
+_LOOK_EVERY_S = 0.02  # where the kernel does not report when a process ends
+# These signals are meant for the hunt; the process of a trial dies of them as any process does.
+_NOT_OURS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
+def main() -> None:
+    """Be the fork server; standard error is a log."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    job: ForkServerJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
+    sys.path[:] = job["sys_path"]
+    _ignore_signals()
+    adopt_orphans()
+    try:
+        settings = WorkerSettings.from_json(job["settings"])
+    except CrashhuntError as error:
+        _send(control, error.to_json())
+        return
+    gc.collect()
+    gc.freeze()
+    orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    server, template = os.getpid(), os.fork()
+    if template == 0:
+        try:
+            control.close()
+            orders.close()
+            die_with(server)
+            _be_template(theirs, settings, late=job["late"])
+        finally:
+            os._exit(1)
+    theirs.close()
+    _Server(control, orders, template, settings).serve()
+
+
+class _Server:
+    """Starts supervisors, and reports how they ended.
+
+    Args:
+        control: to the pool.
+        orders: to the template.
+        template: its process.
+        settings: of the hunt.
+    """
+
+    def __init__(self, control: socket.socket, orders: socket.socket, template: int, settings: WorkerSettings) -> None:
+        self._control, self._orders, self._template, self._settings = control, orders, template, settings
+        self._slots: dict[int, int] = {}  # process to slot
+        self._ends: dict[int, int] = {}  # process to the descriptor by which the kernel reports its end
+
+    def serve(self) -> None:
+        """Do what the pool says until it or the template is gone."""
+        while True:
+            wait_s = _LOOK_EVERY_S if len(self._ends) < len(self._slots) else _ORPHANS_EVERY_S
+            watched = [self._control.fileno(), self._orders.fileno(), *self._ends.values()]
+            ready, _, _ = select.select(watched, [], [], wait_s)
+            if self._control.fileno() in ready and not self._obey():
+                return  # the keeper ends every process
+            if self._orders.fileno() in ready:
+                data = self._orders.recv(_MESSAGE)
+                if not data:
+                    return
+                _send(self._control, _understood(data))
+            if self._reap():
+                return
+            # Other children were left behind by a template or a supervisor that died.
+            end_descendants(frozenset(self._slots) | {self._template})
+
+    def _obey(self) -> bool:
+        """Do what the pool asks for; return whether it is still there."""
+        data, descriptors, _, _ = socket.recv_fds(self._control, _MESSAGE, 1)
+        if not data:
+            return False
+        message: ToForkServer = json.loads(data)
+        if "kill" in message:
+            for pid in [pid for pid, slot in self._slots.items() if slot == message["kill"]]:
+                kill(pid)
+            return True
+        pool = socket.socket(fileno=descriptors[0])
+        zygote, theirs = socket.socketpair()
+        with pool, zygote, theirs:
+            server, pid = os.getpid(), os.fork()
+            if pid == 0:
+                for descriptor in self._ends.values():
+                    os.close(descriptor)
+                self._control.close()
+                self._orders.close()
+                theirs.close()
+                for number in _NOT_OURS:
+                    signal.signal(number, signal.SIG_DFL)
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+                be_supervisor(pool, zygote, self._settings, server)
+            with suppress(OSError):  # the template is gone, which is seen elsewhere
+                socket.send_fds(self._orders, [b"zygote"], [theirs.fileno()])
+        self._slots[pid] = message["slot"]
+        with suppress(AttributeError, OSError):
+            self._ends[pid] = os.pidfd_open(pid)
+        return True
+
+    def _reap(self) -> bool:
+        """Report which supervisors have ended; return whether the template has."""
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return True
+            if pid == 0:
+                return False
+            if pid in self._ends:
+                os.close(self._ends.pop(pid))
+            code = os.waitstatus_to_exitcode(status)
+            if pid in self._slots:
+                _send(self._control, {"slot": self._slots.pop(pid), "pid": pid, "exit_code": code})
+            elif pid == self._template:
+                if code < 0:  # leave as it was killed: who started this process decides what that means
+                    end_descendants()
+                    signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
+                    os.kill(os.getpid(), -code)
+                os._exit(code)
+
+
+def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool) -> None:
+    """Import what trials need, and fork a zygote whenever the fork server asks for one."""
+    adopt_orphans()
+    try:
+        imported = import_nothing(settings) if late else import_parts(settings)
+    except CrashhuntError as error:
+        _send(orders, error.to_json())
+        return
+    if imported is None:
+        _send(orders, {"unfit": True})
+        return
+    gc.collect()
+    gc.freeze()
+    _send(orders, {"ready": os.getpid()})
+    zygotes: set[int] = set()
+    while True:
+        ready, _, _ = select.select([orders], [], [], _ORPHANS_EVERY_S)
+        if ready:
+            data, descriptors, _, _ = socket.recv_fds(orders, _MESSAGE, 1)
+            if not data:
+                os._exit(0)
+            control = socket.socket(fileno=descriptors[0])
+            template, pid = os.getpid(), os.fork()
+            if pid == 0:
+                orders.close()
+                die_with(template)
+                for number in _NOT_OURS:
+                    signal.signal(number, signal.SIG_DFL)
+                os.setsid()
+                be_zygote(control, settings, imported)
+            control.close()
+            zygotes.add(pid)
+        with suppress(ChildProcessError):
+            while (pid := os.waitpid(-1, os.WNOHANG)[0]) != 0:
+                zygotes.discard(pid)
+        end_descendants(frozenset(zygotes))
+
+
+def _understood(data: bytes) -> FromForkServer:
+    """Return what the template says of itself; an agent that is being imported may have written something else."""
+    said: FromForkServer = {}
+    with suppress(ValueError, KeyError, TypeError):
+        message = json.loads(data)
+        if "error" in message:
+            words = message["error"]
+            said["error"] = {name: str(words[name]) for name in ("message", "fix", "where")}  # type: ignore[typeddict-item]
+        elif message.get("unfit") is True:
+            said["unfit"] = True
+        elif "ready" in message:
+            said["ready"] = int(message["ready"])
+    return said
+
+
+def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socket:
+    """Fork a zygote that imports what trials need; return a socket to it, with which it ends.
+
+    Args:
+        settings: of the hunt.
+        late: whether each trial imports its agents itself.
+    """
+    ours, theirs = socket.socketpair()
+    gc.collect()
+    gc.freeze()
+    parent, pid = os.getpid(), os.fork()
+    if pid == 0:
+        try:
+            ours.close()
+            die_with(parent)
+            imported = import_nothing(settings) if late else import_parts(settings)
+            if imported is None:
+                theirs.sendall(json.dumps({"unfit": True}).encode() + b"\n")
+            else:
+                be_zygote(theirs, settings, imported)
+        except CrashhuntError as error:
+            theirs.sendall(json.dumps(error.to_json()).encode() + b"\n")
+        finally:
+            os._exit(1)
+    theirs.close()
+    return ours
+
+
+def _ignore_signals() -> None:
+    for number in _NOT_OURS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _send(control: socket.socket, message: FromForkServer | ErrorData) -> None:
+    with suppress(OSError):  # nobody is there any more, which is seen elsewhere
+        control.send(json.dumps(message).encode())

@@ -1,0 +1,362 @@
+"""The supervisor of a slot: it hands trials to a zygote, and decides what came of each. It never runs foreign code.
+
+The socket to the hunt, the black box, the scratch folder of the trial and its result belong to the supervisor. What the
+process of a trial leaves behind is evidence, which `check_report` checks.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import select
+import shutil
+import signal
+import time
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NoReturn
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.files import whole_file
+from crashhunt.base.processes import die_with
+from crashhunt.episode import scratch_of
+from crashhunt.executors._evidence import KEY_BYTES, Report, check_report
+from crashhunt.executors._remains import damaged, died, hung, read_tail
+from crashhunt.executors._trial_process import UNABLE_TO_RECORD
+from crashhunt.recording import BlackBoxFile
+from crashhunt.trial import TrialSpec
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.executors._messages import Answer, Done, FromZygote, KillTrial
+    from crashhunt.executors._trial_process import Job
+    from crashhunt.trial import TrialResult
+
+__all__ = ["Ended", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor"]
+
+START_UP_S = 60.0  # for the simulator to be made, and where trials import their agents themselves, for that
+_LOOK_EVERY_S = 0.1  # whether a trial hangs
+_LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
+_NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
+_RECEIVED = 1 << 16  # bytes at a time
+_LARGEST_OUTPUT = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file
+
+
+class LostTrialError(Exception):
+    """The process of a trial was ended from outside, or by an agent that attacked what it is a fork of.
+
+    Args:
+        exit_code: of the process, negative for a signal.
+    """
+
+    def __init__(self, exit_code: int) -> None:
+        super().__init__(exit_code)
+        self.exit_code = exit_code
+
+
+class UnfitZygoteError(Exception):
+    """What has imported the agents cannot be forked, so that each trial has to import them itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A trial that has ended.
+
+    Args:
+        result: what came of it.
+        notices: what people should know.
+        braking: how the vehicle brakes that collided, where the settings ask for that.
+    """
+
+    result: TrialResult
+    notices: tuple[str, ...] = ()
+    braking: Mapping[str, object] | None = None
+
+
+class Supervisor:
+    """Has a zygote run one trial after another, each in a process of its own.
+
+    Args:
+        settings: of the hunt.
+        zygote: to the zygote of this slot.
+
+    Attributes:
+        retires: whether the zygote may run no other trial.
+    """
+
+    def __init__(self, settings: WorkerSettings, zygote: socket.socket) -> None:
+        self._settings = settings
+        self._zygote = zygote
+        self._received = bytearray()
+        self._ready = False
+        self.retires = False
+        self._box: BlackBoxFile | None = None
+        self._output = self._stack = -1
+        self._folder: Path | None = None
+        self._made = self._trials = 0
+
+    def run(self, spec: TrialSpec) -> Ended:
+        """Run a trial. Its scratch folder stays where the result says that it is kept.
+
+        Raises:
+            LostTrialError: its process was ended from outside, or its zygote is gone.
+            UnfitZygoteError: the zygote cannot fork.
+            CrashhuntError: the disk is full, or the simulator cannot be made at all.
+        """
+        self._await_zygote()
+        box, folder = self._prepare(spec)
+        key = secrets.token_bytes(KEY_BYTES)
+        given_at = time.monotonic()
+        self._trials += 1
+        job: Job = {
+            "spec": spec.to_json(),
+            "folder": str(folder),
+            "reserved": box.reserved,
+            "key": key.hex(),
+            "wants_map": not (self._settings.scratch / layout.MAP).exists(),
+            "tries_copy": self._trials == 1,
+        }
+        self._send(job)
+        said, was_killed = self._wait(box, given_at)
+        self.retires = self.retires or said.get("unfit", False)
+        ended = self._judge(spec, box, key, said, was_killed=was_killed)
+        notices = (*ended.notices, *said.get("notices", ()))
+        wall_s = max(ended.result.wall_s, time.monotonic() - given_at)
+        result = replace(ended.result, worker=os.getpid(), wall_s=wall_s)
+        if result.kept:
+            self._folder = None  # it belongs to the hunt now; the next trial gets another one
+        return replace(ended, result=result, notices=notices)
+
+    def _judge(self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool) -> Ended:
+        """Decide what came of a trial whose process has ended."""
+        scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
+        self._secure(spec)
+        header = box.header()
+        report = box.read_report(header) if header is not None else b""
+        is_whole = box.is_reusable()
+        if was_killed and not (code == 0 and report):
+            return Ended(hung(spec, scratch, self._settings.timeout_s))
+        if not is_whole or header is None:
+            what = "its recording was truncated" if header is None or not is_whole else ""
+            return Ended(damaged(spec, scratch, what or "its recording was overwritten", recorded=False))
+        if code == UNABLE_TO_RECORD and not report:
+            box.require_room()
+            raise LostTrialError(-signal.SIGKILL)  # there is room again
+        if report is None:
+            return Ended(damaged(spec, scratch, "the process could not report what came of it, as it is damaged"))
+        if code != 0 or not report:
+            if -code in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU):
+                raise LostTrialError(code)
+            return Ended(died(spec, scratch, code))
+        found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)
+        if isinstance(found, str):
+            return Ended(damaged(spec, scratch, f"the process may not be believed: {found}"))
+        return self._keep(*found)
+
+    def _keep(self, result: TrialResult, report: Report) -> Ended:
+        """Write down what a trial leaves for the hunt."""
+        settings, folder = self._settings, scratch_of(self._settings.scratch, result.spec.number)
+        kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
+        kept = kept or settings.is_audited(result)
+        self._write_map(report.get("map"), folder if kept else None)
+        failure = result.failure
+        if kept:
+            if failure is not None:
+                failure = replace(failure, last_output=read_tail(folder / layout.RUN_LOG))
+                if failure.traceback:
+                    (folder / layout.ERROR_LOG).write_text(failure.traceback, encoding="utf-8", errors="replace")
+            if (entered := report.get("entered")) is not None:
+                (folder / layout.ENTERED).write_text(json.dumps(entered), encoding="utf-8")
+        result = replace(result, kept=kept, failure=failure)
+        return Ended(result, tuple(map(str, report["notices"])), report.get("braking"))
+
+    def _write_map(self, text: str | None, kept: Path | None) -> None:
+        """Write the map down, once for all trials; for a trial that is kept, where an argument makes it another."""
+        if text is None:
+            return
+        path = self._settings.scratch / layout.MAP
+        if not path.exists():
+            with whole_file(path, lasting=False) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        elif kept is not None and path.read_text(encoding="utf-8") != text:
+            (kept / layout.MAP).write_text(text, encoding="utf-8")
+
+    def _wait(self, box: BlackBoxFile, given_at: float) -> tuple[FromZygote, bool]:
+        """Wait for the end of a trial's process; kill it where it hangs. Return whether that was so."""
+        was_killed = False
+        while True:
+            message = self._next(_LOOK_EVERY_S)
+            if message is not None and "ended" in message:
+                return message, was_killed
+            if not was_killed and self._has_hung(box, given_at):
+                was_killed = True
+                self._send({"kill": True})
+
+    def _has_hung(self, box: BlackBoxFile, given_at: float) -> bool:
+        header, now = box.header(), time.monotonic()
+        began, allowed_s = given_at, self._settings.timeout_s
+        if header is None or header.pid == os.getpid():  # its own process has not begun
+            allowed_s += START_UP_S
+        elif given_at <= header.started <= now:  # later than it began by what copies of it took
+            began = header.started
+        over_s = now - began - allowed_s
+        if over_s <= _LAST_WORDS_S:
+            return False
+        return os.fstat(self._stack).st_size > 0 or over_s > _NO_WORDS_S
+
+    def _await_zygote(self) -> None:
+        deadline = time.monotonic() + START_UP_S + self._settings.timeout_s
+        while not self._ready:
+            message = self._next(_LOOK_EVERY_S)
+            if message is not None and "error" in message:
+                raise CrashhuntError(**message["error"])
+            if message is not None and message.get("unfit"):
+                raise UnfitZygoteError
+            self._ready = message is not None and "ready" in message
+            if not self._ready and time.monotonic() > deadline:
+                raise CrashhuntError(
+                    f"the simulator cannot be made: it takes more than {START_UP_S + self._settings.timeout_s:g} s",
+                    fix="see what it waits for, or give it more time with --timeout",
+                )
+
+    def _send(self, message: Job | KillTrial) -> None:
+        with suppress(OSError):  # it is gone, which the next message shows
+            self._zygote.sendall(json.dumps(message).encode() + b"\n")
+
+    def _next(self, timeout_s: float) -> FromZygote | None:
+        """Return the next message of the zygote; None where there is none yet.
+
+        Raises:
+            LostTrialError: the zygote is gone.
+        """
+        if b"\n" not in self._received:
+            ready, _, _ = select.select([self._zygote], [], [], timeout_s)
+            if not ready:
+                return None
+            try:
+                data = self._zygote.recv(_RECEIVED)
+            except OSError:
+                data = b""
+            if not data:
+                raise LostTrialError(-signal.SIGKILL)
+            self._received += data
+            if b"\n" not in self._received:
+                return None
+        line, _, rest = bytes(self._received).partition(b"\n")
+        self._received = bytearray(rest)
+        message: FromZygote = json.loads(line)
+        return message
+
+    def _prepare(self, spec: TrialSpec) -> tuple[BlackBoxFile, Path]:
+        """Give the trial its scratch folder: that of the last one, whose pages are warm, or a new one."""
+        folder = scratch_of(self._settings.scratch, spec.number)
+        _remove(folder)  # of an earlier attempt at the same trial
+        if self._folder is None or self._box is None or not self._box.is_reusable() or not self._is_ours(self._folder):
+            self._make_folder()
+        assert self._folder is not None
+        assert self._box is not None
+        os.ftruncate(self._output, 0)
+        os.ftruncate(self._stack, 0)
+        self._box.begin(trial=spec.number, started=time.monotonic())
+        os.rename(self._folder, folder)  # noqa: PTH104 - Path.rename builds a path for nothing
+        self._folder = folder
+        return self._box, folder
+
+    def _make_folder(self) -> None:
+        if self._box is not None:
+            self._box.close()
+            os.close(self._output)
+            os.close(self._stack)
+            self._box = None
+        if self._folder is not None:
+            _remove(self._folder)
+        self._made += 1
+        folder = self._settings.scratch / f"new-{os.getpid()}-{self._made}"
+        _remove(folder)
+        folder.mkdir(parents=True)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        self._output = os.open(folder / layout.RUN_LOG, flags, 0o644)
+        self._stack = os.open(folder / layout.STACK, flags, 0o644)
+        self._box = BlackBoxFile(folder / layout.BLACK_BOX)
+        self._folder = folder
+
+    def _is_ours(self, folder: Path) -> bool:
+        """Whether a folder is there, and has the files that this process has open."""
+        assert self._box is not None
+        try:
+            return not folder.is_symlink() and all(
+                os.path.samestat(os.lstat(folder / name), found)
+                for name, found in (
+                    (layout.BLACK_BOX, self._box.identity),
+                    (layout.RUN_LOG, os.fstat(self._output)),
+                    (layout.STACK, os.fstat(self._stack)),
+                )
+            )
+        except OSError:
+            return False
+
+    def _secure(self, spec: TrialSpec) -> None:
+        """See that the folder of a trial has the evidence, whatever the trial did to the folder."""
+        folder = scratch_of(self._settings.scratch, spec.number)
+        if self._is_ours(folder):
+            for entry in os.scandir(folder):
+                if entry.name not in (layout.BLACK_BOX, layout.RUN_LOG, layout.STACK):
+                    _remove(folder / entry.name)  # a file there has a meaning, and this one is not ours
+            return
+        _remove(folder)
+        folder.mkdir(parents=True)
+        assert self._box is not None
+        self._box.copy_to(folder / layout.BLACK_BOX)
+        for name, descriptor in ((layout.RUN_LOG, self._output), (layout.STACK, self._stack)):
+            (folder / name).write_bytes(os.pread(descriptor, _LARGEST_OUTPUT, 0))
+
+
+def _remove(path: Path) -> None:
+    if path.is_symlink() or path.is_file():
+        path.unlink(missing_ok=True)
+    elif path.exists():
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSettings, parent: int) -> NoReturn:
+    """Run trials until the pool has no more; does not return.
+
+    Args:
+        pool: to the pool.
+        zygote: to the zygote of this slot.
+        settings: of the hunt.
+        parent: the process that started this one, which ends with it.
+    """
+    code = 1
+    try:
+        os.setsid()  # what a terminal or a batch system sends to everybody is for the hunt
+        die_with(parent)
+        supervisor = Supervisor(settings, zygote)
+        with pool.makefile("rb") as specs:
+            for line in specs:
+                answer = _answer(supervisor, TrialSpec.from_json(json.loads(line)))
+                pool.sendall(json.dumps(answer).encode() + b"\n")
+                if supervisor.retires or "result" not in answer:
+                    break
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def _answer(supervisor: Supervisor, spec: TrialSpec) -> Answer:
+    try:
+        ended = supervisor.run(spec)
+    except LostTrialError as error:
+        return {"lost": error.exit_code}
+    except CrashhuntError as error:
+        return error.to_json()
+    answer: Done = {"result": ended.result.to_json(), "retires": supervisor.retires}
+    if ended.notices:
+        answer["notices"] = list(ended.notices)
+    return answer

@@ -1,0 +1,257 @@
+"""What happens in the process of one trial: a fork of a process that has run nothing, which ends with its trial."""
+
+from __future__ import annotations
+
+import faulthandler
+import io
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn, TypedDict
+
+from crashhunt.base import layout
+from crashhunt.base.errors import RecorderError
+from crashhunt.base.faculties import offers
+from crashhunt.base.forks import copying, watchdog
+from crashhunt.episode import (
+    BUDGET,
+    BUDGET_BESIDE,
+    Brancher,
+    FirstCopy,
+    Parts,
+    Prober,
+    overruled_agent,
+    ready_recorder,
+    run_episode,
+)
+from crashhunt.executors._evidence import encode_report
+from crashhunt.recording import BlackBox
+from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, ReadiesProcess, TellsNotices, Tidies
+from crashhunt.trial import Outcome, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.agents import Agent
+    from crashhunt.episode import Reset, WorkerSettings
+    from crashhunt.executors._evidence import Report
+    from crashhunt.simulators import Simulator
+    from crashhunt.trial import Overruled, SpecData, TrialResult, Value
+
+__all__ = ["LEFT_OUT", "UNABLE_TO_RECORD", "Job", "TrialProcess", "loaded"]
+
+LEFT_OUT = " are left out: "
+"""Stands in a notice between probes or branches, and why there are none of them."""
+_FROM_HERE_ON = " are left out from here on: "
+UNABLE_TO_RECORD = 78
+"""The exit code of the process of a trial for whose recording the disk has no room. The supervisor checks that."""
+
+# Bound here, before any agent is imported that could replace them.
+_dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
+
+
+class Job(TypedDict):
+    """What the process of a trial is given.
+
+    ``folder`` is that of the trial, whose black box has ``reserved`` bytes; ``key`` is for its report, in hexadecimal.
+    ``wants_map`` asks for the map in any case, ``tries_copy`` for whether the trial can be copied.
+    """
+
+    spec: SpecData
+    folder: str
+    reserved: int
+    key: str
+    wants_map: bool
+    tries_copy: bool
+
+
+class TrialProcess:
+    """Runs one trial in a fork of the process in which this was made.
+
+    Making it takes over the standard output and the signals of the process.
+
+    Args:
+        settings: of the hunt.
+        parts: what has been imported already; None to import it in the process of each trial.
+    """
+
+    def __init__(self, settings: WorkerSettings, parts: Parts | None) -> None:
+        self._settings = settings
+        self._parts = parts
+        self._simulator: Simulator | None = None
+        self._box: BlackBox | None = None
+        self._pid = 0
+        self._home = Path.cwd()
+        self._notices: list[str] = []
+        self._asking: tuple[tuple[Prober | Brancher, str], ...] = ()  # copies of the trial, and what people call them
+        # Line by line, so that what a dying process printed last is in the file.
+        sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
+        sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(name)s: %(message)s")
+        self._stack = Path(os.devnull).open("a", encoding="utf-8")  # noqa: SIM115 - open as long as the process
+        os.register_at_fork(after_in_child=self._stop_recording)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole terminal; the hunt decides
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a simulator that does not return to Python as well
+
+    def make_simulator(self) -> Simulator:
+        """Make the simulator, and what each process of a trial would have to make again.
+
+        Raises:
+            CrashhuntError: it cannot be made.
+        """
+        if self._parts is None:
+            self._parts = loaded(self._settings)
+        if self._simulator is None:
+            self._simulator = self._parts.simulator()
+            if offers(self._simulator, Tidies):
+                self._simulator.tidy()
+            if offers(self._simulator, ReadiesProcess):
+                self._simulator.ready_process()
+                ready_recorder(self._simulator)
+        return self._simulator
+
+    def run(self, job: Job, reset: Reset | None = None) -> NoReturn:
+        """Run a trial, leave its report in the black box, and end this process.
+
+        Args:
+            job: the trial.
+            reset: what resets the simulator, where it has been reset already.
+        """
+        code = 1
+        try:
+            code = self._run(job, reset)
+        except BaseException:  # something that this process needs is damaged
+            code = 0
+            if self._box is not None:
+                self._box.announce_damage()
+        finally:
+            _leave(code)
+
+    def _run(self, job: Job, reset: Reset | None) -> int:
+        settings, folder = self._settings, Path(job["folder"])
+        self._pid = os.getpid()
+        os.setsid()  # what a trial sends to its whole process group is for itself
+        os.chdir(self._home)
+        self._redirect(folder)
+        spec = TrialSpec.from_json(job["spec"])
+        self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
+        box.begin(pid=self._pid, trial=spec.number, started=time.monotonic())
+        began = time.monotonic()
+        try:
+            simulator = self.make_simulator()
+            assert self._parts is not None
+            # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
+            box.begin(pid=self._pid, trial=spec.number, started=time.monotonic())
+            watchdog.arm(settings.timeout_s, self._stack)
+            made = time.monotonic()
+            prober, brancher = self._copies()
+            result = run_episode(
+                spec,
+                simulator=simulator,
+                make_agent=self._parts.agent if spec.overruled is None else partial(self._overrule, spec.overruled),
+                box=box,
+                oracles=self._parts.oracles(),
+                crash_on=settings.crash_on,
+                reset=reset,
+                prober=prober,
+                brancher=brancher,
+                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and (prober or brancher) else None,
+            )
+        except RecorderError:
+            return UNABLE_TO_RECORD
+        finally:
+            if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to its end
+                _leave(0)
+        for asks, what in self._asking:
+            if asks.why_not:
+                self._notices.append(f"{what}{_FROM_HERE_ON}{asks.why_not}")
+        wall_s, setup_s = time.monotonic() - began, made - began + result.setup_s
+        report = self._report(replace(result, wall_s=wall_s, setup_s=setup_s), simulator, job)
+        box.report(encode_report(report, bytes.fromhex(job["key"]), result.digest, dumps=_dumps))
+        return 0
+
+    def _redirect(self, folder: Path) -> None:
+        """Have what is printed, and where this process is when it dies, written into the folder of the trial."""
+        output = _open(folder / layout.RUN_LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        _dup2(output, 1)
+        _dup2(output, 2)
+        _close(output)
+        stack = _open(folder / layout.STACK, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        _dup2(stack, self._stack.fileno(), inheritable=False)
+        _close(stack)
+        faulthandler.enable(self._stack)
+        faulthandler.register(signal.SIGUSR1, self._stack)
+
+    def _report(self, result: TrialResult, simulator: Simulator, job: Job) -> Report:
+        settings = self._settings
+        data: dict[str, object] = {**result.to_json()}
+        del data["spec"]  # which the supervisor knows
+        report: Report = {"result": data, "notices": self._notices}
+        report["notices"] += simulator.notices if offers(simulator, TellsNotices) else ()
+        kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
+        kept = kept or settings.is_audited(result)
+        wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
+        if wants_map and offers(simulator, HasMap):
+            report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])
+        if kept and result.spec.only is not None and offers(simulator, LeavesOut):
+            report["entered"] = list(simulator.entered)
+        if settings.find_escapes and result.collision is not None and offers(simulator, BrakesFully):
+            braking = simulator.full_braking(result.collision.agent)
+            said: dict[str, object] | None = None
+            if braking is not None:
+                said = {"how": braking.how, "deceleration": braking.deceleration}
+            report["braking"] = said
+        return report
+
+    def _copies(self) -> tuple[Prober | None, Brancher | None]:
+        settings, prober, brancher = self._settings, None, None
+        if settings.probe_s:
+            budget = BUDGET_BESIDE if settings.branch else BUDGET
+            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget)
+        if settings.branch:
+            brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)
+        self._asking = tuple(
+            (asks, what) for asks, what in ((prober, "probes"), (brancher, "branches")) if asks is not None
+        )
+        return prober, brancher
+
+    def _cannot_copy(self, why_not: str) -> None:
+        for asks, what in self._asking:
+            asks.why_not = why_not
+            self._notices.append(f"{what}{LEFT_OUT}{why_not}")
+        self._asking = ()
+
+    def _delay(self, wall_s: float) -> None:
+        """Count the time of copies as not the trial's own."""
+        assert self._box is not None
+        self._box.delay(wall_s)
+        watchdog.extend(wall_s)
+
+    def _stop_recording(self) -> None:
+        """Keep the copy of this process that an agent forks from writing into the recording."""
+        if self._box is not None and not copying():
+            self._box.detach()
+
+    def _overrule(
+        self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
+    ) -> Agent:
+        assert self._parts is not None
+        made = self._parts.agent(agent, simulator, arguments)
+        return overruled_agent(made, simulator, overruled) if agent == overruled.agent else made
+
+
+def loaded(settings: WorkerSettings) -> Parts:
+    """Import everything that trials need.
+
+    Raises:
+        CrashhuntError: something cannot be imported.
+    """
+    parts = Parts(settings)
+    parts.load()
+    return parts
