@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
-from crashhunt.episode import WorkerSettings
+from crashhunt.episode import WorkerSettings, require_origin, seal
 from crashhunt.executors._supervisor import be_supervisor
 from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
 
@@ -47,11 +47,15 @@ def main() -> None:
     """Be the fork server; standard error is a log."""
     control = socket.socket(fileno=int(sys.argv[1]))
     job: ForkServerJob = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))
-    sys.path[:] = job["sys_path"]
+    if job["sys_path"]:
+        sys.path[:] = job["sys_path"]
     _ignore_signals()
     adopt_orphans()
     try:
         settings = WorkerSettings.from_json(job["settings"])
+        if not job["sys_path"]:
+            require_origin("crashhunt", settings.code)
+        seal(settings)
     except CrashhuntError as error:
         _send(control, error.to_json())
         return

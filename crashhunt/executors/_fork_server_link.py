@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
-from crashhunt.executors._environment import worker_environment
+from crashhunt.executors._environment import snapshot_environment, worker_environment
 from crashhunt.executors._remains import signal_name
 
 if TYPE_CHECKING:
@@ -37,17 +37,23 @@ class ForkServerLink:
         settings: of the hunt.
         late: whether each trial imports its agents itself, because what has imported them cannot be forked.
         deaths: how often it was killed before.
+        snapshot: whether crashhunt itself comes from the code of the settings.
     """
 
-    def __init__(self, settings: WorkerSettings, *, late: bool = False, deaths: int = 0) -> None:
+    def __init__(
+        self, settings: WorkerSettings, *, late: bool = False, deaths: int = 0, snapshot: bool = False
+    ) -> None:
         self._settings = settings
         self._late = late
+        self._snapshot = snapshot
         self.deaths = deaths
         self.ready = False
         self.unfit = False
         number = next(_numbers)
         job = settings.scratch / f"fork-server-{number}.json"
-        content: ForkServerJob = {"settings": settings.to_json(), "sys_path": sys.path, "late": late}
+        path = [] if snapshot else sys.path
+        content: ForkServerJob = {"settings": settings.to_json(), "sys_path": path, "late": late}
+        environment = snapshot_environment(settings) if snapshot else {**os.environ, **worker_environment()}
         job.write_text(json.dumps(content), encoding="utf-8")
         self._log = settings.scratch / f"fork-server-{number}.log"
         # Messages stay apart from each other, and file descriptors with theirs.
@@ -56,7 +62,7 @@ class ForkServerLink:
             self._kept = Kept(
                 "crashhunt.executors._fork_server",
                 [str(theirs.fileno()), str(job)],
-                environment={**os.environ, **worker_environment()},
+                environment=environment,
                 inherited=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -110,7 +116,7 @@ class ForkServerLink:
             code = -signal.SIGKILL
         self.end()
         if self.unfit:
-            return ForkServerLink(self._settings, late=True, deaths=self.deaths)
+            return ForkServerLink(self._settings, late=True, deaths=self.deaths, snapshot=self._snapshot)
         if -code not in _FROM_OUTSIDE or self.deaths + 1 >= _DEATHS:
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             how = f"was killed by {signal_name(code)}" if code < 0 else f"exited with {code}"
@@ -120,7 +126,7 @@ class ForkServerLink:
                 f"the process that starts the workers {how}{again}{said}",
                 fix="see that the limits on memory and processes leave it room, and run the same command again",
             )
-        return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1)
+        return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1, snapshot=self._snapshot)
 
     def end(self) -> None:
         """Kill it, and everything that it has started."""

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import subprocess
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
-from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
-from crashhunt.executors._environment import worker_environment
+from crashhunt.episode import WorkerSettings, answer_file, require_origin, seal
+from crashhunt.executors._environment import snapshot_environment
+from crashhunt.executors._escapes import with_escape
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
 from crashhunt.executors._remains import Attempt, damaged, died, hung, where_it_is
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError
-from crashhunt.recording import Recording, read_black_box
-from crashhunt.simulators import FullBraking
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from crashhunt.executors._messages import Answer, FreshJob
-    from crashhunt.executors._supervisor import Ended
     from crashhunt.recording import BlackBoxHeader
-    from crashhunt.trial import Escape
 
-__all__ = ["FreshProcessExecutor", "fresh_environment"]
+__all__ = ["FreshProcessExecutor"]
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
 _DAMAGED = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
@@ -123,7 +119,7 @@ class FreshProcessExecutor:
                 kept = Kept(
                     "crashhunt.executors._fresh",
                     [str(job)],
-                    environment=fresh_environment(self._settings),
+                    environment=snapshot_environment(self._settings),
                     stdin=described,  # which older versions read
                     stdout=subprocess.DEVNULL,
                     stderr=log,
@@ -186,16 +182,6 @@ class FreshProcessExecutor:
         return self._settings.scratch / f"start-{number:06d}.log"
 
 
-def fresh_environment(settings: WorkerSettings) -> dict[str, str]:
-    """Return the environment of a fresh process, in which crashhunt itself comes from the snapshot too.
-
-    Nothing compiled is left in the snapshot: what is there would be taken for the code, whoever has put it there.
-    """
-    paths = os.pathsep.join(filter(None, (*settings.code, os.environ.get("PYTHONPATH"))))
-    ours = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"} if settings.code else {}
-    return {**os.environ, **worker_environment(), **ours}
-
-
 def main() -> None:
     """Run the one trial that a file describes; what comes of it goes into another one."""
     job: FreshJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
@@ -225,39 +211,11 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
             supervisor = Supervisor(settings, fork_zygote(settings, late=True))
             ended = supervisor.run(spec)
         answer({"result": ended.result.to_json()})  # which counts, whatever becomes of what follows
-        escape = _escape(supervisor, settings, ended) if settings.find_escapes else None
-        if escape is not None:
-            answer({"result": replace(ended.result, escape=escape).to_json()})
+        found = with_escape(supervisor, settings, ended)
+        if found is not ended.result:
+            answer({"result": found.to_json()})
     except LostTrialError as error:
         answer({"lost": error.exit_code})
     except CrashhuntError as error:
         answer(error.to_json())
     return 0
-
-
-def _escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) -> Escape | None:
-    """Until when braking would have avoided a crash, by further trials."""
-    from crashhunt.crashes import find_escape
-
-    result = ended.result
-    if result.collision is None or ended.braking is None or supervisor.retires:
-        return None
-    braking = FullBraking(None, str(ended.braking["how"]), _number(ended.braking["deceleration"]))
-    numbers = itertools.count(result.spec.number + 1)  # folders of their own
-
-    def recording(number: int) -> Recording:
-        return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
-
-    def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        number = next(numbers)
-        done = supervisor.run(replace(spec, number=number)).result
-        return done, recording(number)
-
-    try:
-        return find_escape(result, recording(result.spec.number), braking, run)
-    except (BundleError, LostTrialError):
-        return None
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) else None

@@ -55,7 +55,10 @@ class FreshJob(TypedDict):
 
 
 class ForkServerJob(TypedDict):
-    """What a fork server needs to know; ``late`` where every trial imports its agents itself."""
+    """What a fork server needs to know; ``late`` where every trial imports its agents itself.
+
+    ``sys_path`` is empty where crashhunt itself comes from the snapshot, as its environment says.
+    """
 
     settings: SettingsData
     sys_path: list[str]

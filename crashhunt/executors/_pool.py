@@ -53,9 +53,17 @@ class PoolExecutor:
         settings: of the hunt.
         parallel: how many slots.
         recycle_after: not used; no process runs two trials.
+        snapshot: whether crashhunt itself comes from the code of the settings, in new Python processes.
+
+    Attributes:
+        held_back: how many slots get no further trial for now.
     """
 
-    def __init__(self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1000) -> None:
+    def __init__(
+        self, settings: WorkerSettings, *, parallel: int = 1, recycle_after: int = 1000, snapshot: bool = False
+    ) -> None:
+        self.held_back = 0
+        self._snapshot = snapshot
         self._settings = settings
         self._parallel = parallel
         self._lock = threading.RLock()
@@ -173,8 +181,10 @@ class PoolExecutor:
             running = [worker.attempt for worker in self._workers.values() if worker.attempt is not None]
             if any(attempt.alone for attempt in running) or (running and self._waiting[0].alone):
                 return
+            if len(running) >= self._parallel - self.held_back:
+                return
             if self._link is None:
-                self._link = ForkServerLink(self._settings)
+                self._link = ForkServerLink(self._settings, snapshot=self._snapshot)
                 self._selector.register(self._link.control, selectors.EVENT_READ)
             free = next((worker for worker in self._workers.values() if not (worker.attempt or worker.retired)), None)
             if free is None:

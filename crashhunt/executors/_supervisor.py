@@ -340,7 +340,7 @@ def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSe
         supervisor = Supervisor(settings, zygote)
         with pool.makefile("rb") as specs:
             for line in specs:
-                answer = _answer(supervisor, TrialSpec.from_json(json.loads(line)))
+                answer = _answer(supervisor, settings, TrialSpec.from_json(json.loads(line)))
                 pool.sendall(json.dumps(answer).encode() + b"\n")
                 if supervisor.retires or "result" not in answer:
                     break
@@ -349,14 +349,17 @@ def be_supervisor(pool: socket.socket, zygote: socket.socket, settings: WorkerSe
         os._exit(code)
 
 
-def _answer(supervisor: Supervisor, spec: TrialSpec) -> Answer:
+def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -> Answer:
     try:
         ended = supervisor.run(spec)
     except LostTrialError as error:
         return {"lost": error.exit_code}
     except CrashhuntError as error:
         return error.to_json()
-    answer: Done = {"result": ended.result.to_json(), "retires": supervisor.retires}
+    from crashhunt.executors._escapes import with_escape
+
+    result = with_escape(supervisor, settings, ended)
+    answer: Done = {"result": result.to_json(), "retires": supervisor.retires}
     if ended.notices:
         answer["notices"] = list(ended.notices)
     return answer

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.executors import SharedExecutors, read_map, snapshot_executor
 from crashhunt.hunts._workers import settings_again
 from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence, Sized
+    from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
@@ -43,6 +43,7 @@ class RunsAgain:
         notes: gets a line for whatever went wrong.
         failed: gets what was to confirm something, and ended otherwise.
         stops: has something in it as soon as somebody wants to stop.
+        executors: which run crashes again.
     """
 
     place: HuntDirectory
@@ -52,6 +53,7 @@ class RunsAgain:
     notes: list[str]
     failed: list[TrialResult]
     stops: Sized
+    executors: SharedExecutors
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until somebody wants to stop.
@@ -72,7 +74,7 @@ class RunsAgain:
             scratch.mkdir(exist_ok=True)
             try:
                 again = settings_again(self.settings, snapshot, scratch)
-                with closing(FreshProcessExecutor(again, parallel=self.parallel)) as executor:
+                with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
                     waiting = len(group)
                     for spec in group:
                         executor.submit(spec)
@@ -85,17 +87,25 @@ class RunsAgain:
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
         """Run every crash that nobody has confirmed yet once more, and return them all, in their order."""
-
-        def confirmed(bundle: Bundle) -> Bundle:
-            if bundle.confirmed is None and not len(self.stops):
-                found = confirm(bundle, lambda: bool(len(self.stops)), failed=self.failed)
-                if found is not None:
-                    found.write()
-                    return found
-            return bundle
-
         with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
-            return list(threads.map(confirmed, crashes))
+            return list(threads.map(self.confirm_one, crashes))
+
+    def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
+        """Run a crash that nobody has confirmed yet once more; return it as it is then.
+
+        Args:
+            bundle: the crash.
+            stopped: asked now and then whether to give up.
+        """
+        if bundle.confirmed is not None or len(self.stops) or stopped():
+            return bundle
+        found = confirm(
+            bundle, lambda: bool(len(self.stops)) or stopped(), failed=self.failed, executors=self.executors
+        )
+        if found is None or not bundle.path.is_dir():  # a hunt with --keep may have given it up meanwhile
+            return bundle
+        found.write()
+        return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,10 @@ from crashhunt.base.signals import stop_requests
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
-from crashhunt.executors import make_executor, read_map
+from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
 from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._confirmation import Confirmation
 from crashhunt.hunts._copied_crashes import CopiedCrashes
 from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
@@ -164,14 +165,31 @@ class Hunt:
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         again = RunsAgain(
-            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops
-        )
+            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
+            SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+        )  # fmt: skip
+        try:
+            return self._run_with(again, ledger, trials, snapshot, progress, finished, watch)
+        finally:
+            again.executors.close()
+
+    def _run_with(
+        self,
+        again: RunsAgain,
+        ledger: Ledger,
+        trials: Trials,
+        snapshot: Snapshot,
+        progress: Progress,
+        finished: set[int],
+        watch: Callable[[HuntStatus], None],
+    ) -> HuntReport:
+        settings = self.settings
         copies = FromTheStart(again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
         if not progress.is_done:
-            stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
+            stopped = self._hunt(again, ledger, trials, snapshot, progress, finished, watch)
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         progress.replace(again.confirm(progress.crashes))
@@ -205,6 +223,7 @@ class Hunt:
 
     def _hunt(
         self,
+        again: RunsAgain,
         ledger: Ledger,
         trials: Trials,
         snapshot: Snapshot,
@@ -222,6 +241,7 @@ class Hunt:
             listen=lambda: self._heard.hear(executor),
         )  # fmt: skip
         in_flight: set[int] = set()
+        confirmation = Confirmation(again, executor)
         heartbeat = 0.0
         progress.until = time.monotonic() + run.duration_s
         try:
@@ -248,6 +268,7 @@ class Hunt:
                 if not finished and is_hopeless(settings, progress.outcomes):
                     return "no_valid_trial"
                 self._listen(executor, audit, ledger, progress)
+                confirmation.look(progress)
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
@@ -273,6 +294,7 @@ class Hunt:
         finally:
             executor.close()
             audit.close()
+            confirmation.close(progress)
         if self._stops:
             return "interrupted"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:

@@ -19,7 +19,7 @@ from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.faculties import offers
 from crashhunt.base.keeper import Kept
 from crashhunt.episode import Observer, Parts, WorkerSettings, run_episode, seal
-from crashhunt.executors import fresh_environment
+from crashhunt.executors import snapshot_environment
 from crashhunt.panels import labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
@@ -101,7 +101,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         kept = Kept(
             _module_in(settings.code),
             [folder],
-            environment=fresh_environment(settings),
+            environment=snapshot_environment(settings),
             apart=False,
             stdout=2 if look.to_stderr else None,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor
+from crashhunt.executors import run_alone
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.replays._prepare import ReplayOptions, prepare
 from crashhunt.replays._verdict import judged, up_to
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.crashes import Bundle
+    from crashhunt.executors import SharedExecutors
     from crashhunt.recording import DivergenceData
     from crashhunt.replays._debugger import Look
     from crashhunt.replays._prepare import Rerun
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
     from crashhunt.trial import TrialResult
 
 __all__ = ["confirm", "replay"]
-
-_LOOK_EVERY_S = 0.5  # how late Ctrl-C may be
 
 
 def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport:
@@ -54,7 +54,11 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
 
 
 def confirm(
-    bundle: Bundle, stopped: Callable[[], bool] = lambda: False, *, failed: list[TrialResult] | None = None
+    bundle: Bundle,
+    stopped: Callable[[], bool] = lambda: False,
+    *,
+    failed: list[TrialResult] | None = None,
+    executors: SharedExecutors | None = None,
 ) -> Bundle | None:
     """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
 
@@ -62,13 +66,14 @@ def confirm(
         bundle: the crash.
         stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
         failed: gets what came of the replay, where that is not the crash.
+        executors: which run it; a new Python process where there are none.
 
     Returns:
         None where it was given up.
     """
     try:
         rerun = prepare(bundle, ReplayOptions(force=True))
-        report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped)
+        report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped, executors)
     except _StoppedError:
         return None
     except CrashhuntError as error:
@@ -86,27 +91,28 @@ class _StoppedError(Exception):
     pass
 
 
-def _run(rerun: Rerun, stopped: Callable[[], bool] = lambda: False) -> ReplayReport:
+def _run(
+    rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedExecutors | None = None
+) -> ReplayReport:
     with tempfile.TemporaryDirectory(prefix="crashhunt-replay-") as folder:
-        scratch = Path(folder)
-        executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
-        try:
-            executor.submit(rerun.spec)
-            found: list[TrialResult] = []
-            while not found:
-                found = list(executor.completed(_LOOK_EVERY_S))
-                if stopped():
-                    raise _StoppedError
-            result = found[0]
-        finally:
-            executor.close()
+        scratch, found = Path(folder), None
+        if executors is None:
+            result = run_alone(replace(rerun.worker, scratch=scratch), rerun.spec, stopped)
+        else:
+            found = executors.run(rerun.worker, rerun.spec, stopped)
+            result, scratch = found if found is not None else (None, scratch)
+        if result is None:
+            raise _StoppedError
         message = result.failure.message if result.failure else "it left no recording"
-        if result.outcome is Outcome.INVALID:
-            raise _not_set_up(rerun, message)
+        recorded_in = scratch_of(scratch, rerun.spec.number)
         try:
-            replayed = Recording(read_black_box(scratch_of(scratch, rerun.spec.number) / layout.BLACK_BOX))
+            if result.outcome is Outcome.INVALID:
+                raise _not_set_up(rerun, message)
+            replayed = Recording(read_black_box(recorded_in / layout.BLACK_BOX))
         except BundleError as error:
             raise _not_set_up(rerun, message) from error
+        finally:
+            shutil.rmtree(recorded_in, ignore_errors=True)
     recorded = rerun.recorded
     if rerun.code == "log":
         return judged(rerun, up_to(recorded, recorded.steps), up_to(replayed, replayed.steps), result)
