@@ -233,7 +233,7 @@ def child_core(scenario: str) -> dict[str, float]:
     arguments = {"ego": {"speed": 8.0}} if scenario == "loop" else {}  # of the agents that they name
     spent: dict[tuple[int, bool], list[float]] = {}
     with folder() as scratch:
-        slots = {}
+        slots: dict[bool, Slot] = {}
         for native in (True, False):
             (place := scratch / str(native)).mkdir()
             one = chosen.with_table(replace(chosen.table(SumoSetup), native=None if native else False))
@@ -475,6 +475,65 @@ def bench_help() -> Iterator[Figure]:
         subprocess.run([str(CRASHHUNT), "--help"], stdout=subprocess.DEVNULL, check=True)
         times.append(time.perf_counter() - began)
     yield Figure("help_s", statistics.median(times), "s", "lower", 0.3, "crashhunt --help")
+
+
+def child_projection(first: str, second: str) -> dict[str, float]:
+    """Processor time of trials of two scenarios, in turns."""
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.scenario import argument_values, load_scenario
+    from crashhunt.trial import TrialSpec
+
+    rounds, at_once = 9, 8
+    spent: dict[str, list[float]] = {first: [], second: []}
+    with folder() as scratch:
+        slots: dict[str, Slot] = {}
+        for name in spent:
+            (place := scratch / str(len(slots))).mkdir()
+            oracles = ("reported-collision", "overlap", "off-road")
+            chosen = load_scenario(name)
+            slots[name] = Slot(WorkerSettings(scenario=chosen, oracles=oracles, crash_on=(), scratch=place))
+        for number in range(rounds):
+            for name in spent if number % 2 else reversed(spent):
+                began = slots[name].cpu_s()
+                for again in range(at_once):
+                    trial = number * at_once + again
+                    slots[name].run(TrialSpec(trial, trial, {"ego": {"speed": 5.0}}, argument_values(chosen), 84))
+                if number:  # the first warms everything up
+                    spent[name].append((slots[name].cpu_s() - began) / at_once)
+    return {"ratio": statistics.median(map(float.__truediv__, spent[second], spent[first])),
+            "first": statistics.median(spent[first])}  # fmt: skip
+
+
+def bench_projection() -> Iterator[Figure]:
+    """A network with a geographic projection, for which SUMO opens a database, against the same one without."""
+    with folder() as place:
+        loop = Path(__file__).resolve().parent.parent / "scenarios" / "loop"
+        for name in ("flat", "projected"):
+            shutil.copytree(loop, place / name)
+        net = place / "projected" / "loop.net.xml"
+        text = net.read_text()
+        if 'projParameter="!"' not in text:
+            raise RuntimeError(f"{net} has a projection already")
+        projection = 'projParameter="+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"'
+        net.write_text(text.replace('projParameter="!"', projection))
+        found = in_child("child_projection", str(place / "projected"), str(place / "flat"))
+    note = f"trials of 84 steps for the same CPU time; {60 / found['first']:.0f} a minute of it with a projection"
+    yield Figure("projected_network", found["ratio"], "x", "higher", 0.97, note)
+
+
+def bench_replay_cpu() -> Iterator[Figure]:
+    """The processor time of a replay from the command line, its children included."""
+    import resource
+
+    with folder() as place:
+        hunt(place / "h", 2, 300, 600, "--seed", "1")
+        spent = []
+        for _ in range(7):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run([CRASHHUNT, "replay", place / "h"], check=True, stdout=subprocess.DEVNULL)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    yield Figure("replay_cpu", statistics.median(spent[1:]), "s", "lower", 0.6, "crashhunt replay of a crash of loop")
 
 
 def child_memory(trials: str) -> dict[str, float]:
@@ -973,6 +1032,8 @@ BENCHES: dict[str, Callable[[], Iterator[Figure]]] = {
     "step": bench_step,
     "core": bench_core,
     "isolation": bench_isolation,
+    "projection": bench_projection,
+    "replay-cpu": bench_replay_cpu,
     "parallel": bench_parallel,
     "orchestration": bench_orchestration,
     "ceiling": bench_ceiling,

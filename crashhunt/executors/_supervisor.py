@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.errors import CrashhuntError, RecorderError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.processes import die_with
 from crashhunt.episode import scratch_of
@@ -356,6 +356,12 @@ def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -
         return {"lost": error.exit_code}
     except CrashhuntError as error:
         return error.to_json()
+    except FileNotFoundError:  # another trial has removed the scratch folder meanwhile
+        return {"lost": -signal.SIGKILL}
+    except OSError as error:
+        return RecorderError(
+            f"the trial cannot be kept: {error.strerror}", fix=remedy(error), where=str(error.filename or "")
+        ).to_json()
     from crashhunt.executors._escapes import with_escape
 
     result = with_escape(supervisor, settings, ended)

@@ -141,13 +141,13 @@ class TrialProcess:
         self._redirect(folder)
         spec = TrialSpec.from_json(job["spec"])
         self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
-        box.begin(pid=self._pid, trial=spec.number, started=time.monotonic())
         began = time.monotonic()
         try:
             simulator = self.make_simulator()
             assert self._parts is not None
-            # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
+            # From here on the trial's time runs; imports that each trial makes itself do not count.
             box.begin(pid=self._pid, trial=spec.number, started=time.monotonic())
+            # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
             watchdog.arm(settings.timeout_s, self._stack)
             made = time.monotonic()
             prober, brancher = self._copies()
