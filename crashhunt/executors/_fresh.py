@@ -21,7 +21,7 @@ from crashhunt.executors._baseline import OPEN_FILES
 from crashhunt.executors._environment import worker_environment
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._worker import Worker
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.trial import TrialResult, TrialSpec
@@ -163,7 +163,7 @@ class FreshProcessExecutor:
                 self._notes.add(why)
                 self._waiting.appendleft(running.attempt)
                 return None
-            return died(spec, scratch, exit_code)
+            return result_of_death(running.attempt, scratch, exit_code)
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:

@@ -18,7 +18,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import answer_file
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import DAMAGED, Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._remains import DAMAGED, Attempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._template_link import TemplateLink
 from crashhunt.trial import TrialResult
 
@@ -318,7 +318,7 @@ class PoolExecutor:
             self._notes.add(why)
             self._waiting.appendleft(attempt)
         else:
-            self._done.put(died(attempt.spec, scratch, exit_code))
+            self._done.put(result_of_death(attempt, scratch, exit_code))
 
     def _discard(self, worker: _Worker) -> None:
         with suppress(KeyError, ValueError):

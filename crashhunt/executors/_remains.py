@@ -12,7 +12,7 @@ from crashhunt.base.errors import BundleError
 from crashhunt.episode import scratch_of
 from crashhunt.executors._worker import read_tail
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
-from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
 from crashhunt.world import ClosestApproach, DangerMeter, closest_approach
 
 if TYPE_CHECKING:
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "signal_name", "where_it_is"]
+__all__ = ["DAMAGED", "Attempt", "damaged", "died", "hung", "result_of_death", "signal_name", "where_it_is"]
 
 DAMAGED = 79
 """The exit code of a worker that has run its trial to the end, and could not say what came of it."""
 _FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
-_ATTEMPTS = 3  # of a trial whose process is killed from outside; then somebody means it
+_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
 @dataclass(slots=True)
@@ -34,7 +34,7 @@ class Attempt:
 
     A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
     kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same place
-    it was the trial itself.
+    it was the trial itself. Where it ends at another place each time, the trial is not the cause.
 
     Args:
         spec: the trial.
@@ -48,6 +48,11 @@ class Attempt:
     def alone(self) -> bool:
         """Whether no other trial may run meanwhile."""
         return bool(self.ends)
+
+    @property
+    def is_killed_from_outside(self) -> bool:
+        """Whether every allowed attempt was killed, each at another step: no attempt shows how the trial ends."""
+        return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
 
     def again(self, scratch: Path, exit_code: int) -> str:
         """Why it is to be run once more, in words; empty where what has happened is its outcome."""
@@ -79,6 +84,27 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int) -> TrialResult:
     )
     kind = "signal" if exit_code < 0 else "exit code"
     return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code)
+
+
+def result_of_death(attempt: Attempt, scratch: Path, exit_code: int) -> TrialResult:
+    """Return the result of a trial whose process died and that is not run again.
+
+    The trial is invalid where its processes were killed from outside at different steps, and else as of `died`.
+
+    Args:
+        attempt: the trial; `Attempt.again` has been called with this death.
+        scratch: the folder in which the trial records.
+        exit_code: exit code of the process; negative for a signal.
+    """
+    result = died(attempt.spec, scratch, exit_code)
+    if not attempt.is_killed_from_outside:
+        return result
+    ends = ", ".join(f"{signal_name(code)} after step {max(0, step)}" for code, step in attempt.ends)
+    why = f"killed from outside {len(attempt.ends)} times, each time at another step ({ends})"
+    failure = Failure(KILLED, why, exit_code=exit_code)
+    return TrialResult(
+        attempt.spec, Outcome.INVALID, failure=failure, wall_s=result.wall_s, worker=result.worker, kept=result.kept
+    )
 
 
 def damaged(spec: TrialSpec, scratch: Path, what: str) -> TrialResult:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.plain import finite
 from crashhunt.trial._branches import Branches
 from crashhunt.trial._disturbance import Disturbance
-from crashhunt.trial._evidence import Collision, Escape, Failure
+from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.trial._stress import Stress
@@ -140,6 +140,11 @@ class TrialResult:
             branches=Branches.from_json(branches) if branches else None,
             setup_steps=data.get("setup_steps"),
         )
+
+    @property
+    def was_killed_from_outside(self) -> bool:
+        """Whether its processes were killed from outside until no attempt was left: how it ends is not known."""
+        return self.failure is not None and self.failure.kind == KILLED
 
     @property
     def steps_begun(self) -> int:
