@@ -82,8 +82,8 @@ class Worker:
         self.used = False
         self._pid = os.getpid()
         self._is_copy = False
-        budget = BUDGET_BESIDE if settings.branch else BUDGET
-        self._prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget) if settings.probe_s else None
+        asks = settings.crash_on, self._delay, BUDGET_BESIDE if settings.branch else BUDGET, self._notice
+        self._prober = Prober(settings.probe_s, *asks) if settings.probe_s else None
         about = settings.branch, settings.crash_on, self._delay, self._notice
         self._brancher = Brancher(*about) if settings.branch else None
         self._first_copy = FirstCopy(self._no_copies) if settings.probe_s or settings.branch else None
@@ -225,9 +225,9 @@ class Worker:
     def _no_copies(self, why_not: str) -> None:
         """Do without copies from the first step on; the hunt is told at once."""
         if self._prober is not None:
-            self._prober.why_not = why_not
+            self._prober.stop(why_not)
         if self._brancher is not None:
-            self._brancher.why_not = why_not
+            self._brancher.stop(why_not)
         self._tell_why_not(LEFT_OUT)
 
     def _tell_why_not(self, how: str) -> None:

@@ -86,6 +86,7 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
+        self._unanswered: dict[int, TrialResult] = {}  # that run again, as the ledger has them
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -141,12 +142,14 @@ class Hunt:
             spec = proposed.get(bundle.result.spec.number, bundle.result.spec)
             ledger.record(replace(bundle.result, spec=spec), snapshot=bundle.snapshot)
             finished.add(spec.number)
+        self._unanswered = {result.spec.number: result for result in ledger.unanswered()}
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
-        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber)
+        again = [result.spec for result in self._unanswered.values()]
+        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
         ledger.enter(
             "running",
             owner=this_process(),
@@ -163,10 +166,10 @@ class Hunt:
             copies=copies_to_come(settings),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        again = RunsAgain(
+        runs_again = RunsAgain(
             self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops
         )
-        copies = FromTheStart(again, self._disturber)
+        copies = FromTheStart(runs_again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
@@ -174,8 +177,8 @@ class Hunt:
             stopped = self._hunt(ledger, trials, snapshot, progress, finished, watch)
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
-        progress.replace(again.confirm(progress.crashes))
-        near, (probes, branches) = keep_near_misses(again), look_at_copies(copies)
+        progress.replace(runs_again.confirm(progress.crashes))
+        near, (probes, branches) = keep_near_misses(runs_again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
@@ -201,6 +204,7 @@ class Hunt:
             progress.kinds.at_fault if progress.kinds is not None else None,
             branches,
             progress.ended_by_copy,
+            0 if stopped in ("crash", "distinct") else len(ledger.unanswered()),
         )
 
     def _hunt(
@@ -214,11 +218,12 @@ class Hunt:
     ) -> StoppedBecause:
         settings, run = self.settings, self.settings.run
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
-        parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
+        planned = settings.most_trials - len(finished) + len(self._unanswered)
+        parallel = min(run.parallel, max(1, planned))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         audit, self._heard = Audit(worker_settings, progress.failed), Heard(settings, progress.outcomes)
         preflight = Preflight(
-            settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code,
+            settings, planned, files=snapshot.argument_files, code=snapshot.code,
             listen=lambda: self._heard.hear(executor),
         )  # fmt: skip
         in_flight: set[int] = set()
@@ -322,6 +327,16 @@ class Hunt:
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
+        before = self._unanswered.pop(result.spec.number, None)
+        if before is not None:
+            if result.was_killed_from_outside:
+                return  # the ledger has an answer that is as good, or better
+            progress.outcomes[str(before.outcome)] -= 1
+            if before.digest and before.digest != result.digest:
+                again = f"trial {result.spec.number} was run again for the answers of its copies"
+                note = f"{again}, and is another one: it is not determined by its specification"
+                ledger.remark(note)
+                progress.notes.append(note)
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
         if crashed:
@@ -378,6 +393,7 @@ class Hunt:
             progress.disturbed if self._disturber is not None else None,
             progress.stressed,
             progress.branched,
+            progress.not_fully_asked,
             progress.searching.status(),
         )
 

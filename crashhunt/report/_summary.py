@@ -49,6 +49,11 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.copied is not None:
         number = report.copied.result.spec.number
         lines.append(f"Trial {number} did not crash; a copy of it did, and from the start it crashed as well.")
+    if report.unanswered:
+        one = report.unanswered == 1
+        who, whom = f"{report.unanswered} {'trial' if one else 'trials'}", "it" if one else "them"
+        why = "processes were killed from outside"
+        lines.append(f"Answers are missing from {who}: {why}. The same command runs {whom} again.")
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
