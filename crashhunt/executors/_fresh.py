@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.keeper import Kept
+from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
 from crashhunt.executors._baseline import OPEN_FILES
 from crashhunt.executors._environment import worker_environment
@@ -164,13 +165,22 @@ class FreshProcessExecutor:
                 self._waiting.appendleft(running.attempt)
                 return None
             return result_of_death(running.attempt, scratch, exit_code)
+        # The answer is there, so that what was killed is the search for the escape: without it the answer is half.
+        why_no_escape = ""
+        if self._settings.find_escapes and not running.killed and is_sent_from_outside(exit_code):
+            if why := running.attempt.again(scratch, exit_code):
+                self._notes.add(why)
+                self._waiting.appendleft(running.attempt)
+                return None
+            why_no_escape = f"the process that searched {describe_death(exit_code)}, {len(running.attempt.ends)} times"
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
         if "result" not in answer:
             raise KeyError("result")
-        return TrialResult.from_json(answer["result"])
+        result = TrialResult.from_json(answer["result"])
+        return replace(result, why_no_escape=why_no_escape) if why_no_escape and result.escape is None else result
 
     def _job(self, number: int) -> Path:
         return self._settings.scratch / layout.numbered(number, layout.JOB)

@@ -84,10 +84,10 @@ class RunsAgain:
                 shutil.rmtree(scratch, ignore_errors=True)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
-        """Run every crash that nobody has confirmed yet once more, and return them all, in their order."""
+        """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
 
         def confirmed(bundle: Bundle) -> Bundle:
-            if bundle.confirmed is None and not len(self.stops):
+            if not bundle.is_fully_confirmed and not len(self.stops):
                 found = confirm(bundle, lambda: bool(len(self.stops)), failed=self.failed)
                 if found is not None:
                     found.write()

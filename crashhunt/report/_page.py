@@ -223,7 +223,11 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "digest": result.digest,
             "snapshot": bundle.snapshot,
             **_disturbances(result),
-            "confirmed": {True: "yes, to the bit", False: "no: flaky", None: "not tried"}[bundle.confirmed],
+            "confirmed": {
+                True: "yes, to the bit",
+                False: "no: flaky",
+                None: f"not confirmed: {bundle.why_unconfirmed}" if bundle.why_unconfirmed else "not tried",
+            }[bundle.confirmed],
         },
         "escape": story.escape,
         "nearest": story.nearest.step if story.nearest is not None else None,

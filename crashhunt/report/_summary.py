@@ -213,6 +213,10 @@ def _describe_crash(bundle: Bundle) -> list[str]:
             if bundle.confirmed
             else f"  flaky: a fresh process did not do the same ({diverged})"
         )
+    elif bundle.why_unconfirmed:
+        lines.append(f"  not confirmed: {bundle.why_unconfirmed}; the same command tries again")
+    if result.why_no_escape:
+        lines.append(f"  last avoidable step: not known, as {result.why_no_escape}; the same command tries again")
     return lines
 
 
