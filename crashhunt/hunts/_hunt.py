@@ -16,11 +16,12 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
-from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._audit import Audit, AuditReport
 from crashhunt.hunts._copied_crashes import CopiedCrashes
 from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._from_the_start import FromTheStart
+from crashhunt.hunts._late_audits import find_audits_left, finish_audits
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._look_at_copies import look_at_copies
 from crashhunt.hunts._near_misses import keep_near_misses
@@ -86,6 +87,7 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
+        self._audits_left: list[int] = []  # by earlier runs
         self._unanswered: dict[int, TrialResult] = {}  # that run again, as the ledger has them
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
@@ -149,6 +151,8 @@ class Hunt:
         progress.resume(list_bundles(self.directory), settings.run, before)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
         again = [result.spec for result in self._unanswered.values()]
+        worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
+        self._audits_left = find_audits_left(ledger, before, worker_settings)
         trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
         ledger.enter(
             "running",
@@ -164,6 +168,7 @@ class Hunt:
             core=core_of(self.scenario, settings.run),
             disturb=list(settings.disturb) or None,
             copies=copies_to_come(settings),
+            audits_left=self._audits_left or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         runs_again = RunsAgain(
@@ -178,6 +183,9 @@ class Hunt:
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         progress.replace(runs_again.confirm(progress.crashes))
+        if self._audits_left:
+            watch(self._status(progress, "auditing"))
+            self._finish_audits(runs_again, progress)
         near, (probes, branches) = keep_near_misses(runs_again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
@@ -276,6 +284,7 @@ class Hunt:
                 raise
             raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
+            self._note_audits(audit, progress)
             executor.close()
             audit.close()
         if self._stops:
@@ -305,8 +314,21 @@ class Hunt:
         progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")
+        self._note_audits(audit, progress)
+
+    def _note_audits(self, audit: Audit, progress: Progress) -> None:
         if self.settings.run.audit > 0:
             progress.audit = audit.report
+            progress.audits_left = sorted({*audit.left, *self._audits_left})
+
+    def _finish_audits(self, runs_again: RunsAgain, progress: Progress) -> None:
+        """Run the trials again that earlier runs of the hunt were to audit, and did not."""
+        left_now = set(progress.audits_left) - set(self._audits_left)
+        now, (late, left) = progress.audit or AuditReport(), finish_audits(runs_again, self._audits_left)
+        progress.audit = AuditReport(
+            now.trials + late.trials, now.differences + late.differences, now.not_finished + late.not_finished
+        )
+        progress.audits_left = sorted({*left_now, *left})
 
     def _see_to(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger anew where somebody has removed it; what was recorded is still at hand.

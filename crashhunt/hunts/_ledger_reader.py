@@ -222,6 +222,13 @@ class LedgerReader:
             return None
         return self._result(self._plain(row))
 
+    def ended_since(self, at: float) -> Iterator[TrialResult]:
+        """Yield the trials that ended at some time or later, in s since the epoch."""
+        return (
+            self._result(self._plain(row))
+            for row in self._select(f"{self._shape.select('trials')} WHERE ended_at >= ? ORDER BY number", (at,))
+        )
+
     def unanswered(self) -> list[TrialResult]:
         """Return the trials that a resumed hunt runs again: something outside of them kept answers from it.
 

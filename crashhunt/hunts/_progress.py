@@ -107,6 +107,7 @@ class Progress:
     failed: list[TrialResult] = field(default_factory=list)  # what was to confirm something, and ended otherwise
     failed_steps: int = 0  # of such runs, before this run of the hunt
     audit: AuditReport | None = None
+    audits_left: list[int] = field(default_factory=list)
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
     searching: Searching = field(default_factory=Searching)
@@ -200,7 +201,8 @@ class Progress:
             kinds = {"kinds": list(map(kind_data, self.kinds.groups())), "newest_kind": self.kinds.newest}
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
-        return {"heartbeat": time.time(), **nodes, **kinds, **in_vain}
+        audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
+        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain}
 
     def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the last three of `HuntStatus`."""

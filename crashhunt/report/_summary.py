@@ -186,9 +186,11 @@ def _describe_audit(report: HuntReport) -> list[str]:
     if found is None:
         return []
     same = found.trials - len(found.differences)
-    if found.trials == 0:
+    if found.trials == found.not_finished == 0:
         return ["Audit: no trial without a crash belonged to the sample."]
     lines = [f"Audit: {found.trials} run again in fresh processes, {same} the same to the bit."]
+    if found.not_finished:
+        lines.append(f"  {found.not_finished} more could not be run again to the end; the same command does it")
     lines += [f"  {difference}" for difference in found.differences[:_SHOWN]]
     if len(found.differences) > _SHOWN:
         lines.append(f"  … and {len(found.differences) - _SHOWN} more; crashhunt logs has them all")
