@@ -88,7 +88,8 @@ class Hunt:
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
         self._audits_left: list[int] = []  # by earlier runs
-        self._unanswered: dict[int, TrialResult] = {}  # that run again, as the ledger has them
+        self._unanswered: dict[int, TrialResult] = {}  # that are still to run again, as the ledger has them
+        self._open: set[int] = set()  # that the next run of the hunt runs again
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -212,7 +213,7 @@ class Hunt:
             progress.kinds.at_fault if progress.kinds is not None else None,
             branches,
             progress.ended_by_copy,
-            0 if stopped in ("crash", "distinct") else len(ledger.unanswered()),
+            0 if stopped in ("crash", "distinct") else len(self._open | self._unanswered.keys()),
         )
 
     def _hunt(
@@ -349,6 +350,8 @@ class Hunt:
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
+        if result.is_to_be_run_again:
+            self._open.add(result.spec.number)
         before = self._unanswered.pop(result.spec.number, None)
         if before is not None:
             if result.was_killed_from_outside:
