@@ -39,10 +39,14 @@ class Asleep:
     Attributes:
         pid: its process.
         raised: the exception that has ended what was asked last, in words; empty where there was none.
+        no_answer: why `ask` has returned None.
+        is_usable: whether it can be asked again.
     """
 
     def __init__(self, work: Callable[[Plain], Plain], known: forks.Held | None = None) -> None:
         self.raised = ""
+        self.no_answer: forks.NoAnswer | None = None
+        self.is_usable = True
         wakes, self._asks = os.pipe()
         self._says, says = os.pipe()
         forks.ends.update((self._asks, self._says))
@@ -56,28 +60,52 @@ class Asleep:
             os.close(says)
 
     def ask(self, job: Plain, timeout_s: float) -> Plain | None:
-        """Return what comes of it; None where it raised something, died, or took longer, and then it cannot go on.
+        """Return what comes of it; None where it raised something, died, or took longer: `no_answer` has the reason.
 
         Args:
             job: what is asked.
             timeout_s: wall time that it has, in s.
         """
+        if not self.is_usable:
+            return None
+        children = forks.children_now()
+        try:
+            return self._ask(job, timeout_s)
+        finally:
+            if not self.is_usable:
+                forks.end_orphans(children)
+
+    def _ask(self, job: Plain, timeout_s: float) -> Plain | None:
         text, received = _dumps([job, timeout_s]).encode() + b"\n", bytearray()
         deadline = time.monotonic() + timeout_s + _MORE_S
         try:
             while text:
                 text = text[_write(self._asks, text) :]
         except BrokenPipeError:
+            self._lose(forks.explain_silence(self.pid))
             return None
         while not received.endswith(b"\n"):
             ready, _, _ = select.select([self._says], [], [], max(0.0, deadline - time.monotonic()))
-            data = os.read(self._says, _RECEIVED) if ready else b""
+            if not ready:
+                self._lose(forks.NoAnswer(f"took longer than {timeout_s:g} s"))
+                return None
+            data = os.read(self._says, _RECEIVED)
             if not data:
+                self._lose(forks.explain_silence(self.pid))
                 return None
             received += data
         answer: Plain | None
-        answer, self.raised = _loads(received)
+        try:
+            answer, self.raised, why = _loads(received)
+        except (ValueError, TypeError):
+            self._lose(forks.NoAnswer("sent data that are no answer"))
+            return None
+        if answer is None:
+            self.no_answer = forks.NoAnswer(*why)
         return answer
+
+    def _lose(self, why: forks.NoAnswer) -> None:
+        self.no_answer, self.is_usable = why, False
 
     def end(self) -> None:
         """End it, and whatever it has asked a copy for; may be called twice."""
@@ -97,12 +125,14 @@ def _sleep(wakes: int, says: int, work: Callable[[Plain], Plain], known: forks.H
     with os.fdopen(wakes, "rb", closefd=False) as jobs:
         for line in jobs:
             job, timeout_s = _loads(line)
-            answer, raised = None, ""
+            answer: Plain | None = None
+            raised, why = "", forks.NoAnswer("")
             try:
                 copy = forks.Copy(partial(work, job), known)
-                answer, raised = copy.answer(timeout_s), copy.raised
+                answer, raised, why = copy.answer(timeout_s), copy.raised, copy.no_answer or why
             except forks.CannotForkError as error:
                 raised = error.message
-            text = _dumps([answer, raised]).encode() + b"\n"
+                why = forks.NoAnswer(f"could not be made: {raised}", isinstance(error, forks.NoProcessError))
+            text = _dumps([answer, raised, [why.why, why.is_from_outside]]).encode() + b"\n"
             while text:
                 text = text[_write(says, text) :]

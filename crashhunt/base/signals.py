@@ -1,4 +1,4 @@
-"""Requests to stop: Ctrl-C, SIGTERM, a hang-up."""
+"""Signals: requests to stop (Ctrl-C, SIGTERM, a hang-up), and which deaths may have come from outside a process."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ import os
 import signal
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["stop_requests"]
+__all__ = ["describe_death", "is_sent_from_outside", "stop_requests"]
+
+_SENT_FROM_OUTSIDE: Final = frozenset(
+    {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
+)
+"""What an administrator, a batch system, or the kernel where memory runs out, ends a process by."""
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
@@ -48,3 +53,26 @@ def stop_requests() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def is_sent_from_outside(exit_code: int) -> bool:
+    """Return whether a process died of a signal that another process or the kernel may have sent.
+
+    Args:
+        exit_code: as `subprocess` has it: negative for a signal.
+    """
+    return -exit_code in _SENT_FROM_OUTSIDE
+
+
+def describe_death(exit_code: int) -> str:
+    """Return how a process ended: "was killed by SIGKILL", "exited with 3".
+
+    Args:
+        exit_code: as `subprocess` has it: negative for a signal.
+    """
+    if exit_code >= 0:
+        return f"exited with {exit_code}"
+    try:
+        return f"was killed by {signal.Signals(-exit_code).name}"
+    except ValueError:  # a real-time signal
+        return f"was killed by signal {-exit_code}"

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.cli._common import Commands
+    from crashhunt.crashes import Bundle
     from crashhunt.shrinking import Shrunk
 
 __all__ = ["add_shrink"]
@@ -107,12 +108,18 @@ def _told(found: Shrunk) -> str:
         f"  {found.trials} trials"
         + (f"; ended before it was done: {found.why or found.ended}" if _early(found) else ""),
         f"  saved in {small.path}",
-        "  confirmed: a fresh process did the same to the bit"
-        if small.confirmed
-        else "  flaky: a fresh process did not do the same",
+        _confirmed(small),
         *(f"  note: {note}" for note in found.notes),
     ]
     return in_lines(lines)
+
+
+def _confirmed(small: Bundle) -> str:
+    if small.confirmed:
+        return "  confirmed: a fresh process did the same to the bit"
+    if small.confirmed is None:
+        return f"  not confirmed: {small.why_unconfirmed or 'interrupted'}"
+    return "  flaky: a fresh process did not do the same"
 
 
 def _moved(names: Sequence[str]) -> str:

@@ -119,13 +119,19 @@ def copies_told(state: HuntState) -> list[str]:
         least = "no stress margin yet"
         if probes["least"] is not None:
             least = f"least stress margin {probes['least']:.2f} (trial {probes['trial']})"
-        crashed = f"{probes['crashed_trials']} of {probes['trials']} trials"
-        told.append(f"{least}; probes {probes['probes']}, made to crash {crashed}{_confirmed(probes)}")
+        crashed = f"{probes['crashed_trials']} of {probes['trials'] + probes['not_fully_asked']} trials"
+        said = f"{least}; probes {probes['probes']}, made to crash {crashed}{_confirmed(probes)}"
+        told.append(said + _not_fully_asked(probes))
     if (branches := state.branches) is not None:
         asked = f"branches {branches['branches']} (moments {branches['moments']})"
         crashed = f"crashed {branches['crashed']} (in {branches['crashed_trials']} of {branches['trials']} trials)"
-        told.append(f"{asked}, {crashed}{_confirmed(branches)}")
+        told.append(f"{asked}, {crashed}{_confirmed(branches)}{_not_fully_asked(branches)}")
     return told
+
+
+def _not_fully_asked(sums: ProbeSums | BranchSums) -> str:
+    count = sums["not_fully_asked"]
+    return f", not fully asked {count} {'trial' if count == 1 else 'trials'}" if count else ""
 
 
 def _confirmed(sums: ProbeSums | BranchSums) -> str:

@@ -68,6 +68,7 @@ _TYPES: Plain = {
     "disturbed": bool,
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
     "only": list[str] | None,
+    **dict.fromkeys(("why_unconfirmed", "why_no_escape"), str),
     "script": dict | None,
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
@@ -86,10 +87,12 @@ class Bundle:
         result: the crash.
         hunt_seed: of the hunt that found it.
         snapshot: the digest of the code that it ran.
-        confirmed: whether a fresh process did the same to the bit; None where nobody tried.
+        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or the try did not come to
+            its end.
         divergence: where it did not.
         files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
         added: what a later version says of it, which is written back.
+        why_unconfirmed: why the try did not come to its end; empty where it did, or nobody tried.
     """
 
     path: Path
@@ -100,6 +103,12 @@ class Bundle:
     divergence: DivergenceData | None = None
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     added: Plain = field(default_factory=dict)
+    why_unconfirmed: str = ""
+
+    @property
+    def is_fully_confirmed(self) -> bool:
+        """Whether it was replayed to the end, and so was the search for the last step at which braking helps."""
+        return self.confirmed is not None and not self.result.why_no_escape
 
     @property
     def id(self) -> str:
@@ -167,6 +176,8 @@ class Bundle:
             "digest": plain["digest"],
             "confirmed": self.confirmed,
         }
+        if self.why_unconfirmed:
+            found["why_unconfirmed"] = self.why_unconfirmed
         if self.is_near_miss:
             found["danger"] = plain.get("danger")
         if "log_likelihood" in plain or self.result.spec.disturbances:
@@ -207,6 +218,10 @@ class Bundle:
             "divergence": self.divergence,
             "files": dict(self.files) or files_beside(folder),
         }
+        if self.why_unconfirmed:
+            data["why_unconfirmed"] = self.why_unconfirmed
+        if result.why_no_escape:
+            data["why_no_escape"] = result.why_no_escape
         if result.danger is not None:
             data["danger"] = plain.get("danger")
         if result.log_likelihood is not None or result.spec.disturbances:
@@ -300,6 +315,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
         log_likelihood=data.get("log_likelihood"),
         danger=data.get("danger"),
+        why_no_escape=data.get("why_no_escape", ""),
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(
@@ -311,6 +327,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         data.get("divergence"),
         files,
         added=_added(data),
+        why_unconfirmed=data.get("why_unconfirmed", ""),
     )
 
 

@@ -59,6 +59,8 @@ class CrashData(Protected):
     planned_disturbances: NotRequired[list[DisturbanceData]]
     only: NotRequired[list[str] | None]
     script: NotRequired[PathsData | None]
+    why_unconfirmed: NotRequired[str]
+    why_no_escape: NotRequired[str]
 
 
 class CrashSummary(TypedDict):
@@ -74,6 +76,7 @@ class CrashSummary(TypedDict):
     path: str
     digest: str
     confirmed: bool | None
+    why_unconfirmed: NotRequired[str]
     disturbed: NotRequired[bool]
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]

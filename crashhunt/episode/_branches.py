@@ -19,10 +19,12 @@ from typing import TYPE_CHECKING, Final, cast
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
+from crashhunt.base.forks import NoAnswer, NoProcessError
 from crashhunt.base.memory import FREE, free_memory
 from crashhunt.base.plain import finite
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
 from crashhunt.episode._observer import Observer
+from crashhunt.episode._questions import Questions
 from crashhunt.simulators import Disturbs
 from crashhunt.trial import OF_AGENT, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import approaches, dangers
@@ -89,9 +91,6 @@ class Brancher(Observer):
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
         tell: called with what people should know.
-
-    Attributes:
-        why_not: why there are no branches any more, in words; empty where there are.
     """
 
     def __init__(
@@ -106,7 +105,7 @@ class Brancher(Observer):
         self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.why_not = ""
+        self._questions = Questions("branches", tell)
         self._branches = Branches()
         self._asleep: deque[_Sleeper] = deque()
         self._frames: deque[Frame] = deque()
@@ -118,11 +117,21 @@ class Brancher(Observer):
         self._strongest_at = 0  # when everything may be asked for again
         self._any = False  # whether there might have been any
 
+    @property
+    def why_not(self) -> str:
+        """Why there are no branches any more, in words; empty where there are."""
+        return self._questions.why_not
+
+    def stop(self, why_not: str) -> None:
+        """Ask no copies any more."""
+        self._questions.stop(why_not)
+
     def begin(self, episode: Episode) -> None:
         """Note how long a second is; the next episode begins."""
         self._second = steps_of(1.0, episode.simulator.step_length_s)
         self._frames = deque(maxlen=_WINDOW_S * self._second + 1)
         self._branches, self._draws, self._rests_until = Branches(), 0, 0
+        self._questions.begin_trial()
         self._drawn_steps, self._strongest_at = 0, 0
         self._owner = os.getpid()
         self._any = False
@@ -133,29 +142,46 @@ class Brancher(Observer):
 
     def is_due(self, episode: Episode) -> bool:
         """Whether a copy is to be left asleep after the step that has just been taken."""
-        return not self.why_not and episode.steps % self._second == 0
+        return episode.steps % self._second == 0
 
     def ask(self, episode: Episode) -> None:
         """Leave a copy asleep where somebody is near, and ask it, and those of some seconds ago."""
         began = time.monotonic()
         try:
-            while self._asleep and self._asleep[0].step <= episode.steps - _KEPT * self._second:
-                self._asleep.popleft().copy.end()
-            near = self._is_near(episode)
-            if near and free_memory() < FREE:
-                self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
-            else:
-                self._any = True
-                if near:
-                    self._asleep.append(_Sleeper(episode.steps, episode.leave_asleep(self._go_on)))
-                    if episode.steps >= self._strongest_at:
-                        self._ask_for_everything(episode, self._asleep[-1])
-            if not self.why_not:
-                self._look(episode, episode.steps)
+            self._ask(episode)
         except CrashhuntError as error:
-            self.why_not = error.message
+            self._questions.stop(error.message)
+            self._questions.skip()
         finally:
             self._delay(time.monotonic() - began)
+
+    def _ask(self, episode: Episode) -> None:
+        while self._asleep and self._asleep[0].step <= episode.steps - _KEPT * self._second:
+            self._asleep.popleft().copy.end()
+        self._any = True
+        near = self._is_near(episode)
+        if self._questions.is_over:
+            if near:
+                self._questions.skip()
+            return
+        if near and free_memory() < FREE:
+            self._tell(f"less than {FREE:.0%} of the memory is free: trials branch less than they might")
+            self._questions.skip(f"less than {FREE:.0%} of the memory was free")
+        else:
+            sleeper = self._leave_asleep(episode) if near else None
+            if sleeper is not None and episode.steps >= self._strongest_at:
+                self._ask_for_everything(episode, sleeper)
+        if not self._questions.is_over:
+            self._look(episode, episode.steps)
+
+    def _leave_asleep(self, episode: Episode) -> _Sleeper | None:
+        """Leave a copy asleep after the step that has just been taken; None where there can be none now."""
+        try:
+            self._asleep.append(_Sleeper(episode.steps, episode.leave_asleep(self._go_on)))
+        except NoProcessError as error:
+            self._questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
+            return None
+        return self._asleep[-1]
 
     def close(self) -> None:
         """End all copies, unless an agent has forked, and this is what it has forked: they are not its own."""
@@ -168,7 +194,14 @@ class Brancher(Observer):
             return result  # nobody could be asked, which says nothing
         if str(result.outcome) in self._crashes:
             return replace(result, branches=replace(self._branches, crashes=()))  # it needed no other
-        return replace(result, branches=self._branches)
+        asked = self._questions
+        branches = replace(
+            self._branches,
+            unanswered=asked.unanswered,
+            why_unanswered=asked.why_unanswered,
+            may_be_asked_again=asked.may_be_answered,
+        )
+        return replace(result, branches=branches)
 
     def _draws_of(self, episode: Episode) -> Disturber:
         names, dt = episode.names, episode.simulator.step_length_s
@@ -199,19 +232,20 @@ class Brancher(Observer):
         choices = draws.draw_strongest(episode.spec.seed, self._draws, begins, round(_AT_ONCE_S * self._second))
         self._draws += 1
         fixed = [(one,) for one in draws.fixed if begins < one.step <= until]
-        found = self._branch(sleeper, [*choices, *fixed], until)
+        found = self._branch(episode, sleeper, [*choices, *fixed], until)
         if found is None:
             return
-        if self._branch(sleeper, fixed, min(until, found.step + self._second)) is not None or self.why_not:
-            return  # it is about to crash anyway
+        anyway = self._branch(episode, sleeper, fixed, min(until, found.step + self._second))
+        if anyway is not None or not self._questions.has_answer:
+            return  # it is about to crash anyway, or may be
         first = not self._branches.crashes  # of which one that is likelier is looked for whatever it takes
         self._take(episode, found)
         kept = [one for one in found.took_place if one not in draws.fixed]
         for one in kept:
             fewer = [other for other in kept if other is not one]
-            if not fewer or self.why_not or (not first and self._is_spent(episode)):
+            if not fewer or self._questions.is_over or (not first and self._is_spent(episode)):
                 return
-            found = self._branch(sleeper, [*((other,) for other in fewer), *fixed], until)
+            found = self._branch(episode, sleeper, [*((other,) for other in fewer), *fixed], until)
             if found is not None:
                 kept = fewer
                 self._take(episode, found)
@@ -237,7 +271,7 @@ class Brancher(Observer):
                 self._branches = replace(self._branches, left_out=self._branches.left_out + 1)
             elif not self._is_spent(episode):
                 self._draw(episode, sleeper)
-            if self.why_not:
+            if self._questions.is_over:
                 return
 
     def _draw(self, episode: Episode, sleeper: _Sleeper) -> None:
@@ -246,7 +280,7 @@ class Brancher(Observer):
         soon, before = round(_SOON_S * self._second), self._branches.steps
         drawn = self._draws_of(episode).draw_another(episode.spec.seed, self._draws, begins, soon, until)
         self._draws += 1
-        found = self._branch(sleeper, [(one,) for one in drawn], until)
+        found = self._branch(episode, sleeper, [(one,) for one in drawn], until)
         self._drawn_steps += self._branches.steps - before
         if found is not None:
             self._take(episode, found)
@@ -255,16 +289,22 @@ class Brancher(Observer):
         """The step after which disturbances of a branch begin, and the one in which it ends."""
         return sleeper.step + _BEGINS - 1, sleeper.step + round(_HORIZON_S * self._second)
 
-    def _branch(self, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int) -> _Crashed | None:
+    def _branch(
+        self, episode: Episode, sleeper: _Sleeper, choices: Sequence[Sequence[Disturbance]], until: int
+    ) -> _Crashed | None:
         """Have a copy go on with other disturbances, of each choice the first for which somebody is there.
 
         Returns:
-            None where it has not crashed.
+            None where it has not crashed, or no copy has answered.
         """
         job: Plain = {"choices": [[one.to_json() for one in some] for some in choices], "until": until}
-        answer = sleeper.copy.ask(job, _PATIENCE_S)
+
+        def attempt() -> tuple[Plain | None, NoAnswer | None]:
+            copy = self._usable(episode, sleeper)
+            return copy.ask(job, _PATIENCE_S), copy.no_answer
+
+        answer = self._questions.ask(attempt, lambda: sleeper.step == episode.steps or sleeper.copy.is_usable)
         if answer is None:
-            self.why_not = sleeper.copy.raised or "a copy died, or hung"
             return None
         before, steps = self._branches, cast(int, answer["steps"])
         self._branches = replace(before, asked=before.asked + 1, steps=before.steps + steps)
@@ -274,6 +314,16 @@ class Brancher(Observer):
         there = cast("list[DisturbanceData]", answer["there"])
         likely = cast("float | None", answer["log_likelihood"])
         return _Crashed(tuple(map(Disturbance.from_json, there)), sleeper.step, outcome, step, likely)
+
+    def _usable(self, episode: Episode, sleeper: _Sleeper) -> Asleep:
+        """Return the copy of a step that is asleep; one that was killed is replaced while the trial is at that step."""
+        copy = next((one.copy for one in self._asleep if one.step == sleeper.step), sleeper.copy)
+        if copy.is_usable or sleeper.step != episode.steps:
+            return copy
+        copy.end()
+        self._asleep = deque(one for one in self._asleep if one.copy is not copy)
+        self._asleep.append(_Sleeper(sleeper.step, episode.leave_asleep(self._go_on)))
+        return self._asleep[-1].copy
 
     def _take(self, episode: Episode, found: _Crashed) -> None:
         """Take a crash in, as a specification from the start."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.forks import NoProcessError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,11 +33,13 @@ class FirstCopy:
 
     def ask(self, episode: Episode) -> None:
         """Try it."""
-        self._tried = True
         try:
             episode.fork(lambda _copy: {}, observed=False).end()
+        except NoProcessError:
+            return  # which says nothing about the trial: the next step tries again
         except CrashhuntError as error:
             self._refused(error.message)
+        self._tried = True
 
     def result(self, result: TrialResult) -> TrialResult:
         """Return it as it is."""

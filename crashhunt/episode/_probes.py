@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
+from crashhunt.episode._questions import Questions
 from crashhunt.simulators import Disturbs
 from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Outcome, Stress, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from crashhunt.base.forks import NoAnswer
     from crashhunt.base.plain import Plain
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
@@ -123,48 +125,79 @@ class Prober:
         crash_on: what counts as a crash.
         delay: called with the wall time that copies have taken, in s.
         budget: steps that copies may take for each step of their trial.
-
-    Attributes:
-        why_not: why copies cannot be asked any more, in words; empty where they can.
+        tell: called with what people should know.
     """
 
     def __init__(
-        self, every_s: float, crash_on: Sequence[Outcome], delay: Callable[[float], None], budget: int = BUDGET
+        self,
+        every_s: float,
+        crash_on: Sequence[Outcome],
+        delay: Callable[[float], None],
+        budget: int = BUDGET,
+        tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._every_s = every_s
         self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.why_not = ""
+        self._questions = Questions("probes", tell)
         self._stress = Stress(1.0)
-        self._moment = 0
+        self._moment = 0  # of those at which there was something to ask
         self._goes_on = False  # without any disturbance, from the present moment on: that is asked once
+
+    @property
+    def why_not(self) -> str:
+        """Why copies cannot be asked any more, in words; empty where they can."""
+        return self._questions.why_not
+
+    def stop(self, why_not: str) -> None:
+        """Ask no copies any more."""
+        self._questions.stop(why_not)
 
     def is_due(self, episode: Episode) -> bool:
         """Whether copies are to be asked after the step that has just been taken."""
-        return not self.why_not and episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
+        return episode.steps % steps_of(self._every_s, episode.simulator.step_length_s) == 0
 
     def ask(self, episode: Episode) -> None:
         """Find the mildest disturbance of each kind with which the episode crashes soon, if there is a milder one."""
+        before = self._questions.unanswered
+        self._ask(episode)
+        asked = self._questions.unanswered == before
+        stress = self._stress
+        self._stress = replace(stress, moments=stress.moments + 1, moments_asked=stress.moments_asked + asked)
+
+    def _ask(self, episode: Episode) -> None:
         self._goes_on = False
-        if self._stress.margin <= 1 / _SHARES:
+        if self._least <= 1 / _SHARES:
+            return
+        if self._questions.is_over:
+            self._questions.skip()
             return
         try:
-            asked = self._questions(episode)
+            asked = self._questions_at(episode)
             turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
             self._moment += 1
             for question in asked[turn:] + asked[:turn]:
+                if self._questions.is_over:
+                    return
                 if self._is_spent(episode):
                     self._stress = replace(self._stress, left_out=self._stress.left_out + 1)
                 elif not self._mildest(episode, question):
                     return
         except CrashhuntError as error:
-            self.why_not = error.message
+            self._questions.stop(error.message)
+            self._questions.skip()
+
+    @property
+    def _least(self) -> float:
+        """The least share that has made a copy crash so far; 1 where none has."""
+        assert self._stress.margin is not None
+        return self._stress.margin
 
     def _is_spent(self, episode: Episode) -> bool:
         return self._stress.steps >= self._budget * episode.steps
 
-    def _questions(self, episode: Episode) -> list[_Question]:
+    def _questions_at(self, episode: Episode) -> list[_Question]:
         """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""
         simulator = episode.simulator
         kinds = simulator.disturbing_kinds if offers(simulator, Disturbs) else ()
@@ -184,7 +217,7 @@ class Prober:
             }
 
         there = self._in_copy(episode, look).get("there", []) if others else []
-        if self.why_not:
+        if others and not self._questions.has_answer:
             return []
         absent = {one for one, is_there in zip(others, cast("list[bool]", there), strict=False) if not is_there}
         return [one for one in every if one not in absent]
@@ -192,8 +225,18 @@ class Prober:
     def result(self, result: TrialResult) -> TrialResult:
         """Return the result of the trial with what has been found out; the next one begins."""
         stress, self._stress, self._moment = self._stress, Stress(1.0), 0
+        why, may_be_answered = self._questions.why_unanswered, self._questions.may_be_answered
+        self._questions.begin_trial()
         if str(result.outcome) in self._crashes:
             stress = replace(stress, margin=0.0, disturbance=None, outcome="", step=0)
+        elif stress.moments_asked < stress.moments:
+            stress = replace(
+                stress,
+                margin=None,
+                margin_upper_bound=stress.margin,
+                why_unasked=why,
+                may_be_asked_again=may_be_answered,
+            )
         elif not stress.probes:
             return result  # nobody was asked, which says nothing
         return replace(result, stress=stress)
@@ -202,28 +245,32 @@ class Prober:
         """Ask one question; return whether there is any point in asking another."""
         kind, step = question.kind, episode.steps + _BEGINS
         every = kind.shares(episode.simulator.step_length_s)
-        shares = [share for share in every if share < self._stress.margin - _NOTHING]
+        shares = [share for share in every if share < self._least - _NOTHING]
         low, high = -1, len(shares)  # so many of them do no harm, and from here on they do
         at = high - 1
         while at > low:
             disturbance = kind.disturbance(shares[at], question.who, question.agent, step)
             outcome, ended = self._copy(episode, disturbance)
+            if not self._questions.has_answer:
+                break
             if not outcome:
                 low = at
             elif not self._goes_on and self._copy(episode, None)[0]:
                 return False  # it is about to crash anyway
+            elif not self._questions.has_answer:
+                break  # it may be about to crash anyway
             else:
                 self._goes_on, high = True, at
                 self._stress = replace(
                     self._stress, margin=shares[at], disturbance=disturbance, outcome=outcome, step=ended
                 )
-            if self.why_not or low == high - 1:
+            if low == high - 1:
                 break
             at = (low + high) // 2
-        return not self.why_not and self._stress.margin > 1 / _SHARES
+        return self._least > 1 / _SHARES
 
     def _copy(self, episode: Episode, disturbance: Disturbance | None) -> tuple[str, int]:
-        """Return how a copy crashed, and at which step; nothing where it did not."""
+        """Return how a copy crashed, and at which step; nothing where it did not, or did not answer."""
         horizon = _BEGINS + steps_of(_HORIZON_S, episode.simulator.step_length_s)
 
         def follow(copy: Episode) -> Plain:
@@ -246,14 +293,14 @@ class Prober:
         return (outcome, cast(int, answer["step"])) if crashed else ("", 0)
 
     def _in_copy(self, episode: Episode, work: Callable[[Episode], Plain]) -> Plain:
-        """Return what a copy answers; nothing where it does not, and then there are no more."""
-        began = time.monotonic()
-        try:
-            asked = episode.fork(work, observed=False)
-            answer = asked.answer(_PATIENCE_S)
-        finally:
-            self._delay(time.monotonic() - began)
-        if answer is None:
-            self.why_not = asked.raised or "a copy died, or hung"
-            return {}
-        return answer
+        """Return what a copy answers; nothing where none does."""
+
+        def attempt() -> tuple[Plain | None, NoAnswer | None]:
+            began = time.monotonic()
+            try:
+                asked = episode.fork(work, observed=False)
+                return asked.answer(_PATIENCE_S), asked.no_answer
+            finally:
+                self._delay(time.monotonic() - began)
+
+        return self._questions.ask(attempt) or {}

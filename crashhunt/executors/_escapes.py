@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
+from crashhunt.base.signals import describe_death
 from crashhunt.episode import scratch_of
 from crashhunt.executors._supervisor import LostTrialError
 from crashhunt.recording import Recording, read_black_box
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["with_escape"]
 
+_ATTEMPTS = 3  # of a trial whose process is killed from outside
 _FIRST_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
 
 
@@ -46,15 +48,22 @@ def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) 
         return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
 
     def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
-        number = next(numbers)
-        done = supervisor.run(replace(spec, number=number)).result
-        try:
-            return done, recording(number)
-        finally:
-            if done.kept:
+        for left in reversed(range(_ATTEMPTS)):
+            number = next(numbers)
+            try:
+                done = supervisor.run(replace(spec, number=number)).result
+                return done, recording(number)
+            except LostTrialError:
+                if not left:
+                    raise
+            finally:
                 shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
+        raise AssertionError
 
     try:
         return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run))
-    except (BundleError, LostTrialError):
+    except BundleError:
         return result
+    except LostTrialError as error:
+        why = f"the process that searched {describe_death(error.exit_code)}, {_ATTEMPTS} times"
+        return replace(result, why_no_escape=why)

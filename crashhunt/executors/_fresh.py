@@ -8,20 +8,21 @@ import subprocess
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.keeper import Kept
+from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import WorkerSettings, answer_file, require_origin, seal
 from crashhunt.executors._environment import snapshot_environment
 from crashhunt.executors._escapes import with_escape
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._hang import has_hung
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import Attempt, damaged, died, hung, where_it_is
+from crashhunt.executors._remains import Attempt, damaged, hung, result_of_death, where_it_is
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError
 from crashhunt.trial import TrialResult, TrialSpec
 
@@ -159,13 +160,22 @@ class FreshProcessExecutor:
             if exit_code == _DAMAGED:
                 return damaged(spec, scratch, "the process could not report what came of it, as it is damaged")
             return self._again(running, exit_code)
+        # The answer is there, so that what was killed is the search for the escape: without it the answer is half.
+        why_no_escape = ""
+        if self._settings.find_escapes and not running.killed and is_sent_from_outside(exit_code):
+            if why := running.attempt.again(scratch, exit_code):
+                self._notes.add(why)
+                self._waiting.appendleft(running.attempt)
+                return None
+            why_no_escape = f"the process that searched {describe_death(exit_code)}, {len(running.attempt.ends)} times"
         for file in (running.answer, self._job(spec.number), self._log(spec.number)):
             file.unlink(missing_ok=True)  # a hunt has a million trials
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
         if "lost" in answer:
             return self._again(running, answer["lost"])
-        return TrialResult.from_json(answer["result"])
+        result = TrialResult.from_json(answer["result"])
+        return replace(result, why_no_escape=why_no_escape) if why_no_escape and result.escape is None else result
 
     def _again(self, running: _Running, exit_code: int) -> TrialResult | None:
         """Account for a trial whose process is gone, or run it again."""
@@ -173,7 +183,7 @@ class FreshProcessExecutor:
             self._notes.add(why)
             self._waiting.appendleft(running.attempt)
             return None
-        return died(running.attempt.spec, self._settings.scratch, exit_code)
+        return result_of_death(running.attempt, self._settings.scratch, exit_code)
 
     def _job(self, number: int) -> Path:
         return self._settings.scratch / layout.numbered(number, layout.JOB)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.executors._fork_server_link import ForkServerLink
 from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import Attempt, died, where_it_is
+from crashhunt.executors._remains import Attempt, result_of_death, where_it_is
 from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
@@ -299,7 +299,7 @@ class PoolExecutor:
             self._notes.add(why)
             self._waiting.appendleft(attempt)
         else:
-            self._done.put(died(attempt.spec, scratch, exit_code))
+            self._done.put(result_of_death(attempt, scratch, exit_code))
 
     def _discard(self, worker: _Worker) -> None:
         with suppress(KeyError, ValueError):

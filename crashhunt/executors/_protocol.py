@@ -22,7 +22,7 @@ class Executor(Protocol):
 
     Contract: every submitted trial comes back from `completed` exactly once, unless it is cancelled first. A worker
     that dies or hangs costs exactly its own trial. Trials begin in the order in which they were submitted. A trial
-    whose process was killed from outside is run again, alone.
+    whose process was killed from outside is run again, alone; after three kills at different steps it is invalid.
 
     What a trial has written is wanted only where its result says ``kept``: then, before the result comes back, the
     folder ``scratch_of(settings.scratch, number)`` of this machine has its black box and output, and it or

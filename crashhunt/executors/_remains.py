@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
-from crashhunt.trial import Failure, Outcome, TrialResult, in_effect
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
 from crashhunt.world import ClosestApproach, DangerMeter, Lane, closest_approach
 
 if TYPE_CHECKING:
@@ -22,11 +23,20 @@ if TYPE_CHECKING:
 
     from crashhunt.trial import TrialSpec
 
-__all__ = ["Attempt", "damaged", "died", "hung", "read_map", "read_tail", "signal_name", "where_it_is"]
+__all__ = [
+    "Attempt",
+    "damaged",
+    "died",
+    "hung",
+    "read_map",
+    "read_tail",
+    "result_of_death",
+    "signal_name",
+    "where_it_is",
+]
 
 _TAIL = 4000  # bytes
-_FROM_OUTSIDE = {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
-_ATTEMPTS = 3  # of a trial whose process is killed from outside; then somebody means it
+_ATTEMPTS = 3  # of a trial whose process is killed from outside
 
 
 @dataclass(slots=True)
@@ -35,7 +45,7 @@ class Attempt:
 
     A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
     kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same place
-    it was the trial itself.
+    it was the trial itself. Where it ends at another place each time, the trial is not the cause.
 
     Args:
         spec: the trial.
@@ -50,9 +60,14 @@ class Attempt:
         """Whether no other trial may run meanwhile."""
         return bool(self.ends)
 
+    @property
+    def is_killed_from_outside(self) -> bool:
+        """Whether every allowed attempt was killed, each at another step: no attempt shows how the trial ends."""
+        return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
+
     def again(self, scratch: Path, exit_code: int) -> str:
         """Why it is to be run once more, in words; empty where what has happened is its outcome."""
-        if -exit_code not in _FROM_OUTSIDE:
+        if not is_sent_from_outside(exit_code):
             return ""
         header = where_it_is(scratch, self.spec.number)
         end = exit_code, header.step if header is not None else -1
@@ -80,6 +95,27 @@ def died(spec: TrialSpec, scratch: Path, exit_code: int) -> TrialResult:
     )
     kind = "signal" if exit_code < 0 else "exit code"
     return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code)
+
+
+def result_of_death(attempt: Attempt, scratch: Path, exit_code: int) -> TrialResult:
+    """Return the result of a trial whose process died and that is not run again.
+
+    The trial is invalid where its processes were killed from outside at different steps, and else as of `died`.
+
+    Args:
+        attempt: the trial; `Attempt.again` has been called with this death.
+        scratch: the folder in which the trial records.
+        exit_code: exit code of the process; negative for a signal.
+    """
+    result = died(attempt.spec, scratch, exit_code)
+    if not attempt.is_killed_from_outside:
+        return result
+    ends = ", ".join(f"{signal_name(code)} after step {max(0, step)}" for code, step in attempt.ends)
+    why = f"killed from outside {len(attempt.ends)} times, each time at another step ({ends})"
+    failure = Failure(KILLED, why, exit_code=exit_code)
+    return TrialResult(
+        attempt.spec, Outcome.INVALID, failure=failure, wall_s=result.wall_s, worker=result.worker, kept=result.kept
+    )
 
 
 def damaged(spec: TrialSpec, scratch: Path, message: str, *, recorded: bool = True) -> TrialResult:

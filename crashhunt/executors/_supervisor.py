@@ -21,6 +21,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, remedy
 from crashhunt.base.files import whole_file
 from crashhunt.base.processes import die_with
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.executors._evidence import KEY_BYTES, Report, check_report
 from crashhunt.executors._remains import damaged, died, hung, read_tail
@@ -151,7 +152,7 @@ class Supervisor:
         if report is None:
             return Ended(damaged(spec, scratch, "the process could not report what came of it, as it is damaged"))
         if code != 0 or not report:
-            if -code in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU):
+            if is_sent_from_outside(code):
                 raise LostTrialError(code)
             return Ended(died(spec, scratch, code))
         found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)

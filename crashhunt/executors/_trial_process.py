@@ -213,7 +213,7 @@ class TrialProcess:
         settings, prober, brancher = self._settings, None, None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
-            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget)
+            prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append)
         if settings.branch:
             brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)
         self._asking = tuple(
@@ -223,7 +223,7 @@ class TrialProcess:
 
     def _cannot_copy(self, why_not: str) -> None:
         for asks, what in self._asking:
-            asks.why_not = why_not
+            asks.stop(why_not)
             self._notices.append(f"{what}{LEFT_OUT}{why_not}")
         self._asking = ()
 

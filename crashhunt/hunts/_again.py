@@ -86,18 +86,18 @@ class RunsAgain:
                 shutil.rmtree(scratch, ignore_errors=True)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
-        """Run every crash that nobody has confirmed yet once more, and return them all, in their order."""
+        """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
         with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
             return list(threads.map(self.confirm_one, crashes))
 
     def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
-        """Run a crash that nobody has confirmed yet once more; return it as it is then.
+        """Run a crash that is not fully confirmed yet once more; return it as it is then.
 
         Args:
             bundle: the crash.
             stopped: asked now and then whether to give up.
         """
-        if bundle.confirmed is not None or len(self.stops) or stopped():
+        if bundle.is_fully_confirmed or len(self.stops) or stopped():
             return bundle
         found = confirm(
             bundle, lambda: bool(len(self.stops)) or stopped(), failed=self.failed, executors=self.executors

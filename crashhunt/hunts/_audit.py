@@ -17,6 +17,8 @@ from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import Recording, first_divergence, read_black_box
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from crashhunt.trial import TrialResult
 
 __all__ = ["Audit", "AuditData", "AuditReport", "Difference", "DifferenceData"]
@@ -26,7 +28,7 @@ class DifferenceData(TypedDict):
     """The plain data of a `Difference`."""
 
     trial: int
-    step: int
+    step: int | None
     agent: str
     field: str
     recorded: object
@@ -37,6 +39,7 @@ class AuditData(TypedDict):
     """The plain data of an `AuditReport`."""
 
     trials: int
+    not_finished: int
     differences: list[DifferenceData]
 
 
@@ -46,7 +49,7 @@ class Difference:
 
     Args:
         trial: its number.
-        step: the first that differs.
+        step: the first that differs; None where there was no recording to compare, and only the digest differs.
         agent: the agent or actor; empty where it is about neither.
         field: what of it.
         recorded: what it was in the hunt.
@@ -54,7 +57,7 @@ class Difference:
     """
 
     trial: int
-    step: int
+    step: int | None
     agent: str
     field: str
     recorded: object
@@ -62,8 +65,9 @@ class Difference:
 
     def __str__(self) -> str:
         whose = f" of {self.agent}" if self.agent else ""
+        where = "" if self.step is None else f"at step {self.step}, "
         return (
-            f"trial {self.trial} is another one in a fresh process: at step {self.step}, {self.field}{whose} was "
+            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
             f"{self.recorded} and is {self.replayed}"
         )
 
@@ -86,14 +90,20 @@ class AuditReport:
     Args:
         trials: how many trials were run again.
         differences: of those that were not the same.
+        not_finished: how many more were to be run again, and were not run to the end.
     """
 
     trials: int = 0
     differences: tuple[Difference, ...] = ()
+    not_finished: int = 0
 
     def to_json(self) -> AuditData:
         """Return the shape that ``run --json`` prints."""
-        return {"trials": self.trials, "differences": [found.to_json() for found in self.differences]}
+        return {
+            "trials": self.trials,
+            "not_finished": self.not_finished,
+            "differences": [found.to_json() for found in self.differences],
+        }
 
 
 class Audit:
@@ -114,6 +124,12 @@ class Audit:
         self._waiting: dict[int, TrialResult] = {}
         self._done = 0
         self._differences: list[Difference] = []
+        self._killed: set[int] = set()
+
+    @property
+    def left(self) -> list[int]:
+        """The numbers of the trials that were to be run again, and have not been run to the end yet."""
+        return sorted(self._killed | self._waiting.keys())
 
     @property
     def waiting(self) -> int:
@@ -123,7 +139,7 @@ class Audit:
     @property
     def report(self) -> AuditReport:
         """What has come of it so far."""
-        return AuditReport(self._done, tuple(self._differences))
+        return AuditReport(self._done, tuple(self._differences), len(self.left))
 
     @property
     def parallel(self) -> int:
@@ -156,6 +172,10 @@ class Audit:
         found = []
         for result in self._executor.completed(timeout_s):
             was = self._waiting.pop(result.spec.number)
+            if result.was_killed_from_outside:  # which says nothing about the trial
+                self._killed.add(result.spec.number)
+                self._clean_up(result.spec.number)
+                continue
             difference = self._compare(was, result)
             self._done += 1
             if difference is not None:
@@ -170,17 +190,24 @@ class Audit:
 
     def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:
         number = was.spec.number
-        folders = self._scratch / f"recorded-{number:06d}", scratch_of(self._scratch, number)
         try:
+            folders = self._folders(number)
             recorded, replayed = (Recording(read_black_box(folder / layout.BLACK_BOX)) for folder in folders)
             found = first_divergence(recorded, replayed)
         except BundleError:  # it could not even be set up
             found = None
         finally:
-            for folder in folders:
-                shutil.rmtree(folder, ignore_errors=True)
+            self._clean_up(number)
         if found is not None:
             return Difference(number, found.step, found.agent, found.field, found.recorded, found.replayed)
         if (was.outcome, was.digest) != (now.outcome, now.digest):
             return Difference(number, now.steps, "", "the outcome", str(was.outcome), str(now.outcome))
         return None
+
+    def _folders(self, number: int) -> tuple[Path, Path]:
+        """Return where the recordings of a trial are: that of the hunt, and that of the fresh process."""
+        return self._scratch / f"recorded-{number:06d}", scratch_of(self._scratch, number)
+
+    def _clean_up(self, number: int) -> None:
+        for folder in self._folders(number):
+            shutil.rmtree(folder, ignore_errors=True)

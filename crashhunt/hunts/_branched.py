@@ -30,7 +30,9 @@ class BranchReportData(TypedDict):
     left_out: int
     crashed: int
     crashed_trials: int
+    not_fully_asked: int
     run_again: int
+    not_finished: int
     confirmed: int
     crashes: list[CrashSummary]
 
@@ -47,7 +49,10 @@ class BranchReport:
         left_out: how many were left out, because branches had taken enough steps.
         crashed: how many crashed.
         crashed_trials: in how many trials.
+        not_fully_asked: of how many of the trials a branch has no answer.
+        why_unanswered: the reason for the first of them; empty where there is none.
         run_again: how many of these were run from the start: of each trial the likeliest.
+        not_finished: how many of these could not be run to their end, as when they are killed from outside.
         crashes: those of them that crashed in the same way at the same step, and once more to the bit.
     """
 
@@ -58,7 +63,10 @@ class BranchReport:
     left_out: int
     crashed: int
     crashed_trials: int
+    not_fully_asked: int
+    why_unanswered: str
     run_again: int
+    not_finished: int
     crashes: tuple[Bundle, ...]
 
     def to_json(self) -> BranchReportData:
@@ -71,7 +79,9 @@ class BranchReport:
             "left_out": self.left_out,
             "crashed": self.crashed,
             "crashed_trials": self.crashed_trials,
+            "not_fully_asked": self.not_fully_asked,
             "run_again": self.run_again,
+            "not_finished": self.not_finished,
             "confirmed": len(self.crashes),
             "crashes": [bundle.summary() for bundle in self.crashes],
         }
@@ -89,13 +99,14 @@ def look_at_branches(copies: FromTheStart) -> BranchReport | None:
     ledger = copies.again.ledger
     if not copies.again.settings.branch:
         return None
-    sums = [0] * 6
+    sums, why_unanswered = [0] * 7, ""
     found: list[tuple[int, Branch]] = []  # of each trial the likeliest; there may be a million trials
     for plain in ledger.plain_results():
         if not (data := plain.get("branches")):
             continue
         one = Branches.from_json(data)
-        counts = (1, one.moments, one.asked, one.steps, one.left_out, len(one.crashes))
+        counts = (1, one.moments, one.asked, one.steps, one.left_out, len(one.crashes), one.unanswered > 0)
+        why_unanswered = why_unanswered or one.why_unanswered
         sums = [sum(pair) for pair in zip(sums, counts, strict=True)]
         if one.crashes:
             found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
@@ -105,10 +116,22 @@ def look_at_branches(copies: FromTheStart) -> BranchReport | None:
         for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_likely(pair[1])))[:_LIKELIEST]
         if (result := ledger.result(number)) is not None
     ]
-    crashes = copies.crashes(specs, layout.BRANCHES)
-    trials, moments, branches, steps, left_out, crashed = sums
-    run_again = 0 if copies.is_stopped else len(specs)
-    return BranchReport(trials, moments, branches, steps, left_out, crashed, len(found), run_again, crashes)
+    crashes, not_finished = copies.crashes(specs, layout.BRANCHES)
+    trials, moments, branches, steps, left_out, crashed, not_fully_asked = sums
+    return BranchReport(
+        trials,
+        moments,
+        branches,
+        steps,
+        left_out,
+        crashed,
+        len(found),
+        not_fully_asked,
+        why_unanswered,
+        0 if copies.is_stopped else len(specs),
+        not_finished,
+        crashes,
+    )
 
 
 def likeliest(result: TrialResult) -> Found | None:

@@ -18,8 +18,9 @@ class ProbeSums(TypedDict):
     """What ``status --json`` says of the probes of a hunt.
 
     Args:
-        trials: of how many trials copies were asked.
-        least: the least stress margin; None where nobody was asked yet.
+        trials: of how many trials copies were asked all that was to be asked.
+        not_fully_asked: of how many further trials a question has no answer.
+        least: the least stress margin of the former; None where there is none.
         trial: the number of the trial that has it.
         probes: how many copies were asked.
         steps: how many steps they took.
@@ -30,6 +31,7 @@ class ProbeSums(TypedDict):
     """
 
     trials: int
+    not_fully_asked: int
     least: float | None
     trial: int | None
     probes: int
@@ -51,6 +53,7 @@ class BranchSums(TypedDict):
         left_out: how many were left out, because branches had taken enough steps.
         crashed: how many crashed.
         crashed_trials: of how many trials.
+        not_fully_asked: of how many of the trials a branch has no answer.
         run_again: how many of the likeliest were run from the start; None until the hunt has come to that.
         confirmed: how many of these crashed there as well.
     """
@@ -62,6 +65,7 @@ class BranchSums(TypedDict):
     left_out: int
     crashed: int
     crashed_trials: int
+    not_fully_asked: int
     run_again: int | None
     confirmed: int | None
 
@@ -77,15 +81,16 @@ def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
         return None
     (row,) = ledger.summed(
         # Of a query with one min(), SQLite takes what stands bare from the row that has it.
-        "count(margin), min(margin), number, total(probes), total(steps), total(left_out), total(crashed)",
+        "count(margin), min(margin), number, total(probes), total(steps), total(left_out), total(crashed), "
+        "count(probes)",
         "SELECT number, {stress.margin} AS margin, {stress.probes} AS probes, {stress.steps} AS steps, "
         "{stress.left_out} AS left_out, {stress.disturbance} IS NOT NULL AS crashed",
     )
-    trials, least, trial, probes, steps, left_out, crashed = row
+    trials, least, trial, probes, steps, left_out, crashed, asked = row
     again, confirmed = _confirmed(facts, PROBES)
     return {
-        "trials": trials, "least": least, "trial": trial if trials else None, "probes": int(probes),
-        "steps": int(steps), "left_out": int(left_out), "crashed_trials": int(crashed),
+        "trials": trials, "not_fully_asked": asked - trials, "least": least, "trial": trial if trials else None,
+        "probes": int(probes), "steps": int(steps), "left_out": int(left_out), "crashed_trials": int(crashed),
         "run_again": again, "confirmed": confirmed,
     }  # fmt: skip
 
@@ -95,15 +100,18 @@ def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
     if BRANCHES not in (facts.get("copies") or ()):
         return None
     (row,) = ledger.summed(
-        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), total(crashed > 0)",
+        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), "
+        "total(crashed > 0), total(unanswered > 0)",
         "SELECT {branches.moments} AS moments, {branches.asked} AS asked, {branches.steps} AS steps, "
-        "{branches.left_out} AS left_out, json_array_length(data, '$.branches.crashes') AS crashed",
+        "{branches.left_out} AS left_out, {branches.unanswered} AS unanswered, "
+        "json_array_length(data, '$.branches.crashes') AS crashed",
     )
-    trials, moments, branches, steps, left_out, crashed, crashed_trials = map(int, row)
+    trials, moments, branches, steps, left_out, crashed, crashed_trials, not_fully_asked = map(int, row)
     again, confirmed = _confirmed(facts, BRANCHES)
     return {
         "trials": trials, "moments": moments, "branches": branches, "steps": steps, "left_out": left_out,
-        "crashed": crashed, "crashed_trials": crashed_trials, "run_again": again, "confirmed": confirmed,
+        "crashed": crashed, "crashed_trials": crashed_trials, "not_fully_asked": not_fully_asked,
+        "run_again": again, "confirmed": confirmed,
     }  # fmt: skip
 
 

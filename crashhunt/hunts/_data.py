@@ -46,6 +46,7 @@ class Noted(TypedDict, total=False):
         kinds: of crashes, the most frequent first, where it collects them all.
         dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
         newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
+        audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
         failed_steps: how many steps were simulated to confirm something that was not confirmed.
     """
 
@@ -67,6 +68,7 @@ class Noted(TypedDict, total=False):
     nodes: list[dict[str, Any]]
     kinds: list[KindData]
     newest_kind: float | None
+    audits_left: list[int] | None
     failed_steps: int
     dropped: dict[str, list[int]]
 

@@ -55,8 +55,10 @@ class FromTheStart:
         """Whether somebody wants to stop: what was found may not have been run from the start then."""
         return bool(len(self.again.stops))
 
-    def crashes(self, found: Sequence[Found], folder: str) -> tuple[Bundle, ...]:
+    def crashes(self, found: Sequence[Found], folder: str) -> tuple[tuple[Bundle, ...], int]:
         """Return those that crashed in the same way at the same step, and once more to the bit, in their order.
+
+        The second value is how many could not be run to their end, so that nothing is known about them.
 
         Args:
             found: of different trials.
@@ -64,13 +66,14 @@ class FromTheStart:
                 to stop, it stays.
         """
         if self.is_stopped:
-            return ()
+            return (), 0
         place, kept = self.again.place.path / folder, self.kept.get(folder, {})
         stay = {bundle.path.name for bundle in kept.values()}
         for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
             shutil.rmtree(path, ignore_errors=True)
-        crashed = kept | self._run([one for one in found if one.spec.number not in kept], folder)
-        return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed)
+        crashed, unanswered = self._run([one for one in found if one.spec.number not in kept], folder)
+        crashed = kept | crashed
+        return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
     def crash(self, found: Found, folder: str) -> Bundle | None:
         """Return one that crashed in the same way at the same step, and once more to the bit; it is kept.
@@ -81,16 +84,21 @@ class FromTheStart:
         """
         if self.is_stopped:
             return None
-        crashed = self._run([found], folder)
+        crashed, _ = self._run([found], folder)  # one that was killed is run once more at the end of the hunt
         self.kept.setdefault(folder, {}).update(crashed)
         return crashed.get(found.spec.number)
 
-    def _run(self, found: Sequence[Found], folder: str) -> dict[int, Bundle]:
+    def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
+        """Return the bundles of those that crashed as their copies did, and the numbers of those without an answer."""
         wanted = {one.spec.number: one for one in found}
+        unanswered = set(wanted)
         bundles: dict[int, Bundle] = {}
         try:
             for one in self.again.run([one.spec for one in found], folder):
                 result, copy = one.result, wanted[one.result.spec.number]
+                if result.was_killed_from_outside:
+                    continue
+                unanswered.discard(result.spec.number)
                 if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
                     self.again.failed.append(result)
                     continue
@@ -100,11 +108,13 @@ class FromTheStart:
         except CrashhuntError as error:
             self.again.notes.append(f"what copies have found could not be run from the start: {error}")
         with ThreadPoolExecutor(self.again.parallel) as threads:  # which only wait for their process
-            confirmed = list(threads.map(self._confirmed, bundles.values()))
-        return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}
+            confirmed = list(threads.map(lambda bundle: self._confirmed(bundle, unanswered), bundles.values()))
+        return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}, unanswered
 
-    def _confirmed(self, bundle: Bundle) -> Bundle | None:
+    def _confirmed(self, bundle: Bundle, unanswered: set[int]) -> Bundle | None:
         found = confirm(bundle, lambda: self.is_stopped, failed=self.again.failed)
+        if found is None or found.confirmed is None:
+            unanswered.add(bundle.result.spec.number)
         if found is None or not found.confirmed:
             self.again.failed.append(bundle.result)  # nothing has come of this run either
             shutil.rmtree(bundle.path, ignore_errors=True)

@@ -16,12 +16,13 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
-from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._audit import Audit, AuditReport
 from crashhunt.hunts._confirmation import Confirmation
 from crashhunt.hunts._copied_crashes import CopiedCrashes
 from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._from_the_start import FromTheStart
+from crashhunt.hunts._late_audits import find_audits_left, finish_audits
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._look_at_copies import look_at_copies
 from crashhunt.hunts._near_misses import keep_near_misses
@@ -87,6 +88,9 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
+        self._audits_left: list[int] = []  # by earlier runs
+        self._unanswered: dict[int, TrialResult] = {}  # that are still to run again, as the ledger has them
+        self._open: set[int] = set()  # that the next run of the hunt runs again
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -142,12 +146,16 @@ class Hunt:
             spec = proposed.get(bundle.result.spec.number, bundle.result.spec)
             ledger.record(replace(bundle.result, spec=spec), snapshot=bundle.snapshot)
             finished.add(spec.number)
+        self._unanswered = {result.spec.number: result for result in ledger.unanswered()}
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
-        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber)
+        again = [result.spec for result in self._unanswered.values()]
+        worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
+        self._audits_left = find_audits_left(ledger, before, worker_settings)
+        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
         ledger.enter(
             "running",
             owner=this_process(),
@@ -162,20 +170,21 @@ class Hunt:
             core=core_of(self.scenario, settings.run),
             disturb=list(settings.disturb) or None,
             copies=copies_to_come(settings),
+            audits_left=self._audits_left or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        again = RunsAgain(
+        runs_again = RunsAgain(
             self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
             SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
         )  # fmt: skip
         try:
-            return self._run_with(again, ledger, trials, snapshot, progress, finished, watch)
+            return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)
         finally:
-            again.executors.close()
+            runs_again.executors.close()
 
     def _run_with(
         self,
-        again: RunsAgain,
+        runs_again: RunsAgain,
         ledger: Ledger,
         trials: Trials,
         snapshot: Snapshot,
@@ -184,16 +193,19 @@ class Hunt:
         watch: Callable[[HuntStatus], None],
     ) -> HuntReport:
         settings = self.settings
-        copies = FromTheStart(again, self._disturber)
+        copies = FromTheStart(runs_again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
         if not progress.is_done:
-            stopped = self._hunt(again, ledger, trials, snapshot, progress, finished, watch)
+            stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
-        progress.replace(again.confirm(progress.crashes))
-        near, (probes, branches) = keep_near_misses(again), look_at_copies(copies)
+        progress.replace(runs_again.confirm(progress.crashes))
+        if self._audits_left:
+            watch(self._status(progress, "auditing"))
+            self._finish_audits(runs_again, progress)
+        near, (probes, branches) = keep_near_misses(runs_again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
@@ -219,11 +231,12 @@ class Hunt:
             progress.kinds.at_fault if progress.kinds is not None else None,
             branches,
             progress.ended_by_copy,
+            0 if stopped in ("crash", "distinct") else len(self._open | self._unanswered.keys()),
         )
 
     def _hunt(
         self,
-        again: RunsAgain,
+        runs_again: RunsAgain,
         ledger: Ledger,
         trials: Trials,
         snapshot: Snapshot,
@@ -233,15 +246,16 @@ class Hunt:
     ) -> StoppedBecause:
         settings, run = self.settings, self.settings.run
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
-        parallel = min(run.parallel, max(1, settings.most_trials - len(finished)))
+        planned = settings.most_trials - len(finished) + len(self._unanswered)
+        parallel = min(run.parallel, max(1, planned))
         executor = make_executor(run.executor, worker_settings, parallel=parallel, recycle_after=run.recycle_after)
         audit, self._heard = Audit(worker_settings, progress.failed), Heard(settings, progress.outcomes)
         preflight = Preflight(
-            settings, settings.most_trials - len(finished), files=snapshot.argument_files, code=snapshot.code,
+            settings, planned, files=snapshot.argument_files, code=snapshot.code,
             listen=lambda: self._heard.hear(executor),
         )  # fmt: skip
         in_flight: set[int] = set()
-        confirmation = Confirmation(again, executor)
+        confirmation = Confirmation(runs_again, executor)
         heartbeat = 0.0
         progress.until = time.monotonic() + run.duration_s
         try:
@@ -292,6 +306,7 @@ class Hunt:
                 raise
             raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
+            self._note_audits(audit, progress)
             executor.close()
             audit.close()
             confirmation.close(progress)
@@ -322,8 +337,21 @@ class Hunt:
         progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")
+        self._note_audits(audit, progress)
+
+    def _note_audits(self, audit: Audit, progress: Progress) -> None:
         if self.settings.run.audit > 0:
             progress.audit = audit.report
+            progress.audits_left = sorted({*audit.left, *self._audits_left})
+
+    def _finish_audits(self, runs_again: RunsAgain, progress: Progress) -> None:
+        """Run the trials again that earlier runs of the hunt were to audit, and did not."""
+        left_now = set(progress.audits_left) - set(self._audits_left)
+        now, (late, left) = progress.audit or AuditReport(), finish_audits(runs_again, self._audits_left)
+        progress.audit = AuditReport(
+            now.trials + late.trials, now.differences + late.differences, now.not_finished + late.not_finished
+        )
+        progress.audits_left = sorted({*left_now, *left})
 
     def _see_to(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
@@ -344,6 +372,18 @@ class Hunt:
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
+        if result.is_to_be_run_again:
+            self._open.add(result.spec.number)
+        before = self._unanswered.pop(result.spec.number, None)
+        if before is not None:
+            if result.was_killed_from_outside:
+                return  # the ledger has an answer that is as good, or better
+            progress.outcomes[str(before.outcome)] -= 1
+            if before.digest and before.digest != result.digest:
+                again = f"trial {result.spec.number} was run again for the answers of its copies"
+                note = f"{again}, and is another one: it is not determined by its specification"
+                ledger.remark(note)
+                progress.notes.append(note)
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
         if crashed:
@@ -400,6 +440,7 @@ class Hunt:
             progress.disturbed if self._disturber is not None else None,
             progress.stressed,
             progress.branched,
+            progress.not_fully_asked,
             progress.searching.status(),
         )
 

@@ -24,7 +24,9 @@ def look_at_copies(copies: FromTheStart) -> tuple[ProbeReport | None, BranchRepo
     """
     probes, branches = look_at_probes(copies), look_at_branches(copies)
     found = {PROBES: probes, BRANCHES: branches}
-    confirmed = {name: (one.run_again, len(one.crashes)) for name, one in found.items() if one is not None}
+    confirmed = {
+        name: (one.run_again - one.not_finished, len(one.crashes)) for name, one in found.items() if one is not None
+    }
     if confirmed:
         copies.again.ledger.note(confirmed=confirmed)
     return probes, branches

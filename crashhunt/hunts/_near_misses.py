@@ -41,7 +41,10 @@ def keep_near_misses(again: RunsAgain) -> tuple[Bundle, ...]:
     try:
         for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
             now, was = one.result, wanted[one.result.spec.number]
-            if (was.outcome, was.digest) == (now.outcome, now.digest):
+            if now.was_killed_from_outside:
+                what = f"trial {now.spec.number}, a near miss, was {now.summary}"
+                again.notes.append(f"{what}: it has no bundle until the same command is run again")
+            elif (was.outcome, was.digest) == (now.outcome, now.digest):
                 one.write(was, confirmed=True)
             else:
                 again.failed.append(now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,8 @@ from crashhunt.hunts._ledger_reader import Turn
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from crashhunt.disturbances import Disturber
     from crashhunt.hunts._ledger import Ledger
     from crashhunt.plans import HuntSettings
@@ -36,6 +39,9 @@ class Trials:
         sampler: who proposes.
         ledger: of the hunt.
         finished: the numbers of the trials that have ended.
+        unanswered: those of them that run again, in order of their numbers: something outside of them kept answers from
+            it. The sampler has been or is told what the ledger has, and not what comes of the second run, so that a
+            resumed hunt proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
         disturber: what draws their disturbances; None where they have none.
 
@@ -52,6 +58,7 @@ class Trials:
         *,
         lag: int,
         disturber: Disturber | None = None,
+        unanswered: Sequence[TrialSpec] = (),
     ) -> None:
         self._settings = settings
         self._sampler = sampler
@@ -60,6 +67,8 @@ class Trials:
         self._disturber = disturber
         self._waiting = iter(number for number in range(settings.most_trials) if number not in finished)
         self._next = next(self._waiting, None)
+        self._unanswered = deque(unanswered)
+        self._running_again: set[int] = set()
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
         self._has_origins = False
@@ -71,12 +80,15 @@ class Trials:
     @property
     def upcoming(self) -> int | None:
         """The number of the next one; all of lower numbers have ended or are under way. None where there is none."""
-        return self._next
+        upcoming = [one.number for one in list(self._unanswered)[:1]] + [
+            one for one in (self._next,) if one is not None
+        ]
+        return min(upcoming, default=None)
 
     @property
     def exhausted(self) -> bool:
         """Whether there are no more."""
-        return self._next is None
+        return self._next is None and not self._unanswered
 
     def take(self, room: int) -> list[TrialSpec]:
         """Return the next trials, at most so many; fewer where there are no more, or a result is waited for first.
@@ -85,6 +97,9 @@ class Trials:
             CrashhuntError: the sampler fails, or the ledger cannot be written.
         """
         found: list[TrialSpec] = []
+        while self._unanswered and len(found) < room:
+            found.append(self._unanswered.popleft())
+            self._running_again.add(found[-1].number)
         turns: list[Turn] = []
         while self._next is not None and len(found) < room:
             spec = self._proposed.pop(self._next, None)
@@ -109,6 +124,9 @@ class Trials:
     def ended(self, result: TrialResult) -> None:
         """Take note of how a trial ended, which is in the ledger already, or will be before anything else happens."""
         number = result.spec.number
+        if number in self._running_again:
+            self._running_again.discard(number)
+            return
         self._open.discard(number)
         if self._sampler.learns:
             self._results[number] = result

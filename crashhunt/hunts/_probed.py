@@ -24,12 +24,14 @@ class ProbeData(TypedDict):
     """What ``run --json`` prints of them."""
 
     trials: int
+    not_fully_asked: int
     least: float | None
     median: float | None
     probes: int
     steps: int
     left_out: int
     run_again: int
+    not_finished: int
     confirmed: int
     crashes: list[CrashSummary]
 
@@ -39,20 +41,26 @@ class ProbeReport:
     """What came of the probes of a hunt.
 
     Args:
-        margins: the stress margin of each trial that was asked.
+        margins: the stress margin of each trial of which all was asked that was to be asked.
+        not_fully_asked: of how many further trials a question has no answer.
+        why_unasked: the reason for the first of them; empty where there is none.
         probes: how many copies were asked.
         steps: how many steps they took.
         left_out: how many questions were left out, because copies had taken enough steps.
         run_again: how many of the mildest were run from the start.
+        not_finished: how many of these could not be run to their end, as when they are killed from outside.
         crashes: those of them that crashed in the same way at the same step, and once more to the bit.
         by: what each of these was probed with, as it took place; others may have been drawn besides.
     """
 
     margins: tuple[float, ...]
+    not_fully_asked: int
+    why_unasked: str
     probes: int
     steps: int
     left_out: int
     run_again: int
+    not_finished: int
     crashes: tuple[Bundle, ...]
     by: tuple[Disturbance, ...]
 
@@ -60,12 +68,14 @@ class ProbeReport:
         """Return the shape that ``run --json`` prints."""
         return {
             "trials": len(self.margins),
+            "not_fully_asked": self.not_fully_asked,
             "least": min(self.margins, default=None),
             "median": statistics.median(self.margins) if self.margins else None,
             "probes": self.probes,
             "steps": self.steps,
             "left_out": self.left_out,
             "run_again": self.run_again,
+            "not_finished": self.not_finished,
             "confirmed": len(self.crashes),
             "crashes": [bundle.summary() for bundle in self.crashes],
         }
@@ -84,16 +94,20 @@ def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
     if not copies.again.settings.probe:
         return None
     margins: list[float] = []
+    not_fully_asked, why_unasked = 0, ""
     sums = [0] * 3
     found: list[tuple[float, int]] = []
     for plain in ledger.plain_results():
         if not (data := plain.get("stress")):
             continue
         stress = Stress.from_json(data)
-        margins.append(stress.margin)
+        if stress.margin is not None:
+            margins.append(stress.margin)
+        else:
+            not_fully_asked, why_unasked = not_fully_asked + 1, why_unasked or stress.why_unasked
         sums = [sum(pair) for pair in zip(sums, (stress.probes, stress.steps, stress.left_out), strict=True)]
         if stress.disturbance is not None:
-            found.append((stress.margin, plain["spec"]["number"]))
+            found.append((stress.least, plain["spec"]["number"]))
     kept = copies.kept.get(layout.PROBES, {})
     results = [
         result
@@ -101,11 +115,22 @@ def look_at_probes(copies: FromTheStart) -> ProbeReport | None:
         if (result := ledger.result(number)) is not None
     ]
     specs = [one for result in results if (one := mildest(result)) is not None]
-    crashes = copies.crashes(specs, layout.PROBES)
+    crashes, not_finished = copies.crashes(specs, layout.PROBES)
     asked = {result.spec.number: result.stress for result in results}
     by = tuple(_as_it_took_place(asked[bundle.result.spec.number], bundle.result) for bundle in crashes)
     probes, steps, left_out = sums
-    return ProbeReport(tuple(margins), probes, steps, left_out, 0 if copies.is_stopped else len(specs), crashes, by)
+    return ProbeReport(
+        tuple(margins),
+        not_fully_asked,
+        why_unasked,
+        probes,
+        steps,
+        left_out,
+        0 if copies.is_stopped else len(specs),
+        not_finished,
+        crashes,
+        by,
+    )
 
 
 def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance:

@@ -46,9 +46,10 @@ class HuntStatus:
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
         time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
-        stressed: the trial of this run for whose crash it would have taken the least; None where nobody asked, or where
-            nothing plausible would have done it.
+        stressed: the trial of this run for whose crash it would have taken the least, as far as copies were asked;
+            None where no copy was asked, or nothing plausible made one crash.
         branched: how many branches of trials of this run have crashed.
+        not_fully_asked: of how many trials of this run a question to their copies has no answer.
         search: which strategies have had trials in this run, and when the greatest danger grew.
     """
 
@@ -69,6 +70,7 @@ class HuntStatus:
     disturbed: int | None = None
     stressed: TrialResult | None = None
     branched: int = 0
+    not_fully_asked: int = 0
     search: SearchStatus = field(default_factory=SearchStatus)
 
     @property
@@ -99,11 +101,13 @@ class Progress:
     nearest: TrialResult | None = None
     stressed: TrialResult | None = None
     branched: int = 0
+    not_fully_asked: int = 0
     last_invalid: TrialResult | None = None
     notes: list[str] = field(default_factory=list)
     failed: list[TrialResult] = field(default_factory=list)  # what was to confirm something, and ended otherwise
     failed_steps: int = 0  # of such runs, before this run of the hunt
     audit: AuditReport | None = None
+    audits_left: list[int] = field(default_factory=list)
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
     searching: Searching = field(default_factory=Searching)
@@ -134,8 +138,9 @@ class Progress:
         if result.branches is not None:
             self.branched += len(result.branches.crashes)
         if result.stress is not None and result.stress.disturbance is not None:
-            least = self.stressed.stress.margin if self.stressed is not None and self.stressed.stress else 1.0
-            self.stressed = result if result.stress.margin < least else self.stressed
+            least = self.stressed.stress.least if self.stressed is not None and self.stressed.stress else 1.0
+            self.stressed = result if result.stress.least < least else self.stressed
+        self.not_fully_asked += not result.is_fully_asked
 
     def save(self, bundle: Bundle) -> None:
         """Take in a crash that has been saved."""
@@ -196,7 +201,8 @@ class Progress:
             kinds = {"kinds": list(map(kind_data, self.kinds.groups())), "newest_kind": self.kinds.newest}
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
-        return {"heartbeat": time.time(), **nodes, **kinds, **in_vain}
+        audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
+        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain}
 
     def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the last three of `HuntStatus`."""

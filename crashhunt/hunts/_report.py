@@ -44,6 +44,7 @@ class HuntReportData(TypedDict):
     crashes: list[CrashSummary]
     notes: list[str]
     audit: AuditData | None
+    unanswered: int
     kinds: NotRequired[list[KindData]]
     near_misses: NotRequired[list[CrashSummary]]
     probes: NotRequired[ProbeData]
@@ -76,6 +77,7 @@ class HuntReport:
         at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
         branches: what came of copies that went on with other disturbances; None where there were to be none.
         copied: what a copy found, where that ended the hunt: it came again from the start.
+        unanswered: how many trials the same command runs again, as they or copies of them were killed from outside.
     """
 
     directory: Path
@@ -96,6 +98,7 @@ class HuntReport:
     at_fault: tuple[int, ...] | None = None
     branches: BranchReport | None = None
     copied: Bundle | None = None
+    unanswered: int = 0
 
     def to_json(self) -> HuntReportData:
         """Return the shape that ``run --json`` prints."""
@@ -112,6 +115,7 @@ class HuntReport:
             "crashes": [bundle.summary() for bundle in self.crashes],
             "notes": list(self.notes),
             "audit": self.audit.to_json() if self.audit is not None else None,
+            "unanswered": self.unanswered,
         }
         if self.probes is not None:
             found["probes"] = self.probes.to_json()

@@ -97,8 +97,8 @@ class HuntResults:
     def columns(self) -> tuple[str, ...]:
         """The columns of a table of its trials; ``parent`` and ``origin`` where its sampler says such a thing.
 
-        Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances, and ``stress_margin``, where it
-        has probes, ``branches`` and ``branch_crashes``, where it has those.
+        Likewise ``disturbances`` and ``log_likelihood``, where it has any disturbances, those of `STRESS`, where
+        it has probes, and those of `BRANCHES`, where it has branches.
         """
         with closing(self._ledger()) as ledger:
             origins = ORIGINS if ledger.facts().get("origins") else ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from crashhunt.trial import EVENTS, outcome_of
+from crashhunt.trial import EVENTS, Branches, Stress, outcome_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,11 +27,12 @@ ORIGINS = ("parent", "origin")
 DISTURBANCES = ("disturbances", "log_likelihood")
 """Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
 
-STRESS = ("stress_margin",)
-"""A further one, of hunts with probes: how little it would have taken, 0 to 1."""
+STRESS = ("stress_margin", "stress_asked", "stress_margin_upper_bound")
+"""Further ones, of hunts with probes: how little it would have taken, 0 to 1; at how many moments that was asked; and
+what the margin is at most where that was not all of them."""
 
-BRANCHES = ("branches", "branch_crashes")
-"""Further ones, of hunts with branches: how many there were, and how many crashed."""
+BRANCHES = ("branches", "branch_crashes", "branches_asked")
+"""Further ones, of hunts with branches: how many there were, how many crashed, and how many of all have an answer."""
 
 Cell: TypeAlias = "Value | None"
 """What a table has in one place; None where a trial has no such value."""
@@ -82,9 +83,15 @@ class TrialRow:
 
     @property
     def stress_margin(self) -> float | None:
-        """How little it would have taken, 0 to 1; None where nobody asked."""
+        """How little it would have taken, 0 to 1; None where that was not asked, or not fully."""
         stress = self.data.get("stress")
         return stress.get("margin") if stress else None
+
+    @property
+    def is_fully_asked(self) -> bool:
+        """Whether every question to its copies has an answer; also where there were to be none."""
+        stress, branches = self.data.get("stress"), self.data.get("branches")
+        return not (stress and stress.get("margin") is None) and not (branches and branches.get("unanswered"))
 
     @property
     def arguments(self) -> Mapping[str, Mapping[str, Value]]:
@@ -123,9 +130,17 @@ class TrialRow:
             "log_likelihood": data.get("log_likelihood"),
             "stress_margin": self.stress_margin,
         }
+        if stress := data.get("stress"):
+            found["stress_margin_upper_bound"] = stress.get("margin_upper_bound")
+            if stress.get("moments"):  # which earlier versions did not count
+                found["stress_asked"] = Stress.from_json(stress).extent
         branches = data.get("branches")
         if branches is not None:
-            found |= {"branches": branches.get("asked"), "branch_crashes": len(branches.get("crashes", ()))}
+            found |= {
+                "branches": branches.get("asked"),
+                "branch_crashes": len(branches.get("crashes", ())),
+                "branches_asked": Branches.from_json(branches).extent,
+            }
         if events is not None:  # somebody has looked for them
             found |= dict.fromkeys(EVENTS, 0)
             found |= events

@@ -84,6 +84,7 @@ def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
     kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
     kinds |= dict.fromkeys(EVENTS, "Int64")
     kinds |= {"parent": "Int64", "origin": "String", "disturbances": "Int64"}
+    kinds |= {"stress_asked": "String", "branches_asked": "String"}
     columns = hunt.columns
     for name in columns:
         kind = specs[name].kind if name in specs else "float"

@@ -69,26 +69,35 @@ def confirm(
         executors: which run it; a new Python process where there are none.
 
     Returns:
-        None where it was given up.
+        None where it was given up. A replay that cannot be run to its end, as when it is killed from outside again and
+        again, says nothing about the crash: then `confirmed` is None, and `why_unconfirmed` has the reason.
     """
     try:
         rerun = prepare(bundle, ReplayOptions(force=True))
         report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped, executors)
     except _StoppedError:
         return None
-    except CrashhuntError as error:
+    except _NotSetUpError as error:
         failure: DivergenceData = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
-        return replace(bundle, confirmed=False, divergence=failure)
+        return replace(bundle, confirmed=False, divergence=failure, why_unconfirmed="")
+    except CrashhuntError as error:  # it did not take place, or not to its end
+        return replace(bundle, confirmed=None, divergence=None, why_unconfirmed=error.message)
     divergence = report.divergence.to_json() if report.divergence else None
     confirmed = report.verdict == "reproduced"
     if not confirmed and failed is not None:
         failed.append(report.replayed)
-    result = replace(bundle.result, escape=report.replayed.escape if confirmed else None)
-    return replace(bundle, result=result, confirmed=confirmed, divergence=divergence)
+    now = report.replayed
+    escape, why_no_escape = (now.escape, now.why_no_escape) if confirmed else (None, "")
+    result = replace(bundle.result, escape=escape, why_no_escape=why_no_escape)
+    return replace(bundle, result=result, confirmed=confirmed, divergence=divergence, why_unconfirmed="")
 
 
 class _StoppedError(Exception):
     pass
+
+
+class _NotSetUpError(CrashhuntError):
+    """The replay took place, and did not get as far as the first step."""
 
 
 def _run(
@@ -105,6 +114,12 @@ def _run(
             raise _StoppedError
         message = result.failure.message if result.failure else "it left no recording"
         recorded_in = scratch_of(scratch, rerun.spec.number)
+        if result.was_killed_from_outside:
+            raise CrashhuntError(
+                f"the replay was {message}",
+                fix="run it again; where memory ran out, with less beside it",
+                where=rerun.bundle.id,
+            )
         try:
             if result.outcome is Outcome.INVALID:
                 raise _not_set_up(rerun, message)
@@ -133,8 +148,8 @@ def _look_into(rerun: Rerun, look: Look) -> ReplayReport:
     return replace(report, verdicts={report.verdict: 1})
 
 
-def _not_set_up(rerun: Rerun, message: str) -> CrashhuntError:
-    return CrashhuntError(
+def _not_set_up(rerun: Rerun, message: str) -> _NotSetUpError:
+    return _NotSetUpError(
         f"the replay did not get as far as the first step: {message}",
         fix="see that what the agent needs is installed",
         where=rerun.bundle.id,

@@ -150,18 +150,19 @@ def _trials(directory: Path) -> dict[str, object]:
     path = directory / layout.LEDGER
     if not has_begun(path):
         nothing = {"outcomes": {}, "categories": {}, "steps": 0, "trials": [], "stress": None, "thinned": False}
-        return {**nothing, "importance": []}
+        return {**nothing, "importance": [], "not_fully_asked": 0}
     ledger = Ledger(path)
     try:
         outcomes = ledger.outcomes()
         total = sum(outcomes.values())
         share = _DOTS / max(total, 1)
-        trials, stress = [], None
+        trials, stress, not_fully_asked = [], None, 0
         unchosen: list[tuple[Mapping[str, Value], float]] = []
         for number, row in enumerate(map(TrialRow, ledger.plain_results())):
             outcome, margin = row.outcome, row.stress_margin
             if margin is not None and (stress is None or margin < stress["margin"]):
                 stress = {"margin": margin, "trial": row.number}
+            not_fully_asked += not row.is_fully_asked
             crashed = outcome.category != "no crash"
             danger = 1.0 if crashed else row.danger
             drawn = _is_drawn(number, share)
@@ -187,6 +188,7 @@ def _trials(directory: Path) -> dict[str, object]:
             "steps": ledger.trial_steps(),
             "trials": trials,
             "stress": stress,
+            "not_fully_asked": not_fully_asked,
             "thinned": share < 1.0,
             "importance": importance_of(unchosen),
         }
@@ -221,7 +223,11 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "digest": result.digest,
             "snapshot": bundle.snapshot,
             **_disturbances(result),
-            "confirmed": {True: "yes, to the bit", False: "no: flaky", None: "not tried"}[bundle.confirmed],
+            "confirmed": {
+                True: "yes, to the bit",
+                False: "no: flaky",
+                None: f"not confirmed: {bundle.why_unconfirmed}" if bundle.why_unconfirmed else "not tried",
+            }[bundle.confirmed],
         },
         "escape": story.escape,
         "nearest": story.nearest.step if story.nearest is not None else None,

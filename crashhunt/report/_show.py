@@ -222,7 +222,8 @@ class Story:
         if self.judgement is not None and self.judgement.runs:
             return self.about_judgement()
         if tried is None:
-            return []
+            why = self.bundle.result.why_no_escape
+            return [f"Until when braking would have helped is not known: {why}."] if why else []
         braking = f"Braking {tried.how}"
         if tried.step is None:
             assert tried.too_late is not None

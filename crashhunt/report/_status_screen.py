@@ -108,6 +108,11 @@ class Watcher:
         if status.stressed is not None and len(status.workers) < left:
             rows.append(Text(one_line(_stressed(status.stressed)), no_wrap=True, overflow="ellipsis"))
             left -= 1
+        if status.not_fully_asked and len(status.workers) < left:
+            count = status.not_fully_asked
+            text = f"{count} {'trial was' if count == 1 else 'trials were'} not fully asked: copies of them died"
+            rows.append(Text(text, no_wrap=True, overflow="ellipsis"))
+            left -= 1
         if status.branched and len(status.workers) < left:
             rows.append(Text(f"branches that crashed: {status.branched}", no_wrap=True, overflow="ellipsis"))
             left -= 1
@@ -234,7 +239,8 @@ def _stressed(result: TrialResult) -> str:
     stress = result.stress
     assert stress is not None
     what = stress.disturbance.words if stress.disturbance is not None else ""
-    return f"least stress margin: {stress.margin:.2f}, trial {result.spec.number}, {what}, {format_arguments(result)}"
+    margin = f"{stress.least:.2f}" if stress.margin is not None else f"at most {stress.least:.2f} ({stress.extent})"
+    return f"least stress margin: {margin}, trial {result.spec.number}, {what}, {format_arguments(result)}"
 
 
 def _strategies(search: SearchStatus) -> str:

@@ -49,6 +49,11 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.copied is not None:
         number = report.copied.result.spec.number
         lines.append(f"Trial {number} did not crash; a copy of it did, and from the start it crashed as well.")
+    if report.unanswered:
+        one = report.unanswered == 1
+        who, whom = f"{report.unanswered} {'trial' if one else 'trials'}", "it" if one else "them"
+        why = "processes were killed from outside"
+        lines.append(f"Answers are missing from {who}: {why}. The same command runs {whom} again.")
     if report.stopped_because == "interrupted":
         lines.append("Interrupted; the same command goes on from here.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
@@ -181,9 +186,11 @@ def _describe_audit(report: HuntReport) -> list[str]:
     if found is None:
         return []
     same = found.trials - len(found.differences)
-    if found.trials == 0:
+    if found.trials == found.not_finished == 0:
         return ["Audit: no trial without a crash belonged to the sample."]
     lines = [f"Audit: {found.trials} run again in fresh processes, {same} the same to the bit."]
+    if found.not_finished:
+        lines.append(f"  {found.not_finished} more could not be run again to the end; the same command does it")
     lines += [f"  {difference}" for difference in found.differences[:_SHOWN]]
     if len(found.differences) > _SHOWN:
         lines.append(f"  … and {len(found.differences) - _SHOWN} more; crashhunt logs has them all")
@@ -208,6 +215,10 @@ def _describe_crash(bundle: Bundle) -> list[str]:
             if bundle.confirmed
             else f"  flaky: a fresh process did not do the same ({diverged})"
         )
+    elif bundle.why_unconfirmed:
+        lines.append(f"  not confirmed: {bundle.why_unconfirmed}; the same command tries again")
+    if result.why_no_escape:
+        lines.append(f"  last avoidable step: not known, as {result.why_no_escape}; the same command tries again")
     return lines
 
 

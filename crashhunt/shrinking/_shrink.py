@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, UsageError
+from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
@@ -254,6 +254,8 @@ def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
                 results = list(executor.completed(1.0))
         finally:
             executor.close()
+        if results[0].was_killed_from_outside:
+            raise CrashhuntError(f"a trial was {results[0].summary}", fix="run the same command again", where=bundle.id)
         trial = scratch_of(scratch, spec.number)
         return write_bundle(
             bundle.hunt, results[0], trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,

@@ -61,6 +61,9 @@ class Branches:
         steps: how many steps they took.
         left_out: how many were left out, because branches had taken enough steps.
         crashes: those that crashed, in the order in which they were found.
+        unanswered: how many more there were to be, of which no copy answered.
+        why_unanswered: the reason for the first of them, in words; empty where there is none.
+        may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
     """
 
     moments: int = 0
@@ -68,16 +71,29 @@ class Branches:
     steps: int = 0
     left_out: int = 0
     crashes: tuple[Branch, ...] = ()
+    unanswered: int = 0
+    why_unanswered: str = ""
+    may_be_asked_again: bool = False
+
+    @property
+    def extent(self) -> str:
+        """How much of it was asked, in words: "asked 12 of 13"."""
+        return f"asked {self.asked} of {self.asked + self.unanswered}"
 
     def to_json(self) -> BranchesData:
         """Return plain text and numbers."""
-        return {
+        data: BranchesData = {
             "moments": self.moments,
             "asked": self.asked,
             "steps": self.steps,
             "left_out": self.left_out,
             "crashes": [one.to_json() for one in self.crashes],
         }
+        if self.unanswered:
+            data["unanswered"] = self.unanswered
+            data["why_unanswered"] = self.why_unanswered
+            data["may_be_asked_again"] = self.may_be_asked_again
+        return data
 
     @classmethod
     def from_json(cls, data: BranchesData) -> Branches:

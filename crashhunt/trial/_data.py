@@ -109,15 +109,20 @@ class EscapeData(TypedDict):
 
 
 class StressData(TypedDict):
-    """Of a `Stress`."""
+    """Of a `Stress`; its margin is null where not all was asked."""
 
-    margin: float
+    margin: float | None
     probes: int
     steps: int
     left_out: int
     disturbance: DisturbanceData | None
     outcome: str
     step: int
+    moments: NotRequired[int]
+    moments_asked: NotRequired[int]
+    margin_upper_bound: NotRequired[float | None]
+    why_unasked: NotRequired[str]
+    may_be_asked_again: NotRequired[bool]
 
 
 class BranchData(TypedDict):
@@ -138,6 +143,9 @@ class BranchesData(TypedDict):
     steps: int
     left_out: int
     crashes: list[BranchData]
+    unanswered: NotRequired[int]
+    why_unanswered: NotRequired[str]
+    may_be_asked_again: NotRequired[bool]
 
 
 class ResultData(TypedDict):
@@ -165,3 +173,4 @@ class ResultData(TypedDict):
     stress: NotRequired[StressData]
     branches: NotRequired[BranchesData]
     setup_steps: NotRequired[int | None]
+    why_no_escape: NotRequired[str]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crashhunt.base.plain import finite
 from crashhunt.base.text import encodable
@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from crashhunt.base.plain import Plain
     from crashhunt.trial._data import CollisionData, EscapeData, FailureData
 
-__all__ = ["Collision", "Escape", "Failure"]
+__all__ = ["KILLED", "Collision", "Escape", "Failure"]
+
+KILLED: Final = "killed from outside"
+"""Kind of the failure of a trial whose processes were killed from outside until no attempt was left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,7 @@ class Failure:
     """What a program did wrong.
 
     Args:
-        kind: the exception's type, ``exit code``, ``signal`` or ``timeout``.
+        kind: the exception's type, ``exit code``, ``signal``, ``timeout`` or ``killed from outside``.
         message: in one line.
         traceback: of the exception, or the stack of the stuck thread.
         agent: the agent in whose code it happened; empty where it was not an agent's.

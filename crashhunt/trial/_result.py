@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.plain import finite
 from crashhunt.trial._branches import Branches
 from crashhunt.trial._disturbance import Disturbance
-from crashhunt.trial._evidence import Collision, Escape, Failure
+from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.trial._stress import Stress
@@ -42,6 +42,7 @@ class TrialResult:
         worker: the process id.
         kept: whether the worker left its scratch folder for the hunt to collect.
         escape: until when braking would have avoided it; None where nobody tried, or where it cannot be told.
+        why_no_escape: why the search for it did not come to its end, where it was killed from outside; else empty.
         events: how many traffic events of which kind there were; None where nobody looked.
         disturbances: those that took place, with who turned out to be meant.
         log_likelihood: that just these disturbances begin in these steps, and no others: the natural logarithm of the
@@ -74,6 +75,7 @@ class TrialResult:
     stress: Stress | None = None
     branches: Branches | None = None
     setup_steps: int | None = None
+    why_no_escape: str = ""
 
     def to_json(self) -> ResultData:
         """Return plain dicts, strings and numbers; what is not a finite number is null."""
@@ -109,6 +111,8 @@ class TrialResult:
             data["branches"] = self.branches.to_json()
         if self.setup_steps is not None:
             data["setup_steps"] = self.setup_steps
+        if self.why_no_escape:
+            data["why_no_escape"] = self.why_no_escape
         return data
 
     @classmethod
@@ -139,7 +143,28 @@ class TrialResult:
             stress=Stress.from_json(stress) if stress else None,
             branches=Branches.from_json(branches) if branches else None,
             setup_steps=data.get("setup_steps"),
+            why_no_escape=data.get("why_no_escape", ""),
         )
+
+    @property
+    def was_killed_from_outside(self) -> bool:
+        """Whether its processes were killed from outside until no attempt was left: how it ends is not known."""
+        return self.failure is not None and self.failure.kind == KILLED
+
+    @property
+    def is_to_be_run_again(self) -> bool:
+        """Whether something outside of the trial kept answers from it, so that a resumed hunt runs it again.
+
+        Its processes were killed from outside, or those of its copies.
+        """
+        unasked = (one for one in (self.stress, self.branches) if one is not None)
+        return self.was_killed_from_outside or any(one.may_be_asked_again for one in unasked)
+
+    @property
+    def is_fully_asked(self) -> bool:
+        """Whether every question to its copies has an answer; also where there were to be none."""
+        unasked = self.stress is not None and self.stress.margin is None
+        return not unasked and not (self.branches is not None and self.branches.unanswered)
 
     @property
     def steps_begun(self) -> int:

@@ -92,10 +92,12 @@ def ends(stage):
     for name, how in {"hangs": lambda: time.sleep(600), "dies": lambda: os.kill(os.getpid(), 9)}.items():
         brancher = Brancher(RATES, CRASHES, lambda _: None)
         result = place.run(brancher, Sleeps(how))
-        found[name] = [str(result.outcome), brancher.why_not, len(children_of(os.getpid()))]
+        found[name] = [
+            str(result.outcome), brancher.why_not, len(children_of(os.getpid())), result.branches.to_json()
+        ]  # fmt: skip
     module.free_memory, told = lambda: 0.2, []
     result = place.run(Brancher(RATES, CRASHES, lambda _: None, told.append), steps=40)
-    found["full"] = [str(result.outcome), result.branches, told[0]]
+    found["full"] = [str(result.outcome), result.branches.to_json(), told[0]]
     module.free_memory = lambda: 1.0
     brancher = Brancher(RATES, CRASHES, lambda _: None)
     brancher.close = lambda: None  # as if it were killed now

@@ -6,6 +6,7 @@ import json
 import mmap
 import os
 import random
+import signal
 import socket
 import subprocess
 import sys
@@ -21,8 +22,9 @@ from gymnasium.spaces import Discrete
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.forks import ends as ends_of_copies
 from crashhunt.base.plugins import locate
-from crashhunt.base.processes import children_of
+from crashhunt.base.processes import adopt_orphans, children_of
 from crashhunt.episode import Episode, Nearness, Prober, Recorder, run_episode, seed_everything
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox
@@ -154,17 +156,37 @@ def refused(stage):
 
 def ends(stage):
     """What becomes of copies that hang, die, or are left alone."""
+    adopt_orphans()  # as workers do
     scenario = Scenario(simulator="toy", agents={"ego": AgentSetup()})
     simulator = locate("simulators", "toy")(scenario, stage)
     with begun(simulator, scenario, stage) as (episode, _):
-        hung = episode.fork(lambda copy: time.sleep(600)).answer(0.2)
-        died = episode.fork(lambda copy: os.kill(os.getpid(), 9)).answer(60.0)
-        divides = episode.fork(lambda copy: 1 / 0)
-        raised = divides.answer(60.0)
+        ways = {
+            "hangs": lambda copy: time.sleep(600),
+            "is killed": lambda copy: os.kill(os.getpid(), signal.SIGKILL),
+            "segfaults": lambda copy: os.kill(os.getpid(), signal.SIGSEGV),
+            "exits": lambda copy: os._exit(3),
+            "divides": lambda copy: 1 / 0,
+            "closes": lambda copy: (os.closerange(3, 100), time.sleep(600)),
+            "forges": lambda copy: [os.write(end, b"[1]\n") for end in ends_of_copies],
+        }
+        copies = {name: episode.fork(how) for name, how in ways.items()}
+        answers = {name: copy.answer(2.0 if name == "hangs" else 60.0) for name, copy in copies.items()}
+        whys = {name: [copy.no_answer.why, copy.no_answer.is_from_outside] for name, copy in copies.items()}
+        divides = copies["divides"]
+        # What a copy has started that is killed goes with it, so that there can be another copy.
+        for how in (lambda: os.kill(os.getpid(), signal.SIGKILL), lambda: time.sleep(600)):
+            work = lambda _copy, how=how: (subprocess.Popen(["sleep", "600"]), how())  # noqa: E731
+            assert episode.fork(work).answer(0.5) is None
+            assert episode.fork(lambda copy: {}).answer(60.0) == {}
+        sleeper = episode.leave_asleep(lambda copy, job: os.kill(os.getppid(), signal.SIGKILL) or time.sleep(600))
+        assert sleeper.ask({}, 60.0) is None
+        whys["sleeper"] = [sleeper.no_answer.why, sleeper.no_answer.is_from_outside, sleeper.is_usable]
+        sleeper.end()
+        assert episode.fork(lambda copy: {}).answer(60.0) == {}
         copies = [episode.fork(lambda copy: time.sleep(600)) for _ in range(2)]
         copies[0].end()
         copies[0].end()
-    return {"answers": [hung, died, raised], "raised": divides.raised, "left": copies[1].pid}
+    return {"answers": list(answers.values()), "whys": whys, "raised": divides.raised, "left": copies[1].pid}
 
 
 def soak(stage, forks=10_000):
@@ -230,7 +252,7 @@ def probes(stage):
         "never": run(drives, late).stress,
         "by itself": run(lambda *_: KeepLaneWithSpeed(20.0), prober).stress.to_json(),
     }  # fmt: skip
-    found["thread"] = run(starts_thread, prober).stress, prober.why_not
+    found["thread"] = run(starts_thread, prober).stress.to_json(), prober.why_not
     return found
 
 

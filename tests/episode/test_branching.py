@@ -65,13 +65,20 @@ def test_branches_crash_from_the_start_as_they_did_and_change_nothing(ask, scena
 
 def test_branches_end_when_they_hang_or_die_and_copies_with_their_process(ask):
     found = ask("ends")
-    for how in ("hangs", "dies"):
-        assert found[how] == ["survived", "a copy died, or hung", 0]
-    assert found["full"] == [
-        "survived",
-        None,
-        "less than 25% of the memory is free: trials branch less than they might",
-    ]
+    outcome, why_not, left, branches = found["hangs"]
+    assert (outcome, why_not, left) == ("survived", "3 copies in turn failed; the last took longer than 0.3 s", 0)
+    assert (branches["asked"], branches["may_be_asked_again"]) == (0, False)
+    assert branches["unanswered"] > 3  # one for each second in which an actor is near
+    outcome, why_not, left, branches = found["dies"]
+    assert (outcome, why_not, left) == ("survived", "", 0)  # the next trial is asked
+    assert (branches["why_unanswered"], branches["may_be_asked_again"]) == ("a copy was killed by SIGKILL", True)
+    outcome, branches, told = found["full"]
+    assert told == "less than 25% of the memory is free: trials branch less than they might"
+    assert (branches["asked"], branches["unanswered"]) == (0, 3)
+    assert (branches["why_unanswered"], branches["may_be_asked_again"]) == (
+        "less than 25% of the memory was free",
+        False,
+    )
     assert len(found["left"]) == 3
     deadline = time.monotonic() + 60.0
     for pid in found["left"]:

@@ -73,7 +73,17 @@ def test_what_has_no_copy_is_named(ask):
 
 def test_copies_end_with_their_process_and_before_it_when_they_hang(ask):
     found = ask("ends")
-    assert found["answers"] == [None, None, None]
+    assert found["answers"] == [None] * 7
+    assert found["whys"] == {
+        "hangs": ["took longer than 2 s", False],
+        "is killed": ["was killed by SIGKILL", True],
+        "segfaults": ["was killed by SIGSEGV", False],
+        "exits": ["exited with 3", False],
+        "divides": ["raised ZeroDivisionError: division by zero", False],
+        "closes": ["closed its connection to the trial", False],
+        "forges": ["sent data that are no answer", False],
+        "sleeper": ["was killed by SIGKILL", True, False],
+    }
     assert found["raised"] == "ZeroDivisionError: division by zero"
     deadline = time.monotonic() + 60.0
     while goes_on(found["left"]):
@@ -97,7 +107,10 @@ def test_probes_find_the_mildest_that_crashes_and_change_nothing(ask):
     assert found["never"] is None
     assert found["by itself"]["margin"] == 0.0
     assert found["by itself"]["disturbance"] is None
-    assert found["thread"] == [None, "threads have no copy, and 1 runs besides the first"]
+    stress, why_not = found["thread"]
+    assert why_not == "threads have no copy, and 1 runs besides the first"
+    assert (stress["margin"], stress["why_unasked"]) == (None, why_not)
+    assert (stress["moments"], stress["moments_asked"], stress["probes"]) == (5, 0, 0)
 
 
 @pytest.mark.nightly

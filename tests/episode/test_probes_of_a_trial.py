@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import members
-from crashhunt.episode import BUDGET_BESIDE, Prober
+from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.episode import BUDGET_BESIDE, Prober, _questions
 from crashhunt.simulators import Disturbs
-from crashhunt.trial import CRASHES, Disturbance, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import CRASHES, Disturbance, Outcome, Stress, TrialResult, TrialSpec
 
 DT = 0.1
 BRAKE, STOP = 6.0, 6.0  # m/s²: the strongest that is plausible
@@ -29,7 +30,7 @@ class Road:
         doomed: it crashes without any disturbance.
         absent: kinds for which nobody is there when they begin.
         away: kinds for which nobody is there already before.
-        answers: whether copies answer at all.
+        answers: whether copies answer at all; otherwise they raise an exception.
     """
 
     crashes: dict[str, float]
@@ -40,7 +41,7 @@ class Road:
     absent: tuple[str, ...] = ()
     away: tuple[str, ...] = ()
     answers: bool = True
-    raised: str = ""
+    forks: int = 0
     names: tuple[str, ...] = ("ego",)
     acting: tuple[int, ...] = (0,)
     kinds: tuple[str, ...] = ("brake", "stop")
@@ -63,7 +64,29 @@ class Road:
         else:
             self.asked.append(copy.disturbance)
             self.taken.append(copy.steps - self.steps)
-        return SimpleNamespace(answer=lambda seconds: answer if self.answers else None, raised=self.raised)
+        self.forks += 1
+        return SimpleNamespace(
+            answer=lambda seconds: answer if self.answers else None, no_answer=NoAnswer("raised KeyError: 3")
+        )
+
+
+@dataclass
+class Kills(Road):
+    """The same, of which some copies are killed.
+
+    Args:
+        kills: a character for each copy: k where it is killed.
+    """
+
+    kills: str = ""
+
+    def fork(self, work, *, observed=True):
+        kill, self.kills = self.kills[:1] == "k", self.kills[1:]
+        if not kill:
+            return super().fork(work, observed=observed)
+        self.forks += 1
+        reason = NoAnswer("was killed by SIGKILL", is_from_outside=True)
+        return SimpleNamespace(answer=lambda seconds: None, no_answer=reason)
 
 
 class _Copy:
@@ -244,26 +267,128 @@ def test_a_trial_that_crashed_has_no_margin_and_one_that_nobody_asked_says_nothi
     assert stress_of(asker) is None  # of the one before
 
 
-def test_it_is_due_every_so_often_until_copies_cannot_be_asked():
-    asker, waited = prober(every_s=0.5)
-    assert [step for step in range(1, 21) if asker.is_due(Road({}, steps=step))] == [5, 10, 15, 20]
-    road = Road({"brake": 0.5}, answers=False, raised="OSError: no")
-    asker.ask(road)
-    assert (road.asked, len(waited)) == ([], 1)  # who is there is not answered already
-    assert asker.why_not == "OSError: no"
-    assert not asker.is_due(Road({}, steps=5))
+def test_it_is_due_every_so_often():
     asker, _ = prober(every_s=0.5)
-    asker.ask(Road({}, answers=False))
-    assert asker.why_not == "a copy died, or hung"
+    assert [step for step in range(1, 21) if asker.is_due(Road({}, steps=step))] == [5, 10, 15, 20]
+
+
+@pytest.fixture
+def no_pauses(monkeypatch):
+    monkeypatch.setattr(_questions, "_PAUSES_S", (0.0, 0.0))
+
+
+@pytest.mark.parametrize("killed", ["k", "kk", ".k", "..kk", "....kk"])
+def test_killed_copy_is_asked_again_and_the_answers_are_as_without_the_kill(killed, no_pauses):
+    undisturbed, _ = prober()
+    undisturbed.ask(Road({"brake": 0.5}))
+    told = []
+    asker = Prober(2.0, CRASHES, lambda _: None, tell=told.append)
+    road = Kills({"brake": 0.5}, kills=killed)
+    asker.ask(road)
+    assert stress_of(asker) == stress_of(undisturbed)
+    assert set(told) == {"probes: a copy of a trial was killed by SIGKILL, and another is asked"}
+    assert asker.why_not == ""
+
+
+def test_question_whose_copies_are_all_killed_leaves_the_margin_open(no_pauses):
+    asker, _ = prober()
+    asker.ask(Kills({"late_action": 0.3}, kinds=("brake",), kills=".kkk"))  # "brake" has no answer, the others have
+    asker.ask(Road({"brake": 0.75}, kinds=("brake",)))
+    asker.ask(Road({}, kinds=("brake",)))
+    stress = stress_of(asker)
+    assert (stress.margin, stress.margin_upper_bound, stress.disturbance.what) == (
+        None, pytest.approx(0.3), "late_action",
+    )  # fmt: skip
+    assert (stress.moments, stress.moments_asked, stress.extent) == (3, 2, "asked 2 of 3")
+    assert (stress.why_unasked, stress.may_be_asked_again) == ("a copy was killed by SIGKILL", True)
+    data = json.loads(json.dumps(stress.to_json()))
+    assert data["margin"] is None
+    assert Stress.from_json(data) == stress
+    asker.ask(Road({"brake": 0.75}, kinds=("brake",)))  # of the next trial
+    assert stress_of(asker).margin == 0.75
+
+
+@pytest.mark.parametrize("killed", ["kkk", ".kkk", "..kkk"])  # who is there, the disturbance, no disturbance
+def test_nothing_is_concluded_from_a_question_without_an_answer(killed, no_pauses):
+    asker, _ = prober()
+    asker.ask(Kills({"brake": 1 / 16}, kinds=("brake",), kills=killed))
+    stress = stress_of(asker)
+    assert (stress.margin, stress.extent) == (None, "asked 0 of 1")
+    assert stress.disturbance is None
+
+
+def test_trial_that_crashed_has_its_margin_whatever_was_not_asked(no_pauses):
+    asker, _ = prober()
+    asker.ask(Kills({}, kills="kkk"))
+    stress = stress_of(asker, Outcome.COLLISION)
+    assert (stress.margin, stress.why_unasked, stress.may_be_asked_again) == (0.0, "", False)
+
+
+def test_kills_suspend_the_questions_of_one_trial_only(no_pauses):
+    asker, _ = prober()
+    road = Kills({}, kills="." + "k" * 9 + "." * 100)
+    asker.ask(road)
+    asked = road.forks
+    assert asked == 1 + 9  # who is there, and three questions, three times each
+    asker.ask(road)
+    assert road.forks == asked
+    stress = stress_of(asker)
+    assert (stress.extent, stress.may_be_asked_again) == ("asked 0 of 2", True)
+    assert asker.why_not == ""
+    asker.ask(road)
+    assert stress_of(asker).extent == "asked 1 of 1"
+
+
+def test_copies_that_fail_by_themselves_are_asked_once_and_three_in_turn_end_the_asking():
+    told = []
+    asker = Prober(2.0, CRASHES, lambda _: None, tell=told.append)
+    for moment in range(3):
+        assert asker.why_not == ""
+        road = Road({"brake": 0.5}, answers=False)
+        asker.ask(road)
+        assert road.forks == 1, "it was asked again, or more was asked though it is not known who is there"
+        assert stress_of(asker).extent == "asked 0 of 1", moment
+    assert asker.why_not == "3 copies in turn failed; the last raised KeyError: 3"
+    assert told == ["probes: a copy raised KeyError: 3; what it was asked has no answer"] * 3
+    road = Road({"brake": 0.5})
+    asker.ask(road)
+    stress = stress_of(asker)
+    assert (road.forks, stress.margin, stress.why_unasked) == (0, None, asker.why_not)
+    assert not stress.may_be_asked_again
+
+
+def test_an_answer_between_failures_keeps_the_asking_going():
+    asker, _ = prober()
+    for answers in (False, False, True, False, False):
+        asker.ask(Road({}, answers=answers))
+    assert asker.why_not == ""
+    assert stress_of(asker).extent == "asked 1 of 5"
 
 
 def test_what_has_no_copy_is_told_and_its_time_counts():
     class Refused(Road):
         def fork(self, work, *, observed=True):
-            raise CrashhuntError("threads have no copy", fix="none")
+            raise CannotForkError("threads have no copy", fix="none")
 
     asker, waited = prober()
     asker.ask(Refused({}))
     assert asker.why_not == "threads have no copy"
     assert len(waited) == 1
-    assert stress_of(asker) is None
+    stress = stress_of(asker)
+    assert (stress.margin, stress.extent, stress.why_unasked) == (None, "asked 0 of 1", "threads have no copy")
+    assert not stress.may_be_asked_again
+
+
+def test_system_that_starts_no_process_for_a_while_does_not_end_the_asking(no_pauses):
+    class Full(Road):
+        left = 2
+
+        def fork(self, work, *, observed=True):
+            self.left -= 1
+            if self.left >= 0:
+                raise NoProcessError("no process could be started: Cannot allocate memory")
+            return super().fork(work, observed=observed)
+
+    asker, _ = prober()
+    asker.ask(Full({"brake": 0.5}))
+    assert (asker.why_not, stress_of(asker).margin) == ("", 0.5)

@@ -5,13 +5,15 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing, suppress
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger, has_begun
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
+from crashhunt.hunts import Ledger, TrialRow, has_begun
+from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
+from crashhunt.trial import KILLED, Branches, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
 
@@ -230,3 +232,31 @@ def test_what_is_no_ledger_is_refused(tmp_path):
         Ledger(tmp_path / "other.sqlite")
     with pytest.raises(HuntDirectoryError, match="does not exist"):
         Ledger(tmp_path / "missing" / "ledger.sqlite", writable=True)
+
+
+def test_trials_that_run_again_are_those_with_a_cause_outside_of_them(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
+    killed = Failure(KILLED, "killed from outside 3 times")
+    forged = Failure("KeyError", '"may_be_asked_again": true, "kind": "killed from outside"')
+    half = Stress(None, moments=9, moments_asked=1, margin_upper_bound=1.0, why_unasked="a copy was killed by SIGKILL")
+    asked = [
+        result(0),
+        replace(result(1), stress=replace(half, may_be_asked_again=True)),
+        replace(result(2), stress=half),  # as copies failed by themselves
+        replace(result(3), branches=Branches(asked=3, unanswered=1, may_be_asked_again=True)),
+        replace(result(4, Outcome.INVALID), failure=killed),
+        replace(result(5), failure=forged),
+        replace(result(6), stress=Stress(0.5, moments=9, moments_asked=9)),
+    ]
+    for one in asked:
+        ledger.record(one, snapshot="")
+    assert ledger.unanswered() == [asked[4]]  # of a hunt without copies, which is not read for them
+    ledger.note(copies=["probes", "branches"])
+    assert ledger.unanswered() == [asked[1], asked[3], asked[4]]
+    assert [one.is_fully_asked for one in asked] == [True, False, False, False, True, True, True]
+    assert [TrialRow(one.to_json()).is_fully_asked for one in asked] == [one.is_fully_asked for one in asked]
+    facts = {"copies": ["probes", "branches"]}
+    probes, branches = sums_of_probes(ledger, facts), sums_of_branches(ledger, facts)
+    assert (probes["trials"], probes["not_fully_asked"], probes["least"], probes["trial"]) == (1, 2, 0.5, 6)
+    assert (branches["trials"], branches["not_fully_asked"]) == (1, 1)
+    ledger.close()

@@ -302,3 +302,36 @@ def test_what_another_sampler_proposes_for_the_scenario_stays():
     assert [(one.arguments, one.scenario_arguments) for one in shared] == [
         (one.arguments, one.scenario_arguments) for one in alone
     ]
+
+
+@pytest.mark.parametrize("sampler", ["random", "climber:Climber"])
+def test_unanswered_trials_run_first_and_the_sampler_proposes_as_if_they_had_not(tmp_path, sampler):
+    chosen, chance = settings(sampler, deterministic=True, trials=20), random.Random(1)
+    undisturbed, killed, resumed = (tmp_path / name / "ledger.sqlite" for name in ("undisturbed", "killed", "resumed"))
+    for path in (undisturbed, killed):
+        path.parent.mkdir()
+    hunt(undisturbed, chosen, random.Random(1), lag=4)
+    with pytest.raises(Killed):
+        hunt(killed, chosen, random.Random(1), lag=4, kill_after=9)
+    shutil.copytree(killed.parent, resumed.parent)
+    with closing(Ledger(resumed, writable=True)) as ledger, closing(Ledger(undisturbed)) as whole:
+        finished = ledger.finished()
+        unanswered = [ledger.result(number).spec for number in sorted(finished)[1:4:2]]
+        made = NamedSampler(chosen.sampler, chosen.space, points=chosen.points)
+        trials = Trials(chosen, made, ledger, finished, lag=4, unanswered=unanswered)
+        assert not trials.exhausted
+        assert trials.upcoming == min(unanswered[0].number, *set(range(20)) - finished)
+        order, running = [], []
+        while True:
+            running += trials.take(2 - len(running))
+            order += [spec for spec in running if spec not in order]
+            if not running:
+                break
+            spec = running.pop(chance.randrange(len(running)))
+            trials.ended(ended(spec))
+            ledger.record(ended(spec), snapshot="")
+        assert trials.exhausted
+        assert trials.upcoming is None
+        assert order[:2] == unanswered
+        assert sorted(spec.number for spec in order[2:]) == sorted(set(range(20)) - finished)
+        assert [one.spec for one in ledger.results()] == [one.spec for one in whole.results()]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 
 from crashhunt.hunts import FACTS, TrialRow
-from crashhunt.trial import EVENTS, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.hunts._row import BRANCHES, STRESS
+from crashhunt.trial import EVENTS, Branches, Collision, Escape, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
 SPEC = TrialSpec(3, 7, {"ego": {"speed": 11.5}}, {"gap_m": 4}, max_steps=100, parent=1, origin="climb")
@@ -68,3 +70,22 @@ def test_a_row_of_an_earlier_version_has_what_that_wrote():
         "wall_s": None,
         "digest": None,
     }
+
+
+def test_margin_that_is_not_fully_asked_is_empty_and_what_was_asked_stands_beside_it():
+    half = Stress(None, moments=9, moments_asked=1, margin_upper_bound=0.25)
+    branches = Branches(asked=12, unanswered=1)
+    row = TrialRow(replace(RESULT, stress=half, branches=branches).to_json()).cells((*STRESS, *BRANCHES))
+    assert row == {
+        "stress_margin": None, "stress_asked": "asked 1 of 9", "stress_margin_upper_bound": 0.25,
+        "branches": 12, "branch_crashes": 0, "branches_asked": "asked 12 of 13",
+    }  # fmt: skip
+    whole = replace(RESULT, stress=Stress(0.5, moments=9, moments_asked=9))
+    assert TrialRow(whole.to_json()).cells(STRESS) == {
+        "stress_margin": 0.5, "stress_asked": "asked 9 of 9", "stress_margin_upper_bound": None,
+    }  # fmt: skip
+    before = whole.to_json()
+    del before["stress"]["moments"], before["stress"]["moments_asked"]  # which earlier versions did not write
+    assert TrialRow(before).cells(STRESS) == {
+        "stress_margin": 0.5, "stress_asked": None, "stress_margin_upper_bound": None,
+    }  # fmt: skip

@@ -76,6 +76,18 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
         assert (line in captured.get()) is shown
 
 
+def test_margin_that_is_not_fully_asked_is_shown_as_such():
+    found = status(2)
+    brake = Disturbance(80, "ahead", "brake", 2.25, 3.0, "ego")
+    half = Stress(None, 20, 900, 0, brake, "collision", 120, moments=9, moments_asked=1, margin_upper_bound=0.375)
+    shown = replace(found, stressed=replace(found.nearest, stress=half), not_fully_asked=2)
+    console = Console(width=100, height=12, force_terminal=True, color_system=None)
+    with console.capture() as captured:
+        console.print(Watcher(console, TITLE)._screen(shown))
+    assert "least stress margin: at most 0.38 (asked 1 of 9), trial 123" in captured.get()
+    assert "2 trials were not fully asked: copies of them died" in captured.get()
+
+
 def test_kinds_of_crashes_and_when_the_last_new_one_came():
     kind = SimpleNamespace(signature="rear end, the agent into the other", count=2)
     found = replace(status(2), kinds=(kind, kind), newest_kind_s=192.0, newest_kind_trials=1)

@@ -1,0 +1,69 @@
+"""Audits that an earlier run of a hunt did not bring to their end, as it was stopped or killed: made up for.
+
+The recordings are gone by then, so that digests are compared: they tell that a trial differs, and not where.
+"""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import scratch_of
+from crashhunt.hunts._audit import AuditReport, Difference
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.episode import WorkerSettings
+    from crashhunt.hunts._again import RunsAgain
+    from crashhunt.hunts._data import Facts
+    from crashhunt.hunts._ledger import Ledger
+
+__all__ = ["find_audits_left", "finish_audits"]
+
+_FOLDER = "audits"  # of the scratch folder
+
+
+def find_audits_left(ledger: Ledger, before: Facts, settings: WorkerSettings) -> list[int]:
+    """Return the numbers of the trials that earlier runs of a hunt were to run again, and did not.
+
+    Args:
+        ledger: of the hunt.
+        before: its facts, as the earlier runs left them.
+        settings: of the workers; they say which trials belong to the sample.
+    """
+    if settings.audit <= 0.0:
+        return []
+    left = set(before.get("audits_left") or ())
+    if before.get("state") == "running":  # it was killed; what ended after its last heartbeat is not noted
+        since = before.get("heartbeat", 0.0)
+        left |= {result.spec.number for result in ledger.ended_since(since) if settings.is_audited(result)}
+    return sorted(left)
+
+
+def finish_audits(again: RunsAgain, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
+    """Run trials again that are to be audited; return what came of it, and the numbers that are still left.
+
+    Args:
+        again: runs trials of the hunt again. Its ledger gets a remark for each trial that differs.
+        numbers: of the trials.
+    """
+    ledger = again.ledger
+    wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None and result.digest}
+    left, differences = set(wanted), []
+    try:
+        for one in again.run([result.spec for result in wanted.values()], _FOLDER):
+            now, was = one.result, wanted[one.result.spec.number]
+            shutil.rmtree(scratch_of(one.scratch, now.spec.number), ignore_errors=True)
+            if now.was_killed_from_outside:
+                continue
+            left.discard(now.spec.number)
+            if (was.outcome, was.digest) != (now.outcome, now.digest):
+                difference = Difference(now.spec.number, None, "", "the digest", was.digest, now.digest)
+                ledger.remark(f"audit: {difference}")
+                differences.append(difference)
+                again.failed.append(now)
+    except CrashhuntError as error:
+        again.notes.append(f"trials could not be run again for the audit: {error}")
+    return AuditReport(len(wanted) - len(left), tuple(differences), len(left)), sorted(left)

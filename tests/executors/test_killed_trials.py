@@ -1,0 +1,64 @@
+"""A trial whose process is killed from outside, by another process and at chosen steps."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import CRASHES, KILLED, Outcome, TrialSpec
+
+STEPS = 60
+
+
+@pytest.fixture
+def settings(tmp_path):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    ego = AgentSetup(agent="crashhunt.agents:KeepLaneWithSpeed")
+    scenario = Scenario(simulator="toy", folder=tmp_path, agents={"ego": ego})
+    return WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch)
+
+
+def run_and_kill(executor, spec, steps):
+    """Run a trial whose process gets SIGKILL as soon as it has passed each of some steps, once each."""
+    executor.submit(spec)
+    steps, killed = list(steps), set()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        found = list(executor.completed(0.0))
+        if found:
+            return found[0]
+        header = executor.where().get(spec.number)
+        if steps and header is not None and header.step >= steps[0] and header.pid not in killed:
+            killed.add(header.pid)
+            os.kill(header.pid, signal.SIGKILL)
+            steps.pop(0)
+        time.sleep(0.002)
+    raise AssertionError("the trial did not end")
+
+
+@pytest.mark.parametrize("kind", [PoolExecutor, FreshProcessExecutor])
+def test_trial_killed_three_times_at_different_steps_is_invalid_and_no_crash(settings, kind):
+    spec = TrialSpec(4, 7, {"ego": {"speed": 5.0}}, {"step_wall_s": 0.01}, max_steps=STEPS)
+    executor = kind(settings, parallel=1)
+    try:
+        result = run_and_kill(executor, spec, (4, 16, 30))
+        assert result.outcome is Outcome.INVALID
+        assert result.was_killed_from_outside
+        assert (result.failure.kind, result.failure.exit_code) == (KILLED, -signal.SIGKILL)
+        assert result.summary.startswith("killed from outside 3 times, each time at another step (SIGKILL after step ")
+        assert (result.steps, result.digest) == (0, "")
+        notes = executor.notes()
+        assert "trial 4 was ended by SIGKILL from outside, and is run again" in notes
+        # The next trial is not affected, and neither is one that is killed twice only.
+        after = run_and_kill(executor, TrialSpec(5, 7, spec.arguments, spec.scenario_arguments, STEPS), (4, 16))
+        assert (after.outcome, after.steps) == (Outcome.SURVIVED, STEPS)
+        assert not after.was_killed_from_outside
+    finally:
+        executor.close()

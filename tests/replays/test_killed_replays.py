@@ -1,0 +1,155 @@
+"""Replays that are killed from outside say nothing about their crash: neither that it is flaky, nor how to avoid it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.crashes import list_bundles
+from crashhunt.episode import answer_file
+from crashhunt.executors import _snapshot_executor
+from crashhunt.recording import read_header
+from crashhunt.replays import ReplayOptions, confirm, replay
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult
+
+WHY = "killed from outside 3 times, each time at another step (SIGKILL after step 2, …)"
+
+
+def hunted(toy):
+    """One crash, for `made_once`: ego drives into the leader, and braking would have helped."""
+    words = ("--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01", "--seed", "1")
+    toy.crashhunt("run", "h", "1", "1", "300", *words)
+
+
+@pytest.fixture
+def bundle(toy, made_once):
+    made_once(hunted, toy)
+    (found,) = list_bundles(toy.folder / "h")
+    assert found.confirmed
+    assert found.result.escape is not None
+    return found
+
+
+class Killed:
+    """In place of an executor: every trial is killed."""
+
+    def __init__(self, settings):
+        pass
+
+    def submit(self, spec):
+        self.spec = spec
+
+    def completed(self, timeout_s):
+        yield TrialResult(self.spec, Outcome.INVALID, failure=Failure(KILLED, WHY, exit_code=-9))
+
+    def close(self):
+        pass
+
+
+def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, toy):
+    with monkeypatch.context() as patched:
+        patched.setattr(_snapshot_executor, "FreshProcessExecutor", Killed)
+        failed = []
+        found = confirm(replace(bundle, confirmed=None), failed=failed)
+        assert (found.confirmed, found.divergence, failed) == (None, None, [])
+        assert found.why_unconfirmed == f"the replay was {WHY}"
+        assert found.summary()["confirmed"] is None
+        with pytest.raises(CrashhuntError, match="the replay was killed from outside 3 times"):
+            replay(bundle, ReplayOptions())
+    found.write()
+    (read,) = list_bundles(toy.folder / "h")
+    assert (read.confirmed, read.why_unconfirmed) == (None, found.why_unconfirmed)
+    words = ("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01")
+    done = toy.crashhunt(*words, "--seed", "1", "--json")
+    (crash,) = done.json["crashes"]
+    assert crash["confirmed"] is True
+    assert "why_unconfirmed" not in crash
+    (read,) = list_bundles(toy.folder / "h")
+    assert (read.confirmed, read.why_unconfirmed) == (True, "")
+
+
+def test_unknown_escape_is_told_and_searched_again(bundle, toy):
+    unknown = replace(
+        bundle.result, escape=None, why_no_escape="the process that searched was killed by SIGKILL, 2 times"
+    )
+    replace(bundle, result=unknown).write()
+    (read,) = list_bundles(toy.folder / "h")
+    assert not read.is_fully_confirmed
+    said = (
+        "Until when braking would have helped is not known: the process that searched was killed by SIGKILL, 2 times."
+    )
+    assert said in " ".join(toy.crashhunt("show", "h").out.split())
+    words = ("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01")
+    toy.crashhunt(*words, "--seed", "1")
+    (read,) = list_bundles(toy.folder / "h")
+    assert read.is_fully_confirmed
+    assert read.result.escape == bundle.result.escape
+
+
+def kill_replays(folder, is_time):
+    """Start a thread that sends SIGKILL to the process of each replay in a folder once; return what ends it."""
+    over = threading.Event()
+    killed = []
+
+    def watch():
+        while not over.wait(0.002):
+            for box in Path(folder).glob("crashhunt-replay-*/trial-000000/blackbox.bin"):
+                header = read_header(box)
+                if header is not None and header.pid not in killed and is_time(box.parent.parent, header, len(killed)):
+                    killed.append(header.pid)
+                    os.kill(header.pid, signal.SIGKILL)
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+
+    def end():
+        over.set()
+        thread.join()
+        return len(killed)
+
+    return end
+
+
+@pytest.mark.nightly
+def test_replay_killed_at_three_steps_is_run_three_times(bundle, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    end = kill_replays(tmp_path, lambda _scratch, header, before: before < 3 and header.step >= 3 + 8 * before)
+    try:
+        found = confirm(replace(bundle, confirmed=None))
+    finally:
+        count = end()
+    assert (count, found.confirmed) == (3, None)
+    assert found.why_unconfirmed.startswith("the replay was killed from outside 3 times, each time at another step")
+    assert confirm(found).confirmed is True
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kills", [1, 2])
+def test_search_for_the_escape_that_is_killed_is_done_again(bundle, monkeypatch, tmp_path, kills):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def is_time(scratch, header, before):
+        return before < kills and answer_file(scratch, 0).exists()
+
+    end = kill_replays(tmp_path, is_time)
+    began = time.monotonic()
+    try:
+        found = confirm(replace(bundle, confirmed=None))
+    finally:
+        count = end()
+    assert time.monotonic() - began < 60
+    assert (count, found.confirmed) == (kills, True)
+    if kills == 1:
+        assert found.result.escape == bundle.result.escape
+        assert found.is_fully_confirmed
+    else:
+        assert found.result.escape is None
+        assert found.result.why_no_escape == "the process that searched was killed by SIGKILL, 2 times"

@@ -1,0 +1,46 @@
+"""What the end of a hunt says of its probes and branches, and of those that have no answer."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from crashhunt.hunts._branched import BranchReport
+from crashhunt.hunts._probed import ProbeReport
+from crashhunt.report._probes import describe_branches, describe_probes
+
+WHY = "a copy was killed by SIGKILL"
+
+
+def probed(*margins, open_ones=0, run_again=0, not_finished=0):
+    why = WHY if open_ones else ""
+    return SimpleNamespace(
+        probes=ProbeReport(margins, open_ones, why, 62, 2751, 0, run_again, not_finished, (), ()), trial_steps=900
+    )
+
+
+def test_nothing_plausible_made_them_crash_is_said_of_fully_asked_trials_only():
+    assert describe_probes(probed(0.25, 1.0, 1.0, open_ones=2)) == [
+        "Stress margin of 3 trials: least 0.25, median 1.00; nothing plausible made 2 of them crash.",
+        "  2 trials were not fully asked: a copy was killed by SIGKILL",
+        "  copies were asked 62 times, with 2751 steps beside 900 of trials",
+    ]
+    assert describe_probes(probed(open_ones=1))[:2] == [
+        "Stress margin: no trial was fully asked.",
+        "  1 trial was not fully asked: a copy was killed by SIGKILL",
+    ]
+    assert describe_probes(probed()) == []
+    assert probed(0.25, open_ones=2).probes.to_json()["not_fully_asked"] == 2
+    assert probed(0.25, open_ones=2).probes.to_json()["trials"] == 1
+
+
+def test_what_could_not_be_run_from_the_start_is_told_apart_from_what_did_not_crash():
+    line = describe_probes(probed(0.25, run_again=3, not_finished=1))[-1]
+    assert line == (
+        "  of the 3 mildest disturbances with which a trial crashed, 0 made it crash from the start as well, "
+        "and 1 could not be run to the end:"
+    )
+    branched = BranchReport(8, 133, 163, 8163, 28, 13, 5, 1, WHY, 5, 2, ())
+    lines = describe_branches(SimpleNamespace(branches=branched, trial_steps=2400))
+    assert lines[2] == "  1 trial was not fully asked: a copy was killed by SIGKILL"
+    assert lines[3] == "  of the 5 likeliest, 0 crashed from the start as well, and 2 could not be run to the end:"
+    assert branched.to_json()["not_fully_asked"] == 1
