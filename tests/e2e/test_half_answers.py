@@ -16,6 +16,7 @@ from contextlib import closing, contextmanager, suppress
 import pytest
 
 from crashhunt.base.processes import children_of
+from crashhunt.recording import read_header
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
 
@@ -160,3 +161,26 @@ def test_branches_that_are_killed_are_counted_and_asked_again(shell, folder, gap
     assert again["unanswered"] == 0
     assert again["branches"] | {"crashes": []} == undisturbed["branches"] | {"crashes": []}
     assert table(shell, "h") == table(shell, "u")
+
+
+def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_again(shell, folder):
+    words = ("run", "h", *HUNT, "--set", "step_wall_s=0.01")
+    process = shell.start(*words)
+    killed, box = set(), folder / "h" / ".scratch" / "trial-000000" / "blackbox.bin"
+    deadline = time.monotonic() + 60
+    while len(killed) < 3:
+        header = read_header(box)
+        if header is not None and header.step >= 3 + 9 * len(killed) and header.pid not in killed:
+            killed.add(header.pid)
+            os.kill(header.pid, signal.SIGKILL)
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    out, err = process.communicate(timeout=60)
+    report = json.loads(out)
+    assert (report["outcomes"], report["crashes"], report["unanswered"]) == ({"invalid": 1, "survived": 1}, [], 1)
+    assert (
+        "Answers are missing from 1 trial: processes were killed from outside. The same command runs it again." in err
+    )
+    again = shell.crashhunt(*words).json
+    assert (again["outcomes"], again["trials_run"], again["unanswered"]) == ({"survived": 2}, 2, 0)
+    assert shell.crashhunt("check", "h").code == 0
