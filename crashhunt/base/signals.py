@@ -11,12 +11,44 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["stop_requests"]
+__all__ = ["ended_by_signals", "stop_requests"]
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
 """GNU timeout sends its signal to the process and then to its group, and batch systems do the like: what comes twice
 within this is one request, not an impatient person."""
+
+
+class _EndedError(BaseException):
+    """A signal asked this process to end."""
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Have SIGTERM and a hang-up end this process as they do by default, but after everything temporary is removed."""
+    asked: list[int] = []
+
+    def end(number: int, _frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+        asked.append(number)
+        raise _EndedError
+
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    try:
+        heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+        for number in heeded:
+            signal.signal(number, end)
+    except ValueError:  # not in the main thread
+        heeded = []
+    try:
+        yield
+    except _EndedError:
+        pass
+    finally:
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
+        if asked:
+            os.kill(os.getpid(), asked[0])
 
 
 @contextmanager
