@@ -307,7 +307,7 @@ class Worker:
             return
         text = json.dumps([[lane.id, lane.width, lane.shape] for lane in lanes])
         if not path.exists():
-            with whole_file(path, lasting=False) as temporary:
+            with whole_file(path, lasting=False, noted=False) as temporary:
                 temporary.write_text(text, encoding="utf-8")
         elif kept is not None and path.read_text(encoding="utf-8") != text:
             (kept / layout.MAP).write_text(text, encoding="utf-8")

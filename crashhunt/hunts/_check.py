@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.owners import has_ended, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._state import find_hunts, hunt_state, is_hunt
@@ -377,9 +378,12 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         (hunt / layout.CRASHES).glob(".*"),
         *((hunt / place).glob(".*") for place in layout.BESIDE),
         (hunt / layout.SNAPSHOTS).glob(".*"),
-        hunt.glob(".scratch"),
+        hunt.glob(".scratch*"),
     )
     for path in sorted({path for place in places for path in place}):
+        owner = owner_in(path.name)
+        if owner is not None and not has_ended(owner):
+            continue  # shrink is writing it, for example
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
         why = "shrink goes on from it" if remembers else "somebody was killed while writing it"
         what = f"{why}; it may be removed"

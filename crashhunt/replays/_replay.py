@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import Recording, read_black_box
@@ -87,8 +86,7 @@ class _StoppedError(Exception):
 
 
 def _run(rerun: Rerun, stopped: Callable[[], bool] = lambda: False) -> ReplayReport:
-    with tempfile.TemporaryDirectory(prefix="crashhunt-replay-") as folder:
-        scratch = Path(folder)
+    with temporary_folder("replay") as scratch:
         executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
         try:
             executor.submit(rerun.spec)

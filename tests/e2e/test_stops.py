@@ -81,8 +81,7 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
 def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
     words = ("run", "h", "1", "2", "40", *FINE, *SLOW, "--json")
     process = toy.start(*words)
-    box = toy.folder / "h" / ".scratch" / "trial-000000" / "blackbox.bin"
-    wait_for(box.exists)
+    wait_for(lambda: [*(toy.folder / "h").glob(".scratch-*/trial-000000/blackbox.bin")])
     wait_for(lambda: len(tree(process.pid)) == 4)
     os.kill(tree(process.pid)[-1], number)  # hunt, keeper, template, worker
     out, err = process.communicate(timeout=90)
