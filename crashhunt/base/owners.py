@@ -23,6 +23,7 @@ from pathlib import Path
 __all__ = ["Owner", "has_ended", "owner_in", "start_time", "this_process"]
 
 _BOOT_ID = "/proc/sys/kernel/random/boot_id"
+_NAMESPACES = "/proc/self/ns"  # of PIDs since Linux 3.8, of times since 5.6
 _BOOT_DIGITS = 12
 _UNKNOWN_BOOT = "0" * _BOOT_DIGITS  # where there is no /proc: such an owner counts as alive
 _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9a-f]{8})(?![0-9a-f])")
@@ -59,13 +60,21 @@ def this_process() -> Owner:
 def _owner(pid: int) -> Owner:
     try:
         boot = Path(_BOOT_ID).read_text(encoding="ascii").replace("-", "")[:_BOOT_DIGITS]
-        names = [os.readlink(f"/proc/self/ns/{kind}") for kind in ("pid", "time")]  # noqa: PTH115 - it is no path
+        names = [_namespace(kind) for kind in ("pid", "time")]
     except (OSError, UnicodeError):
         return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
     started = start_time(pid)
     if started <= 0 or len(boot) < _BOOT_DIGITS:
         return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
     return Owner(pid, started, boot, f"{zlib.crc32(' '.join(names).encode()):08x}")
+
+
+def _namespace(kind: str) -> str:
+    """Return what names a namespace of this process; nothing where the kernel is too old to have any of that kind."""
+    try:
+        return str(Path(_NAMESPACES, kind).readlink())
+    except FileNotFoundError:
+        return ""
 
 
 def owner_in(name: str) -> Owner | None:

@@ -220,9 +220,8 @@ def test_what_another_host_boot_or_container_has_stays(place, field):
 
 def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place, monkeypatch):
     here = this_process()
-    monkeypatch.setattr(owners, "_BOOT_ID", "/nowhere")
-    owners._owner.cache_clear()
-    try:
+    with monkeypatch.context() as patched, fresh():
+        patched.setattr(owners, "_BOOT_ID", "/nowhere")
         assert this_process().boot == "0" * 12
         folder = owned(place, Owner(here.pid, 1, here.boot, here.namespace))
         unknown = owned(place, Owner(here.pid + 1, 0, "0" * 12, "0" * 8))
@@ -232,6 +231,15 @@ def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place
         with temporary_folder("replay") as mine:
             assert mine.is_dir()
         assert not mine.parent.exists()
+    assert this_process() == here
+
+
+@contextmanager
+def fresh():
+    """Nothing is remembered of this process, before and after."""
+    owners._owner.cache_clear()
+    try:
+        yield
     finally:
         owners._owner.cache_clear()
 
@@ -324,6 +332,18 @@ def test_names_that_only_look_like_leftovers_stay(tmp_path):
         (tmp_path / name).mkdir()
     remove_ended(tmp_path)
     assert everything(tmp_path) == {"temporary files", *stay}
+
+
+def test_a_kernel_without_time_namespaces_has_owners_too(tmp_path, monkeypatch):
+    before = this_process()
+    (tmp_path / "pid").symlink_to(os.readlink("/proc/self/ns/pid"))  # noqa: PTH115 - it is no path
+    with monkeypatch.context() as patched, fresh():
+        patched.setattr(owners, "_NAMESPACES", str(tmp_path))
+        here = this_process()
+        assert (here.pid, here.started, here.boot) == (before.pid, before.started, before.boot)
+        assert here.namespace not in (before.namespace, "0" * 8)
+        assert has_ended(Owner(here.pid, here.started - 1, here.boot, here.namespace))
+    assert this_process() == before
 
 
 def test_a_zombie_has_ended():

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ from conftest import keeps_going, mostly_nightly
 from test_bisect import git
 from test_corpus import DRIVER, MENDED
 
-from crashhunt.base.owners import owner_in
+from crashhunt.base.owners import owner_in, start_time
 from crashhunt.base.temporary import remove_leftovers, remove_tree
 from crashhunt.corpus import _bisect
 from crashhunt.errors import HuntDirectoryError
@@ -211,10 +212,12 @@ def test_rerun_to_that_was_killed_before_it_ran_goes_on(damaged, monkeypatch):
             patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
             with pytest.raises(HuntDirectoryError, match=says):
                 again()
-        patched.setattr(_rerun, "hunt_state", lambda _: SimpleNamespace(state="finished"))
-        ran.clear()
-        again()
-        assert not ran
+        for state, resumes in (("finished", False), ("crashed", False), ("killed", True), ("interrupted", True)):
+            patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
+            ran.clear()
+            again()
+            assert bool(ran) == resumes, state
+    ran.clear()
     shutil.rmtree(to)
     to.mkdir()
     again()  # into one that is empty
@@ -249,7 +252,15 @@ def test_a_rerun_that_was_killed_while_it_sets_a_hunt_aside_loses_nothing(damage
         shutil.copytree(copy, hunt)
     assert step > 5
     assert (content(aside), [*content(hunt)]) == (before, ["request.json"])
-    # What was set aside before is not a plan of this one.
+    # A hunt that was set aside before it began is no plan of this one.
+    shutil.rmtree(aside)
+    aside.mkdir()
+    _processes.write_request(aside, replace(request, folder="/elsewhere"))
+    assert _processes.set_aside(hunt, lambda _: request).name == "h.replaced-1"
+    shutil.rmtree(hunt)
+    hunt.with_name("h.replaced-1").rename(hunt)
+    shutil.rmtree(aside)
+    shutil.copytree(copy, aside)
     shutil.copytree(copy, hunt, dirs_exist_ok=True)
     assert _processes.set_aside(hunt, lambda _: request).name == "h.replaced-1"
 
@@ -335,6 +346,19 @@ def test_bisect_that_was_killed_leaves_no_work_tree(tmp_path, monkeypatch, every
     assert [path.name for path in (tmp_path / ".git" / "worktrees").iterdir()] == ["mine"]
     assert bisected().subject == "1"
     shutil.rmtree(tmp_path.with_name("mine"))
+
+
+def test_what_bisect_runs_ends_with_it(tmp_path):
+    said = tmp_path / "pid"
+    pid = os.fork()
+    if pid == 0:
+        with suppress(BaseException):
+            _bisect._ran(["sh", "-c", f"echo $$ > '{said}'; exec sleep 60"], None, os.environ)
+        os._exit(0)
+    wait_for(lambda: said.exists() and said.read_text())
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    wait_for(lambda: start_time(int(said.read_text())) == 0)
 
 
 def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once, temporary_files):
