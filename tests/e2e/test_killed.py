@@ -25,11 +25,13 @@ from conftest import keeps_going, mostly_nightly
 from test_bisect import git
 from test_corpus import DRIVER, MENDED
 
-from crashhunt.base.owners import owner_in, start_time
+from crashhunt.base.owners import Owner, owner_in, start_time, this_process
 from crashhunt.base.temporary import remove_leftovers, remove_tree
 from crashhunt.corpus import _bisect
+from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import check, hunt_state, salvage
+from crashhunt.hunts import Hunt, check, hunt_state, salvage
+from crashhunt.plans import Request, plan
 from crashhunt.suites import _processes, _rerun
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
@@ -395,10 +397,13 @@ class Leaves(KeepLaneWithSpeed):
 def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(toy, temporary_files):
     (toy.folder / "leaves.py").write_text(LEAVES_MEMORY)
     toy.environment["TMPDIR"] = str(temporary_files)
-    words = ("run", "h", "2", "5", "40", "--scenario", "toy", "--agent", "leaves:Leaves", "--arg", "speed=5", "--set",
+    words = ("run", "h", "2", "8", "40", "--scenario", "toy", "--agent", "leaves:Leaves", "--arg", "speed=5", "--set",
              "step_wall_s=0.01", "--seed", "1")  # fmt: skip
     process = toy.start(*words)
     wait_for(lambda: rows(toy.folder / "h"))
+    created = toy.folder / "created.txt"
+    wait_for(lambda: not all(Path("/dev/shm", name).exists() for name in created.read_text().split()))
+    assert process.poll() is None  # what a trial left does not stay until the end of a long hunt
     wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")])
     process.kill()
     process.communicate(timeout=60)
@@ -406,14 +411,58 @@ def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(t
     assert len([*toy.folder.glob("h/.scratch-*")]) == 1
     toy.crashhunt("oracles")
     assert left_in(toy.folder) == []
-    created = (toy.folder / "created.txt").read_text().split()
-    assert not [name for name in created if Path("/dev/shm", name).exists()]
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
     toy.crashhunt(*words)
-    assert sorted(rows(toy.folder / "h")) == [*range(5)]
-    created = (toy.folder / "created.txt").read_text().split()
-    assert len(created) >= 5
-    assert not [name for name in created if Path("/dev/shm", name).exists()]
+    assert sorted(rows(toy.folder / "h")) == [*range(8)]
+    assert len(created.read_text().split()) >= 8
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
     assert left_in(toy.folder) == []
+
+
+def leftover(folder: Path, start: str, *, alive: bool = False, boot: str = "") -> Path:
+    """Make a folder with the name of something temporary, of this process or of one that has ended."""
+    here = this_process()
+    made = folder / f"{start}{Owner(here.pid, here.started - (not alive), boot or here.boot, here.namespace).token}"
+    made.mkdir(parents=True)
+    return made
+
+
+def test_what_no_link_leads_to_goes_where_it_lies(toy, made_once, monkeypatch):
+    """As after a reboot, or where the folder for temporary files was another one."""
+    made_once(keeps_going, toy)
+    monkeypatch.chdir(toy.folder)
+    hunt, corpus = toy.folder / "h", toy.folder / "kept"
+    (hunt / ".scratch").mkdir()  # of an earlier version
+    before = [leftover(hunt, ".scratch-"), leftover(hunt, ".scratch-", boot="0123456789ab"), hunt / ".scratch",
+              leftover(hunt / "crashes", ".000000-hang."), leftover(hunt / "probes", ".000001-hang."),
+              leftover(hunt / "snapshots", ".building-"), leftover(corpus, ".case.")]  # fmt: skip
+    stay = [leftover(hunt / "crashes", ".000000-hang.", alive=True), leftover(corpus, ".case.", alive=True),
+            leftover(hunt / "snapshots", ".building-", boot="0123456789ab")]  # fmt: skip
+    (found,) = check(hunt)
+    said = {finding.where for finding in found.findings}
+    assert {str(path) for path in before[:4]} <= said
+    assert str(stay[0]) not in said  # shrink may be writing it
+    toy.crashhunt("run", "h", "2", "25", "99", "--scenario", "toy", "--seed", "4", "--keep-going")
+    toy.crashhunt("corpus", "add", str(min((hunt / "crashes").glob("[!.]*"))), "--to", "kept")
+    assert [path for path in before if path.exists()] == []
+    assert [path for path in stay if not path.exists()] == []
+
+
+def test_a_hunt_that_is_stopped_while_it_confirms_is_resumed_by_a_rerun(toy, monkeypatch):
+    monkeypatch.chdir(toy.folder)
+    scenario, settings = plan(Request(scenario="toy", trials=3, max_steps=60, arguments={"speed": "14"}))
+    asked = []
+
+    def stop(status):
+        if status.phase == "confirming" and not asked:
+            asked.append(os.kill(os.getpid(), signal.SIGTERM))
+
+    report = Hunt(toy.folder / "h", scenario, settings).run(stop)
+    assert [crash.confirmed for crash in report.crashes] == [None]
+    assert hunt_state(toy.folder / "h").state == "interrupted"
+    (state,) = toy.crashhunt("rerun", "h", "--json").json["hunts"]
+    assert state["state"] == "crashed"
+    assert [bundle.confirmed for bundle in list_bundles(toy.folder / "h")] == [True]
 
 
 SUITE = """
