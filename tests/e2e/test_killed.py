@@ -30,7 +30,7 @@ from crashhunt.base.temporary import remove_leftovers, remove_tree
 from crashhunt.corpus import _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Hunt, check, hunt_state, salvage
+from crashhunt.hunts import Hunt, Ledger, check, hunt_state, salvage
 from crashhunt.plans import Request, plan
 from crashhunt.suites import _processes, _rerun
 
@@ -171,6 +171,12 @@ def test_salvage_refuses_a_directory_with_anything_else(damaged):
         salvage(found, to)
     (damaged.folder / "elsewhere").rename(to / "crashes" / found.crashes[0])
     assert salvage(found, to) == saved
+    resumed = damaged.folder / "resumed"
+    shutil.copytree(to, resumed)
+    with closing(Ledger(resumed / "ledger.sqlite", writable=True)) as ledger:
+        ledger.enter("all_trials")
+    with pytest.raises(HuntDirectoryError, match="it is there already"):
+        salvage(found, resumed)
     with closing(sqlite3.connect(to / "ledger.sqlite")) as database, database:
         database.execute("DELETE FROM trials WHERE number = (SELECT MAX(number) FROM trials)")
     for name in ("file", "folder"):
