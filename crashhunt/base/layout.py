@@ -107,7 +107,7 @@ SMALL: Final = ".small"
 SHOWN: Final = "[!.]*"
 """The glob pattern of what is whole."""
 BUILDING: Final = ".building-"
-"""What the name of a snapshot begins with that is being made."""
+"""What the name of a snapshot begins with that is being made; its owner follows."""
 REPLACED: Final = ".replaced-"
 """What stands in the name of a hunt that another one has taken the place of."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["describe_death", "is_sent_from_outside", "stop_requests"]
+__all__ = ["describe_death", "ended_by_signals", "is_sent_from_outside", "stop_requests"]
 
 _SENT_FROM_OUTSIDE: Final = frozenset(
     {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
@@ -22,6 +22,38 @@ _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
 """GNU timeout sends its signal to the process and then to its group, and batch systems do the like: what comes twice
 within this is one request, not an impatient person."""
+
+
+class _EndedError(BaseException):
+    """A signal asked this process to end."""
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Have SIGTERM and a hang-up end this process as they do by default, but after everything temporary is removed."""
+    asked: list[int] = []
+
+    def end(number: int, _frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+        asked.append(number)
+        raise _EndedError
+
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    try:
+        heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+        for number in heeded:
+            signal.signal(number, end)
+    except ValueError:  # not in the main thread
+        heeded = []
+    try:
+        yield
+    except _EndedError:
+        pass
+    finally:
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
+        if asked:
+            os.kill(os.getpid(), asked[0])
 
 
 @contextmanager

@@ -13,6 +13,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
+from crashhunt.base.signals import ended_by_signals
+from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
 from crashhunt.cli._bisect import add_bisect
@@ -84,7 +86,9 @@ def _run(words: Sequence[str]) -> int:
         parser = make_parser()
         complete(parser)
         options = parser.parse_args(words)
-        code: int = options.command(options, words)
+        remove_leftovers()
+        with ended_by_signals():
+            code: int = options.command(options, words)
     except CrashhuntError as error:
         return _report(error, as_json="--json" in words)
     except SystemExit as leaving:  # of --help and --version

@@ -34,7 +34,7 @@ def add_check(commands: Commands) -> None:
     check.add_argument(
         "--salvage", metavar="TO", type=Path,
         help="copy what is whole of a hunt into this new directory, where the same hunt goes on; what is damaged is "
-        "left out, and its trials run again",
+        "left out, and its trials run again. Where the same command was killed, run it again",
     )  # fmt: skip
     add_json(check)
     check.set_defaults(command=_check)

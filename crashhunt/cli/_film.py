@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.cli._common import integer, number
 from crashhunt.cli._progress import shown_progress
 from crashhunt.trial import Outcome
@@ -97,7 +97,7 @@ def filmed(
     if film is None or not film.panels:
         yield chosen
         return
-    with tempfile.TemporaryDirectory(prefix="crashhunt-panels-") as folder:
+    with temporary_folder("panels") as folder:
         from crashhunt.crashes import most_dangerous
         from crashhunt.render import shown_steps
 
@@ -107,7 +107,7 @@ def filmed(
             near = most_dangerous(recording) if bundle.is_near_miss else None
             first = max(0, shown_steps(recording, film.last_s, near.step if near is not None else -1)[0] - 1)
         look = chosen.look or look_at_all(bundle, to_stderr=to_stderr)
-        yield replace(chosen, look=look and replace(look, panels=(first, Path(folder))))
+        yield replace(chosen, look=look and replace(look, panels=(first, folder)))
 
 
 def replayed_shot(report: ReplayReport, chosen: ReplayOptions) -> Shot:

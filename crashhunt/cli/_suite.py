@@ -68,7 +68,13 @@ def add_rerun(commands: Commands) -> None:
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
                        help="with --to or --all: another specification for an argument (ID.NAME for one of several "
                        "agents), or for trials, max_steps or seed")  # fmt: skip
-    rerun.add_argument("--to", metavar="DIR", type=Path, help="leave DIR as it is, and run there")
+    rerun.add_argument(
+        "--to",
+        metavar="DIR",
+        type=Path,
+        help="leave DIR as it is, and run there: a new directory, or one in which the "
+        "same command was interrupted or killed",
+    )
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
                        help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
     add_options_of_machine(rerun)

@@ -7,19 +7,22 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import environment_of_git
+from crashhunt.base.owners import this_process
+from crashhunt.base.processes import die_with
+from crashhunt.base.temporary import temporary_beside, temporary_folder
 from crashhunt.corpus._store import add_case
 from crashhunt.plans import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from crashhunt.corpus._run import Got
     from crashhunt.crashes import Bundle
@@ -98,8 +101,10 @@ def bisect(
         if not agent.agent.startswith("crashhunt.")
     }
     tried: dict[str, Got] = {}
-    with tempfile.TemporaryDirectory(prefix="crashhunt-bisect-") as name:
-        tree, case = Path(name).resolve() / "tree", add_case(bundle, Path(name) / "corpus").case.path.resolve()
+    token = f"crashhunt-{this_process().token}"  # git gives the name of the work tree to what it writes about it
+    known = Path(top, _git(top, "rev-parse", "--git-common-dir"), "worktrees", token)
+    with temporary_folder("bisect") as scratch, temporary_beside(known, name=token):
+        tree, case = scratch.resolve() / token, add_case(bundle, scratch / "corpus").case.path.resolve()
         _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
         try:
 
@@ -144,7 +149,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
     environment = _environment(folder, tree)
     for module in sorted(modules):
         place = [sys.executable, "-c", _ORIGIN, module]
-        found = subprocess.run(place, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        found = _ran(place, folder, environment)
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):
             raise UsageError(
@@ -154,12 +159,22 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> Got:
         if found.returncode != 0:
             return "cannot_run"
     command = [sys.executable, "-m", "crashhunt", "corpus", "run", str(case), "--json"]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    done = _ran(command, folder, environment)
     try:
         got: Got = json.loads(done.stdout)["cases"][0]["got"]
     except (ValueError, KeyError, IndexError):
         raise CrashhuntError(f"the case could not be run: {done.stderr.strip()[-300:]}", fix="see why") from None
     return got
+
+
+def _ran(
+    command: Sequence[str], folder: Path | None, environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, and return what it printed; where this process is killed, it is killed too."""
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False,
+        preexec_fn=partial(die_with, os.getpid()),
+    )  # fmt: skip
 
 
 def _environment(folder: Path, tree: Path) -> dict[str, str]:
@@ -173,7 +188,7 @@ def _git(folder: Path, *words: str, what: str = "", skipped: bool = False) -> st
     command: Sequence[str] = ["git", "-C", str(folder), *words]
     try:
         environment = {**environment_of_git(), "LC_ALL": "C"}
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+        done = _ran(command, None, environment)
     except OSError as error:
         raise CrashhuntError(f"git cannot be run: {error.strerror}", fix="install git") from None
     if done.returncode and not skipped:

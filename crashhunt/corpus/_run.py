@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import in_lines, one_line
 from crashhunt.corpus._case import Case, Expectation, read_case
 from crashhunt.crashes import Bundle, write_bundle
@@ -180,8 +180,8 @@ class _Running:
     def __init__(self, case: Case, bundle: Bundle, settings: HuntSettings, snapshot: Snapshot) -> None:
         self._case, self._bundle, self._settings = case, bundle, settings
         self._warnings = _warnings(snapshot)
-        self._folder = tempfile.TemporaryDirectory(prefix="crashhunt-corpus-")
-        self._scratch = Path(self._folder.name)
+        self._folder = TemporaryFolder("corpus")
+        self._scratch = self._folder.path
         self._scenario = with_settings(snapshot.scenario(), settings)
         self._executor = FreshProcessExecutor(
             WorkerSettings(
@@ -210,7 +210,7 @@ class _Running:
     def close(self) -> None:
         """End it, and leave nothing behind; may be called twice."""
         self._executor.close()
-        self._folder.cleanup()
+        self._folder.remove()
 
     def _report(self, result: TrialResult, keep: Path | None) -> CaseReport:
         case = self._case

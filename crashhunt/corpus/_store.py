@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree
+from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.corpus._case import Case, read_case
 from crashhunt.recording import write_log
 from crashhunt.snapshots import Snapshot, without_code
@@ -58,24 +58,24 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
     if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
         raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
     name = f"{_id(bundle)}-{bundle.result.digest[:6]}"
-    final, building = corpus / name, corpus / f".{name}.{os.getpid()}.part"
+    final = corpus / name
     try:
         corpus.mkdir(parents=True, exist_ok=True)
+        remove_ended(corpus)
         if not final.exists():
             case = Case(final, expect or "still", note or "", bundle.result.summary, dict(_signature(bundle)))
-            _build(bundle, case, building)
-            try:
-                building.rename(final)
-                sync_folder(corpus)
-                return Added(case, new=True)
-            except OSError:
-                if not (final / layout.CASE).is_file():  # else somebody else has added the same meanwhile
-                    raise
+            with temporary_beside(final) as building:
+                _build(bundle, case, building)
+                try:
+                    building.rename(final)
+                    sync_folder(corpus)
+                    return Added(case, new=True)
+                except OSError:
+                    if not (final / layout.CASE).is_file():  # else somebody else has added the same meanwhile
+                        raise
         return Added(read_case(final).expecting(expect, note), new=False)
     except OSError as error:
         raise cannot_write(corpus, error) from error
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
 
 
 def _signature(bundle: Bundle) -> dict[str, str | bool]:

@@ -8,7 +8,6 @@ import json
 import os
 import socket
 import stat
-import tempfile
 import time
 import zipfile
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.watching import watched
 from crashhunt.crashes._data import ArchiveIndex
 from crashhunt.crashes._trust import is_made_here, signature
@@ -109,8 +109,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
     Raises:
         BundleError: it is not one, or it has something that it should not have.
     """
-    with tempfile.TemporaryDirectory(prefix="crashhunt-archive-") as name:
-        directory = Path(name)
+    with temporary_folder("archive") as directory:
         try:
             with zipfile.ZipFile(path) as archive:
                 index = _read_index(archive, path)

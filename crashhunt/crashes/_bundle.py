@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
-from crashhunt.base.files import sync_folder, sync_tree, whole_file
+from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import changed_file, digest_of_data, read_object, typed
+from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
 from crashhunt.crashes._beside import collect_output, files_beside, see_that_it_is_whole
 from crashhunt.crashes._data import CrashData, Protected
@@ -369,22 +370,21 @@ def write_bundle(
     from crashhunt.recording import foxglove_layout, write_log
 
     name = name or layout.crash_folder(result.spec.number, result.outcome)
-    final, building = directory / place / name, directory / place / f".{name}.part"
-    shutil.rmtree(building, ignore_errors=True)
-    building.mkdir(parents=True)
+    final = directory / place / name
     recording = Recording(read_black_box(scratch / layout.BLACK_BOX))
     crash = result if result.outcome.category != "no crash" else None
     metadata = {"trial": str(result.spec.number), "seed": str(result.spec.seed), "outcome": str(result.outcome)}
-    write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=crash)
     view = json.dumps(foxglove_layout(recording), indent=1)
-    (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
-    collect_output(result, scratch, building)
-    bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
-    bundle.write(into=building)
-    sync_tree(building)
-    shutil.rmtree(final, ignore_errors=True)
-    building.rename(final)
-    sync_folder(final.parent, directory)
+    with temporary_beside(final) as building:
+        building.mkdir(parents=True)
+        write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=crash)
+        (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
+        collect_output(result, scratch, building)
+        bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
+        bundle.write(into=building)
+        sync_tree(building)
+        put_in_place(building, final)
+        sync_folder(final.parent, directory)
     shutil.rmtree(scratch, ignore_errors=True)
     return bundle
 

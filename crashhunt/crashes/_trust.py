@@ -6,10 +6,12 @@ import hmac
 import json
 import os
 import secrets
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.temporary import temporary_beside
 
 if TYPE_CHECKING:
     from crashhunt.crashes._data import ArchiveIndex
@@ -43,15 +45,13 @@ def _key() -> bytes:
         pass  # none yet, or it may not be read
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_name(f".{file.name}.{os.getpid()}")
-        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
-            opened.write(key)
-            opened.flush()
-            os.fsync(opened.fileno())
-        try:
-            os.link(temporary, file)  # the first of two wins
-        finally:
-            temporary.unlink()
+        with temporary_beside(file) as temporary:
+            with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+                opened.write(key)
+                opened.flush()
+                os.fsync(opened.fileno())
+            with suppress(FileExistsError):  # the first of two wins
+                os.link(temporary, file)
         return file.read_bytes()
     except OSError:
         return key  # nowhere to keep it: every archive is a stranger's

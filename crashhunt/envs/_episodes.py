@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections import deque
-from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import SimulatorError, UsageError
 from crashhunt.base.names import one_of
+from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.plans import disturber
@@ -21,6 +20,7 @@ from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     import numpy as np
     from gymnasium import Space
@@ -70,8 +70,8 @@ class Episodes:
             chosen = with_action(chosen, self.agent, action)
         self._arguments = argument_values(chosen)
         self._disturber = _disturber(chosen, self.agent, disturb, max_steps)
-        self._stage = tempfile.TemporaryDirectory(prefix="crashhunt-")
-        self._simulator = SumoSimulator(chosen, Path(self._stage.name))
+        self._stage = TemporaryFolder("environment")
+        self._simulator = SumoSimulator(chosen, self._stage.path)
         self._form = self._simulator.actions[self.agent]
         self._max_steps = max_steps
         self._oracles = (ReportedCollision(), Overlap(), OffRoad())
@@ -155,7 +155,7 @@ class Episodes:
         if self._episode is not None:
             self._episode.close()
         self._simulator.close()
-        self._stage.cleanup()
+        self._stage.remove()
 
 
 class _Trail(Observer):

@@ -14,6 +14,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
+from crashhunt.base.shared_memory import record_shared_memory
 from crashhunt.episode._run import seed_everything
 from crashhunt.oracles import parse_oracle
 from crashhunt.simulators import FlattensObservations
@@ -59,6 +60,7 @@ class Parts:
         Raises:
             CrashhuntError: something cannot be imported.
         """
+        record_shared_memory(self._settings.scratch)
         # Whatever modules draw when they are imported is the same in every process.
         seed_everything(0)
         scenario = self._settings.scenario

@@ -183,7 +183,7 @@ class Supervisor:
             return
         path = self._settings.scratch / layout.MAP
         if not path.exists():
-            with whole_file(path, lasting=False) as temporary:
+            with whole_file(path, lasting=False, noted=False) as temporary:
                 temporary.write_text(text, encoding="utf-8")
         elif kept is not None and path.read_text(encoding="utf-8") != text:
             (kept / layout.MAP).write_text(text, encoding="utf-8")

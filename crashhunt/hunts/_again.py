@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.temporary import remove_scratch
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, read_map, snapshot_executor
@@ -83,7 +83,7 @@ class RunsAgain:
                             waiting -= 1
                             yield Again(result, self, digest, scratch, folder)
             finally:
-                shutil.rmtree(scratch, ignore_errors=True)
+                remove_scratch(scratch)
 
     def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
         """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""

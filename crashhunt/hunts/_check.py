@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.owners import has_ended, owner_in
 from crashhunt.crashes import Bundle, read_bundle, read_params
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._state import find_hunts, hunt_state, is_hunt
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Checked", "CheckedData", "Finding", "FindingData", "check", "intact_snapshots"]
 
 _SHOWN = 5
+_SCRATCH = ".scratch"  # of a hunt, which does not run where its leftovers are looked for
 
 
 class FindingData(TypedDict):
@@ -377,9 +379,12 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         (hunt / layout.CRASHES).glob(".*"),
         *((hunt / place).glob(".*") for place in layout.BESIDE),
         (hunt / layout.SNAPSHOTS).glob(".*"),
-        hunt.glob(".scratch"),
+        hunt.glob(f"{_SCRATCH}*"),
     )
     for path in sorted({path for place in places for path in place}):
+        owner = owner_in(path.name)
+        if owner is not None and not has_ended(owner) and not path.name.startswith(_SCRATCH):
+            continue  # shrink may be writing it, here or on another host
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
         why = "shrink goes on from it" if remembers else "somebody was killed while writing it"
         what = f"{why}; it may be removed"

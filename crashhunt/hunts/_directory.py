@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, HuntDirectoryError
+from crashhunt.base.owners import this_process
+from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside
 from crashhunt.hunts._state import is_hunt
 from crashhunt.plans import HuntSettings, read_settings, write_settings
 
@@ -32,7 +34,8 @@ _OWN = (
     "ledger.sqlite-shm",
     layout.HUNT,
 )
-_BEFORE = (".lock", ".scratch", ".hunt.")  # what may be there before: of a hunt that could not begin
+_SCRATCH = ".scratch"
+_BEFORE = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
 
 
 class HuntDirectory:
@@ -47,8 +50,11 @@ class HuntDirectory:
 
     @property
     def scratch(self) -> Path:
-        """Where running trials write, wherever their process goes meanwhile."""
-        return self.path.absolute() / ".scratch"
+        """Where running trials write, wherever their process goes meanwhile.
+
+        A hunt that resumes has another folder: processes of one that was killed may still be writing for a moment.
+        """
+        return self.path.absolute() / f"{_SCRATCH}-{this_process().token}"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -78,7 +84,8 @@ class HuntDirectory:
             lock.truncate(0)
             lock.write(str(os.getpid()))
             lock.flush()
-            yield
+            with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
+                yield
 
     def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
         """Make the directory this hunt's, or see that it is already; return the settings that hold.
@@ -112,7 +119,10 @@ class HuntDirectory:
                     fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
                     where=str(self.path),
                 )
-        shutil.rmtree(self.scratch, ignore_errors=True)
+        for left in self.path.glob(f"{_SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
+            remove_scratch(left)
+        for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
+            remove_ended(folder)
         try:
             self.scratch.mkdir()
             write_settings(file, settings, command)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.temporary import remove_at_once
 from crashhunt.replays import confirm
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class FromTheStart:
         place, kept = self.again.place.path / folder, self.kept.get(folder, {})
         stay = {bundle.path.name for bundle in kept.values()}
         for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
-            shutil.rmtree(path, ignore_errors=True)
+            remove_at_once(path)
         crashed, unanswered = self._run([one for one in found if one.spec.number not in kept], folder)
         crashed = kept | crashed
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
@@ -117,7 +117,7 @@ class FromTheStart:
             unanswered.add(bundle.result.spec.number)
         if found is None or not found.confirmed:
             self.again.failed.append(bundle.result)  # nothing has come of this run either
-            shutil.rmtree(bundle.path, ignore_errors=True)
+            remove_at_once(bundle.path)
             return None
         found.write()
         return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -10,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
+from crashhunt.base.shared_memory import release_shared_memory
 from crashhunt.base.signals import stop_requests
+from crashhunt.base.temporary import remove_scratch
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
@@ -124,11 +125,11 @@ class Hunt:
                 with suppress(CrashhuntError):
                     ledger.note(owner=None, heartbeat=time.time())
                 ledger.close()
-                shutil.rmtree(self._place.scratch, ignore_errors=True)
+                remove_scratch(self._place.scratch)  # while requests to stop are only collected
 
     def _fail(self, ledger: Ledger, why: str) -> None:
         """Write down why the hunt ends, where that can still be written."""
-        shutil.rmtree(self._place.scratch, ignore_errors=True)  # on a disk that is full, this makes room for a line
+        remove_scratch(self._place.scratch)  # on a disk that is full, this makes room for a line
         with suppress(CrashhuntError):
             ledger.enter("error", encodable(why))
 
@@ -210,7 +211,8 @@ class Hunt:
         self._see_to(ledger, progress)
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
         reason = why_invalid(invalid, self.scenario) if invalid is not None else ""
-        ledger.enter(stopped, reason, **progress.noted())
+        # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
+        ledger.enter("interrupted" if self._stops else stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         return HuntReport(
             self.directory,
@@ -286,6 +288,7 @@ class Hunt:
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
                     self._see_to(ledger, progress)
+                    release_shared_memory(self._place.scratch, of_ended=True)
                     give_up_surplus(ledger, progress, run)
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))

@@ -6,11 +6,11 @@ then, a hunt of before can be asked for them, and what is kept is known to happe
 
 from __future__ import annotations
 
-import shutil
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.temporary import remove_at_once
 from crashhunt.crashes import list_near_misses
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def keep_near_misses(again: RunsAgain) -> tuple[Bundle, ...]:
         if result is not None and result.digest == bundle.result.digest:
             del wanted[bundle.result.spec.number]
         else:
-            shutil.rmtree(bundle.path)
+            remove_at_once(bundle.path)
     try:
         for one in again.run([result.spec for result in wanted.values()], layout.NEAR_MISSES):
             now, was = one.result, wanted[one.result.spec.number]

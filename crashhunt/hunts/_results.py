@@ -14,6 +14,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.names import one_of
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import Bundle, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._ledger import Ledger, has_begun
@@ -185,14 +186,12 @@ class HuntResults:
         Raises:
             UsageError: there is no such vehicle or trial.
         """
-        import tempfile
-
         arguments = self.trial(trial).spec.arguments
         name = agent or next(iter(arguments))
         if name not in arguments:
             raise UsageError(f"there is no controlled vehicle {name!r}", fix=one_of(name, arguments))
-        with tempfile.TemporaryDirectory(prefix="crashhunt-") as folder:
-            settings = WorkerSettings(scenario=self.scenario, oracles=(), crash_on=(), scratch=Path(folder))
+        with temporary_folder("agent") as scratch:
+            settings = WorkerSettings(scenario=self.scenario, oracles=(), crash_on=(), scratch=scratch)
             parts = Parts(settings)
             return parts.agent(name, parts.simulator(), arguments[name])
 

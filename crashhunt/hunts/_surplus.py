@@ -5,13 +5,13 @@ The ledger is told first, for good, so that a bundle that is not there has eithe
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from contextlib import closing, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.temporary import remove_at_once
 from crashhunt.hunts._ledger import Ledger
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ def give_up_surplus(ledger: Ledger, progress: Progress, run: RunSettings) -> Non
         return
     ledger.note(dropped=progress.kinds.dropped)
     for bundle in surplus:
-        hidden = bundle.path.with_name(f".{bundle.id}")
-        bundle.path.rename(hidden)  # at once: half a bundle would be a damaged one
-        shutil.rmtree(hidden, ignore_errors=True)
+        remove_at_once(bundle.path)  # half a bundle would be a damaged one
     gone = {bundle.id for bundle in surplus}
     progress.crashes = [bundle for bundle in progress.crashes if bundle.id not in gone]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import json
 from itertools import islice
-from tempfile import NamedTemporaryFile
 from typing import IO, TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import whole_file
+from crashhunt.base.temporary import temporary_beside, temporary_name
 from crashhunt.trial import EVENTS
 
 if TYPE_CHECKING:
@@ -66,11 +66,12 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
     schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
     with (
         whole_file(path) as temporary,
-        NamedTemporaryFile("w", dir=path.parent, prefix=".", suffix=".csv", encoding="utf-8", newline="") as table,
+        temporary_beside(path, name=temporary_name(path, ".csv")) as plain,
+        plain.open("w", encoding="utf-8", newline="") as table,
     ):
         count = write_text(hunt, table, "csv", outcomes=outcomes)
         table.flush()
-        pl.scan_csv(table.name, schema=schema).sink_parquet(temporary)
+        pl.scan_csv(plain, schema=schema).sink_parquet(temporary)
     return count
 
 

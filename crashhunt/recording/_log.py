@@ -64,7 +64,7 @@ def write_log(
     Raises:
         HuntDirectoryError: the disk is full, or the folder is not writable.
     """
-    with whole_file(path, lasting=False) as temporary, temporary.open("wb") as file:
+    with whole_file(path, lasting=False, noted=False) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="crashhunt")
         writer.add_metadata("crashhunt", {**(metadata or {}), "crashhunt_log_schema": SCHEMA})

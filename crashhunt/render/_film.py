@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from PIL import Image
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, whole_file
+from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.watching import watched
 from crashhunt.crashes import Encounter
 from crashhunt.panels import Action, Curve
@@ -278,19 +278,21 @@ def write_frames(folder: Path, shots: Sequence[Shot], options: FilmOptions, *, w
     made: list[Path] = []
     new = not folder.exists()
     try:
-        folder.mkdir(exist_ok=True)
-        for picture in watched(frames(shots, options), _count(shots, options), watch):
-            made.append(folder / f"{len(made):06d}.png")
-            Image.fromarray(picture).save(made[-1])
-    except BaseException as error:  # Ctrl-C too: half a film is none, and would be in the way of the next
-        for path in made:
-            path.unlink(missing_ok=True)
-        if new:
-            with suppress(OSError):
-                folder.rmdir()
-        if isinstance(error, OSError):
-            raise cannot_write(folder, error) from error
-        raise
+        if not new:
+            folder.mkdir(exist_ok=True)  # which refuses a file
+        # Half a film is none, and would be in the way of the next.
+        with temporary_beside(folder if new else folder / "frames") as building:
+            building.mkdir()
+            for picture in watched(frames(shots, options), _count(shots, options), watch):
+                made.append(building / f"{len(made):06d}.png")
+                Image.fromarray(picture).save(made[-1])
+            if new:
+                building.rename(folder)
+            else:
+                for path in made:
+                    path.replace(folder / path.name)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
     return len(made)
 
 

@@ -7,7 +7,6 @@ import json
 import os
 import pdb
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.faculties import offers
 from crashhunt.base.keeper import Kept
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import Observer, Parts, WorkerSettings, run_episode, seal
 from crashhunt.executors import snapshot_environment
 from crashhunt.panels import labelled, scope
@@ -84,8 +84,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         raise UsageError("a window needs a display, and DISPLAY is not set", fix="log in with ssh -X, or give --video")
     collision = rerun.bundle.result.collision
     involved = {collision.collider, collision.victim} if collision is not None else set()
-    with tempfile.TemporaryDirectory(prefix="crashhunt-debug-") as folder:
-        scratch = Path(folder)
+    with temporary_folder("debug") as scratch:
         settings = replace(rerun.worker, scratch=scratch)
         job: _Job = {
             "settings": settings.to_json(),
@@ -100,7 +99,7 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
         (scratch / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
         kept = Kept(
             _module_in(settings.code),
-            [folder],
+            [str(scratch)],
             environment=snapshot_environment(settings),
             apart=False,
             stdout=2 if look.to_stderr else None,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import INTERRUPTED, ending_of, last_escape, overruled_trial, slowing, visible_from
 from crashhunt.replays._avoiding import CannotError, Search, Tried
 from crashhunt.replays._prepare import ReplayOptions, prepare
@@ -68,8 +67,8 @@ def judge(
     of_two = result.outcome is Outcome.COLLISION and hit is not None and bool(hit.other)
     _see_that_it_can_be_judged(bundle, of_two=of_two, why=why)
     rerun = prepare(bundle, options or ReplayOptions())
-    with tempfile.TemporaryDirectory(prefix="crashhunt-judge-") as folder:
-        reruns = Reruns(rerun, Path(folder), parallel=parallel, stopped=stopped)
+    with temporary_folder("judge") as scratch:
+        reruns = Reruns(rerun, scratch, parallel=parallel, stopped=stopped)
 
         def tell(done: int) -> None:
             if watch is not None:

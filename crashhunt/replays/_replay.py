@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import scratch_of
 from crashhunt.executors import run_alone
 from crashhunt.recording import Recording, read_black_box
@@ -103,8 +102,7 @@ class _NotSetUpError(CrashhuntError):
 def _run(
     rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedExecutors | None = None
 ) -> ReplayReport:
-    with tempfile.TemporaryDirectory(prefix="crashhunt-replay-") as folder:
-        scratch, found = Path(folder), None
+    with temporary_folder("replay") as scratch:
         if executors is None:
             result = run_alone(replace(rerun.worker, scratch=scratch), rerun.spec, stopped)
         else:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.temporary import remove_at_once, temporary_folder
 from crashhunt.crashes import write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
@@ -170,9 +168,9 @@ def shrink(
     rerun = prepare(bundle, ReplayOptions())
     signature = signature_of(bundle)
     memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")
-    with tempfile.TemporaryDirectory(prefix="crashhunt-shrink-") as folder:
+    with temporary_folder("shrink") as scratch:
         runs = Runs(
-            rerun, signature, Path(folder), memory,
+            rerun, signature, scratch, memory,
             parallel=parallel or len(os.sched_getaffinity(0)), budget=budget, time_s=time_s,
             stopped=stopped, watch=watch,
         )  # fmt: skip
@@ -188,8 +186,6 @@ def shrink(
         except OSError as error:
             message = f"{shrunk_name(bundle.id)!r} cannot be written: {error.strerror or error}"
             raise BundleError(message, fix=_WRITE_AGAIN, where=str(bundle.path.parent)) from None
-        finally:  # what was begun is of no use to anybody
-            shutil.rmtree(bundle.path.with_name(f".{shrunk_name(bundle.id)}.part"), ignore_errors=True)
         if small is None:
             why = "what was left did not do the same in a fresh process"
     if not search.reproduced:
@@ -226,7 +222,7 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
             if search.steps_cut:
                 told["steps_cut"] = search.steps_cut
             return _kept(replace(small, added={**small.added, "shrunk": told}))
-        shutil.rmtree(small.path)
+        remove_at_once(small.path)
     return None
 
 
@@ -237,15 +233,14 @@ def _kept(small: Bundle) -> Bundle:
         small = confirm(small) or small
         small.write()
     except BaseException:  # else it would pass for a crash of the hunt, or for one that nobody has looked at
-        shutil.rmtree(small.path, ignore_errors=True)
+        remove_at_once(small.path)
         raise
     return small
 
 
 def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
     bundle = rerun.bundle
-    with tempfile.TemporaryDirectory(prefix="crashhunt-shrink-") as folder:
-        scratch = Path(folder)
+    with temporary_folder("shrink") as scratch:
         executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
         try:
             executor.submit(spec)

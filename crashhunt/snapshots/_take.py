@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError
-from crashhunt.base.files import sync_folder, sync_tree
+from crashhunt.base.files import put_in_place, sync_folder, sync_tree
 from crashhunt.base.integrity import (
     describe_files,
     digest_of_content,
     digest_of_data,
     digest_of_file,
 )
+from crashhunt.base.owners import this_process
+from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.oracles import modules_of
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
@@ -91,7 +93,6 @@ def take_snapshot(
         SnapshotError: it is too large, or cannot be read or written.
     """
     options = options or SnapshotOptions()
-    building = snapshots / f"{layout.BUILDING}{os.getpid()}"
     found = Sources(paths=[])
     if options.code:
         locators = [setup.agent for setup in scenario.agents.values()]
@@ -102,45 +103,54 @@ def take_snapshot(
     _check_size(files, options.limit_mb)
     try:
         snapshots.mkdir(exist_ok=True)
-        shutil.rmtree(building, ignore_errors=True)
-        building.mkdir()
-        for folder in {name.rpartition("/")[0] for name in files}:
-            (building / folder).mkdir(parents=True, exist_ok=True)
-        entries = {name: _store(path, building / name) for name, path in files.items()}
-        entries |= _store_scenario(scenario, building)
-        stored = {name: entry for name, entry in entries.items() if entry is not None}
-        manifest: Manifest = {
-            "schema": SCHEMA,
-            "paths": found.paths,
-            "argument_files": argument_files,
-            "left_out": found.left_out,
-            "files": stored,
-        }
-        digest = digest_of_described(stored, says=[found.paths, argument_files])
-        final = snapshots / digest
-        if final.exists() and not _is_damaged(Snapshot(final)):
-            shutil.rmtree(building)
-            return Snapshot(final)
-        write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
-        facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
-        if (core := core_of(scenario, settings.run)) is not None:
-            facts["core"] = core
-        (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
-        manifest["described"] = describe_files(building)
-        manifest["integrity"] = digest_of_data(manifest)
-        (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-        sync_tree(building)
-        if final.exists():  # what is in it is the same, but for the damage
-            shutil.rmtree(final)
-        building.rename(final)
-        sync_folder(snapshots)
+        remove_ended(snapshots)
+        with temporary_beside(snapshots / layout.MANIFEST, name=f"{layout.BUILDING}{this_process().token}") as building:
+            return _build(building, files, found, argument_files, scenario, settings)
     except OSError as error:
-        shutil.rmtree(building, ignore_errors=True)
         raise SnapshotError(
             f"the snapshot cannot be made: {error.strerror or error}",
             fix="free some space, make the file readable, or give --no-snapshot",
             where=str(error.filename or snapshots),
         ) from error
+
+
+def _build(
+    building: Path,
+    files: dict[str, Path],
+    found: Sources,
+    argument_files: dict[str, str],
+    scenario: Scenario,
+    settings: HuntSettings,
+) -> Snapshot:
+    """Copy everything into a folder, and give that the name of its digest; nothing where it is there already."""
+    building.mkdir()
+    for folder in {name.rpartition("/")[0] for name in files}:
+        (building / folder).mkdir(parents=True, exist_ok=True)
+    entries = {name: _store(path, building / name) for name, path in files.items()}
+    entries |= _store_scenario(scenario, building)
+    stored = {name: entry for name, entry in entries.items() if entry is not None}
+    manifest: Manifest = {
+        "schema": SCHEMA,
+        "paths": found.paths,
+        "argument_files": argument_files,
+        "left_out": found.left_out,
+        "files": stored,
+    }
+    digest = digest_of_described(stored, says=[found.paths, argument_files])
+    final = building.with_name(digest)
+    if final.exists() and not _is_damaged(Snapshot(final)):
+        return Snapshot(final)
+    write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
+    facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
+    if (core := core_of(scenario, settings.run)) is not None:
+        facts["core"] = core
+    (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
+    manifest["described"] = describe_files(building)
+    manifest["integrity"] = digest_of_data(manifest)
+    (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    sync_tree(building)
+    put_in_place(building, final)  # what is there already is the same, but for the damage
+    sync_folder(final.parent)
     return Snapshot(final)
 
 

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import exchange, put_in_place, whole_file
 from crashhunt.base.signals import stop_requests
+from crashhunt.base.temporary import temporary_beside
 from crashhunt.hunts import HuntDirectory, Ledger
 from crashhunt.plans import (
     Request,
@@ -66,6 +67,10 @@ class RunRequest:
     def to_json(self) -> dict[str, object]:
         """Return plain data: what the snapshot takes in stands beside the request."""
         return {"request": asdict(self.request), "folder": self.folder, **asdict(self.snapshot)}
+
+    def to_plain(self) -> object:
+        """Return what is read from the file that has it."""
+        return json.loads(json.dumps(self.to_json(), default=str))
 
     @classmethod
     def read(cls, file: Path) -> RunRequest:
@@ -170,16 +175,42 @@ def run_all(
         raise KeyboardInterrupt
 
 
-def set_aside(folder: Path) -> Path:
-    """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now."""
+def set_aside(folder: Path, planned: Callable[[Path], RunRequest]) -> Path:
+    """Move what a run has left out of the way, beside it, so that it can run anew; return where it is now.
+
+    A process that is killed meanwhile leaves the folder either as it was, or planned anew.
+
+    Args:
+        folder: of the run.
+        planned: called with where its content will be; returns what the run will be.
+
+    Raises:
+        OSError: the folders cannot be made or renamed.
+    """
     number = 0
     while (aside := folder.with_name(f"{folder.name}{layout.REPLACED}{number}")).exists():
+        if _is_same_plan(aside, request := planned(aside)):
+            break
         number += 1
-    folder.rename(aside)
-    folder.mkdir()
-    if (aside / REQUEST).exists():
-        write_request(folder, RunRequest.read(aside / REQUEST))
+    else:
+        request = planned(aside)
+    with temporary_beside(folder) as building:
+        building.mkdir()
+        write_request(building, request)
+        put_in_place(building, aside)
+    if not exchange(folder, aside):
+        with temporary_beside(folder) as building:
+            aside.rename(building)
+            folder.rename(aside)
+            building.rename(folder)
     return aside
+
+
+def _is_same_plan(aside: Path, request: RunRequest) -> bool:
+    """Return whether a folder has only the plan that an earlier call made before it was killed."""
+    if not aside.is_dir() or [path.name for path in aside.iterdir()] != [REQUEST]:
+        return False
+    return RunRequest.read(aside / REQUEST).to_plain() == request.to_plain()
 
 
 def _start(folder: Path, run: Given) -> subprocess.Popen[bytes]:

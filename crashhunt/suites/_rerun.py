@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.files import is_empty_folder, sync_folder
+from crashhunt.base.temporary import temporary_beside
 from crashhunt.disturbances import NONE
 from crashhunt.hunts import HuntState, Ledger, hunt_state
 from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
@@ -74,12 +76,11 @@ def rerun(
     for hunt in hunts:
         state = hunt_state(hunt)
         if everything or state.state == "error":
-            aside = set_aside(hunt)
-            requests[hunt] = _moved(requests[hunt], hunt, aside)
-            replaced.append(aside)
-        elif not (state.failed or state.state == "queued" or _replace_invalid(hunt, state)):
+            replaced.append(set_aside(hunt, partial(_moved, requests[hunt], hunt)))
+        elif state.failed or state.state == "queued" or _replace_invalid(hunt, state):
+            write_request(hunt, requests[hunt])
+        else:
             continue
-        write_request(hunt, requests[hunt])
         again.append(hunt)
     run_all(
         again,
@@ -206,13 +207,38 @@ def _elsewhere(
 ) -> list[HuntState]:
     if len(hunts) != 1:
         raise UsageError(f"--to takes one hunt, and there are {len(hunts)}", fix="choose one with --run")
-    if to.exists():
-        raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
     request = _changed(_request(hunts[0]), changes, hunts[0])
     try:
-        to.mkdir()
-        write_request(to, request)
+        if to.exists() and not is_empty_folder(to):
+            _see_that_it_resumes(to, request)
+        else:
+            with temporary_beside(to) as building:  # one that is there has its request
+                building.mkdir()
+                write_request(building, request)
+                building.rename(to)
+                sync_folder(to.absolute().parent)
     except OSError as error:
         raise HuntDirectoryError(f"cannot be made: {error.strerror}", fix="choose another", where=str(to)) from error
-    run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]), machine=machine)
+    if hunt_state(to).state in ("queued", "killed", "interrupted"):
+        run_all([to], parallel, watch=None if watch is None else lambda: watch([hunt_state(to)]), machine=machine)
     return [hunt_state(to)]
+
+
+def _see_that_it_resumes(to: Path, request: RunRequest) -> None:
+    """See that what is in a directory is what the same command made there before it was killed or interrupted.
+
+    Raises:
+        HuntDirectoryError: it is something else, it runs, or it ended in an error.
+    """
+    try:
+        same = RunRequest.read(to / REQUEST).to_plain() == request.to_plain()
+    except HuntDirectoryError:
+        same = False
+    if not same:
+        raise HuntDirectoryError("it is there already", fix="give a new directory", where=str(to))
+    state = hunt_state(to).state
+    if state == "running":
+        raise HuntDirectoryError("it is running", fix="wait for it, or stop it", where=str(to))
+    if state == "error":
+        fix = f"see crashhunt logs {to}, then crashhunt rerun {to}"
+        raise HuntDirectoryError("it is there already, and ended in an error", fix=fix, where=str(to))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.faculties import offers
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import partner
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import read_log
@@ -100,9 +100,9 @@ def _avoids(rerun: Rerun, after: int, afterwards_s: float) -> bool:
         for agent, given in rerun.spec.arguments.items()
     }
     steps = rerun.recorded.steps + round(afterwards_s / rerun.recorded.prologue.step_length_s)
-    with tempfile.TemporaryDirectory(prefix="crashhunt-escape-") as folder:
+    with temporary_folder("escape") as scratch:
         worker = replace(
-            rerun.worker, scenario=scenario.with_agents(dict.fromkeys(scenario.agents, name)), scratch=Path(folder)
+            rerun.worker, scenario=scenario.with_agents(dict.fromkeys(scenario.agents, name)), scratch=scratch
         )
         executor = FreshProcessExecutor(worker)
         try:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.api import run
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.names import one_of
+from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.text import visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
@@ -21,6 +20,7 @@ from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from crashhunt.crashes import Bundle
     from crashhunt.plans import Driver, Spec
@@ -95,7 +95,7 @@ def assert_survives(
             raise AssertionError(_told(result, call, ""))
         return
     with ExitStack() as stack:
-        place = directory or stack.enter_context(tempfile.TemporaryDirectory(prefix="crashhunt-survives-"))
+        place = directory or stack.enter_context(temporary_folder("survives"))
         report = run(
             place, parallel, trials, max_steps, deterministic=True, agent=agent, scenario=scenario,
             arguments=arguments, scenario_arguments=scenario_arguments, seed=seed,
@@ -160,9 +160,9 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
         only=None if only is None else tuple(only),
         disturbances=tuple(map(Disturbance.from_json, example.get("disturbances", ()))),
     )
-    with tempfile.TemporaryDirectory(prefix="crashhunt-survives-") as folder:
+    with temporary_folder("survives") as scratch:
         worker = WorkerSettings(
-            scenario=scenario, oracles=settings.oracles, crash_on=settings.crash_on, scratch=Path(folder),
+            scenario=scenario, oracles=settings.oracles, crash_on=settings.crash_on, scratch=scratch,
             timeout_s=settings.run.timeout_s,
         )  # fmt: skip
         executor = PoolExecutor(worker)

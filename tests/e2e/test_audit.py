@@ -74,7 +74,7 @@ def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(to
     sample = sum(map(settings.is_audited, ended))
     process = toy.start(*words)
     deadline = time.monotonic() + 60
-    while len(list((toy.folder / "h" / ".scratch").glob("audit/recorded-*"))) < 2:
+    while len(list((toy.folder / "h").glob(".scratch-*/audit/recorded-*"))) < 2:
         assert time.monotonic() < deadline, "no trial waits for its audit"
         time.sleep(0.002)
     process.send_signal(how)

@@ -63,7 +63,7 @@ def test_exactly_so_many_trials_run(toy, parallel, trials):
     assert report["stopped_because"] == "all_trials"
     assert report["steps_total"] == 30 * trials
     assert sorted(ledger(toy.folder / "h")) == list(range(trials))
-    assert not (toy.folder / "h" / ".scratch").exists()
+    assert not [*(toy.folder / "h").glob(".scratch*")]
 
 
 def test_trials_do_not_depend_on_how_many_run_at_once(shell):
@@ -175,7 +175,7 @@ def running_worker(folder: Path) -> int:
     found: list[int] = []
 
     def look() -> bool:
-        headers = [read_header(path) for path in (folder / ".scratch").glob("trial-*/blackbox.bin")]
+        headers = [read_header(path) for path in folder.glob(".scratch-*/trial-*/blackbox.bin")]
         found[:] = [header.pid for header in headers if header is not None and header.phase != Phase.DONE]
         return bool(found)
 

@@ -54,6 +54,16 @@ def left_in(folder: Path) -> list[int]:
     return found
 
 
+def boxes(hunt: Path) -> list[Path]:
+    """The black box of the first trial, while it runs."""
+    return [*hunt.glob(".scratch-*/trial-000000/blackbox.bin")]
+
+
+def is_running(box: Path) -> bool:
+    header = read_header(box)
+    return header is not None and header.phase in (Phase.ACT, Phase.SIMULATE)
+
+
 STOPS = [(number, whom) for number in (signal.SIGTERM, signal.SIGHUP) for whom in ("every process", "the group")]
 BY_DAY = [(signal.SIGHUP, "every process")]
 
@@ -83,9 +93,8 @@ def test_a_stop_of_everybody_at_once_is_no_crash(toy, number, whom):
 def test_a_trial_that_was_killed_from_outside_is_run_again(toy, number):
     words = ("run", "h", "1", "2", "40", *FINE, *SLOW, "--json")
     process = toy.start(*words)
-    box = toy.folder / "h" / ".scratch" / "trial-000000" / "blackbox.bin"
-    wait_for(box.exists)
-    wait_for(lambda: (header := read_header(box)) is not None and header.phase in (Phase.ACT, Phase.SIMULATE))
+    wait_for(lambda: any(is_running(box) for box in boxes(toy.folder / "h")))
+    (box,) = boxes(toy.folder / "h")
     os.kill(read_header(box).pid, number)
     out, err = process.communicate(timeout=90)
     report = json.loads(out)

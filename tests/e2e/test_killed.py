@@ -1,0 +1,609 @@
+"""A command that is killed loses nothing; the next command removes what it left, and the same one finishes the work.
+
+Kills are real: by the process itself at a step, which is an operation on files that Python reports to audit hooks, or
+by a signal after some time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from conftest import keeps_going, mostly_nightly
+from test_bisect import git
+from test_corpus import DRIVER, MENDED
+
+from crashhunt.base.owners import Owner, owner_in, start_time, this_process
+from crashhunt.base.temporary import remove_leftovers, remove_tree
+from crashhunt.corpus import _bisect
+from crashhunt.crashes import list_bundles
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import Hunt, Ledger, check, hunt_state, salvage
+from crashhunt.plans import Request, plan
+from crashhunt.suites import _processes, _rerun
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
+
+# What a command does to files, and to processes; opening is one where it is for writing.
+STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "subprocess.Popen",
+         "shutil.copyfile", "shutil.copytree", "shutil.rmtree", "sqlite3.connect"}  # fmt: skip
+AT_STEP = f"""
+import atexit, os, signal, sys
+STEPS, at, seen = {STEPS!r}, int(os.environ.pop("KILL_AT_STEP", "0")), [0]
+def hook(event, arguments):
+    if event in STEPS or (event == "open" and isinstance(arguments[2], int) and arguments[2] & 3):
+        seen[0] += 1
+        if seen[0] == at:
+            os.kill(os.getpid(), signal.SIGKILL)
+def say(pid=os.getpid(), path=os.environ.pop("STEPS_FILE", "")):
+    if path and os.getpid() == pid:
+        open(path, "w").write(str(seen[0]))
+if at and sys.orig_argv[1:2] and sys.orig_argv[1].endswith("/crashhunt"):
+    sys.addaudithook(hook)
+    atexit.register(say)
+"""
+NEVER = 10**9
+
+
+@pytest.fixture(autouse=True)
+def temporary_files(tmp_path_factory, monkeypatch):
+    folder = tmp_path_factory.mktemp("temporary files")
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+def killed(function, step: int) -> int:
+    """Call a function in a fork that is killed at a step; return how many steps there were, 0 where it was killed."""
+    hear, tell = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        with suppress(BaseException):
+            hook: dict = {}
+            exec(AT_STEP.partition("def say")[0], hook)
+            hook["at"] = step
+            sys.addaudithook(hook["hook"])
+            function()
+            os.write(tell, str(hook["seen"][0]).encode())
+        os._exit(0)
+    os.close(tell)
+    os.waitpid(pid, 0)
+    with os.fdopen(hear) as file:
+        return int(file.read() or 0)
+
+
+def left_in(*folders: Path) -> list[str]:
+    """What has the token of a process in its name, and what lies in the folder for temporary files."""
+    found = [str(path) for folder in folders for path in folder.rglob("*") if owner_in(path.name) is not None]
+    return found + [str(path) for path in Path(os.environ["TMPDIR"]).rglob("*")]
+
+
+def processes_of(folder: Path) -> list[int]:
+    """The processes that have something of a folder open, or work there."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            links = [process / "cwd", *(process / "fd").iterdir()]
+            if int(process.name) != os.getpid() and any(in_folder(link, folder) for link in links):
+                found.append(int(process.name))
+    return found
+
+
+def in_folder(link: Path, folder: Path) -> bool:
+    try:
+        return str(link.readlink()).startswith(f"{folder}/")
+    except OSError:
+        return False
+
+
+def spread(count: int, most: int, *, seed: int) -> list[int]:
+    """Steps of so many, the first and the last among them."""
+    some = random.Random(seed).sample(range(1, count + 1), min(most, count))
+    return sorted({1, 2, count - 1, count, *some} & {*range(1, count + 1)})
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def damaged(toy, made_once, monkeypatch):
+    """A folder with a hunt of which one crash is damaged."""
+    made_once(keeps_going, toy)
+    monkeypatch.chdir(toy.folder)
+    crash = min((toy.folder / "h" / "crashes").iterdir())
+    (crash / "log.mcap").write_bytes(b"")
+    for code in (toy.folder / "h" / "snapshots").glob("*/code"):
+        shutil.rmtree(code)  # so that there are few steps
+    return toy
+
+
+@pytest.mark.parametrize("most", [6, pytest.param(NEVER, marks=pytest.mark.nightly)])
+def test_salvage_that_was_killed_at_a_step_is_done_when_it_is_run_again(damaged, most):
+    folder, to = damaged.folder, damaged.folder / "saved here"
+    (found,) = check(folder / "h")
+    before = content(folder / "h")
+    count = killed(lambda: salvage(found, to), NEVER)
+    assert count > 20
+    shutil.rmtree(to)
+    whole = None
+    for step in spread(count, most, seed=1):
+        assert killed(lambda: salvage(found, to), step) == 0
+        remove_leftovers()
+        assert left_in(folder) == []
+        there = to.exists()
+        saved = salvage(found, to)
+        assert salvage(found, to) == saved == {"trials": len(rows(to)), "crashes": len(found.crashes)}, step
+        if there:  # it was killed too late
+            assert step > count - 10
+        (state,) = check(to)
+        assert (state.trials, state.crashes) == ({*rows(to)}, found.crashes)
+        whole = whole or content(to).keys()
+        assert content(to).keys() == whole
+        assert content(folder / "h") == before
+        shutil.rmtree(to)
+
+
+def rows(hunt: Path) -> list[int]:
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
+        return [number for (number,) in database.execute("SELECT number FROM trials")]
+    return []
+
+
+def test_salvage_refuses_a_directory_with_anything_else(damaged):
+    (found,) = check(damaged.folder / "h")
+    to = damaged.folder / "saved"
+    to.mkdir()
+    saved = salvage(found, to)  # into one that is empty
+    (to / "crashes" / found.crashes[0]).rename(damaged.folder / "elsewhere")
+    with pytest.raises(HuntDirectoryError, match="it is there already"):
+        salvage(found, to)
+    (damaged.folder / "elsewhere").rename(to / "crashes" / found.crashes[0])
+    assert salvage(found, to) == saved
+    resumed = damaged.folder / "resumed"
+    shutil.copytree(to, resumed)
+    with closing(Ledger(resumed / "ledger.sqlite", writable=True)) as ledger:
+        ledger.enter("all_trials")
+    with pytest.raises(HuntDirectoryError, match="it is there already"):
+        salvage(found, resumed)
+    with closing(sqlite3.connect(to / "ledger.sqlite")) as database, database:
+        database.execute("DELETE FROM trials WHERE number = (SELECT MAX(number) FROM trials)")
+    for name in ("file", "folder"):
+        other = damaged.folder / name
+        other.touch() if name == "file" else (other / "thesis").mkdir(parents=True)
+        with pytest.raises(HuntDirectoryError, match="it is there already"):
+            salvage(found, other)
+    with pytest.raises(HuntDirectoryError, match="it is there already"):
+        salvage(found, to)
+    with pytest.raises(HuntDirectoryError, match="cannot be written"):
+        salvage(found, damaged.folder / "no" / "where")
+    assert left_in(damaged.folder) == []
+
+
+def test_rerun_to_that_was_killed_before_it_ran_goes_on(damaged, monkeypatch):
+    hunt, to = damaged.folder / "h", damaged.folder / "to"
+    ran: list[Path] = []
+    monkeypatch.setattr(_rerun, "run_all", lambda folders, *_, **__: ran.extend(folders))
+
+    def again(**options):
+        return _rerun.rerun([hunt], to=to, **{"changes": {"seed": "5"}, **options})
+
+    killed(again, NEVER)
+    request = json.loads((to / "request.json").read_text())
+    shutil.rmtree(to)
+    step = 0
+    while not killed(again, step := step + 1):
+        remove_leftovers()
+        assert left_in(damaged.folder) == []
+        assert not to.exists() or json.loads((to / "request.json").read_text()) == request
+        ((state,), _) = again()
+        assert (state.state, ran) == ("queued", [to])
+        ran.clear()
+        shutil.rmtree(to)
+    assert step > 5
+    for options, says in (({"changes": {}}, "it is there already"), ({"changes": {"seed": "6"}}, "is there already")):
+        with pytest.raises(HuntDirectoryError, match=says):
+            again(**options)
+    with monkeypatch.context() as patched:
+        for state, says in (("running", "it is running"), ("error", "ended in an error")):
+            patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
+            with pytest.raises(HuntDirectoryError, match=says):
+                again()
+        for state, resumes in (("finished", False), ("crashed", False), ("killed", True), ("interrupted", True)):
+            patched.setattr(_rerun, "hunt_state", lambda _, state=state: SimpleNamespace(state=state))
+            ran.clear()
+            again()
+            assert bool(ran) == resumes, state
+    ran.clear()
+    shutil.rmtree(to)
+    to.mkdir()
+    again()  # into one that is empty
+    assert ran == [to]
+    (damaged.folder / "file").touch()
+    with pytest.raises(HuntDirectoryError, match="there already"):
+        _rerun.rerun([hunt], to=damaged.folder / "file")
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_a_rerun_that_was_killed_while_it_sets_a_hunt_aside_loses_nothing(damaged, monkeypatch, exchanges):
+    hunt = damaged.folder / "h"
+    if not exchanges:  # as on some network file systems
+        monkeypatch.setattr(_processes, "exchange", lambda *_: False)
+        monkeypatch.setattr("crashhunt.base.files.exchange", lambda *_: False)
+    request = _rerun._request(hunt)
+    before, aside = content(hunt), hunt.with_name("h.replaced-0")
+    copy = damaged.folder / "copy"
+    shutil.copytree(hunt, copy)
+    step = 0
+    while not killed(lambda: _processes.set_aside(hunt, lambda _: request), step := step + 1):
+        remove_leftovers()
+        assert left_in(damaged.folder) == []
+        assert before in [content(folder) for folder in (hunt, aside) if folder.exists()]
+        if exchanges:
+            assert hunt_state(hunt).state in ("crashed", "queued")
+        if hunt.exists() and content(hunt) == before:
+            assert _processes.set_aside(hunt, lambda _: request) == aside
+            assert (content(aside), [*content(hunt)]) == (before, ["request.json"])
+        for folder in (hunt, aside):
+            shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(copy, hunt)
+    assert step > 5
+    assert (content(aside), [*content(hunt)]) == (before, ["request.json"])
+    # A hunt that was set aside before it began is no plan of this one.
+    shutil.rmtree(aside)
+    aside.mkdir()
+    _processes.write_request(aside, replace(request, folder="/elsewhere"))
+    assert _processes.set_aside(hunt, lambda _: request).name == "h.replaced-1"
+    shutil.rmtree(hunt)
+    hunt.with_name("h.replaced-1").rename(hunt)
+    shutil.rmtree(aside)
+    shutil.copytree(copy, aside)
+    shutil.copytree(copy, hunt, dirs_exist_ok=True)
+    assert _processes.set_aside(hunt, lambda _: request).name == "h.replaced-1"
+
+
+WRITERS = [
+    "corpus add h --to kept",
+    "export h crash.zip",
+    "report h --output report.html",
+    "trials h --out trials.csv",
+    "export h out.xosc --as openscenario",
+]
+
+
+@pytest.mark.parametrize("words", mostly_nightly(WRITERS, always=WRITERS[:1]))
+def test_what_is_written_is_whole_or_not_there(toy, made_once, monkeypatch, words):
+    made_once(keeps_going, toy)
+    monkeypatch.chdir(toy.folder)
+    from crashhunt.cli import main
+
+    def command():
+        for descriptor in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+        with suppress(SystemExit):
+            main(words.split())
+
+    before = {*toy.folder.iterdir()}
+    count = killed(command, NEVER)
+    made = {*toy.folder.iterdir()} - before
+    whole = {path: described(path) for path in made}
+    for step in spread(count, 4, seed=len(words)):
+        for path in {*toy.folder.iterdir()} - before:
+            remove_tree(path)
+        assert killed(command, step) == 0
+        remove_leftovers()
+        assert left_in(toy.folder) == []
+        for path in {*toy.folder.iterdir()} - before:
+            assert described(path) in (whole[path], {})  # a corpus may have no case yet
+        assert killed(command, NEVER)
+        assert {path: described(path) for path in {*toy.folder.iterdir()} - before} == whole
+
+
+def described(path: Path) -> dict[str, int]:
+    """The names below a folder with their sizes; of a file, whose size depends on the time, how many kB it has."""
+    if path.is_dir():
+        return {str(file.relative_to(path)): file.stat().st_size for file in path.rglob("*") if file.is_file()}
+    return {path.name: path.stat().st_size // 1000}
+
+
+@pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.nightly)])
+def test_bisect_that_was_killed_leaves_no_work_tree(tmp_path, monkeypatch, every):
+    git(tmp_path, "init", "-q", "-b", "main")
+    for number in range(3):
+        (tmp_path / "code").write_text("good" if number < 1 else f"bad {number}")
+        git(tmp_path, "add", "code")
+        git(tmp_path, "commit", "-qm", str(number))
+
+    def ran(case, folder, tree, modules):
+        return "still" if (tree / "code").read_text().startswith("bad") else "fixed"
+
+    monkeypatch.setattr(_bisect, "_run", ran)
+    monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
+    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}))
+
+    def bisected():
+        return _bisect.bisect(SimpleNamespace(hunt=tmp_path), "main~2", bad="main", folder=tmp_path)
+
+    files = {*tmp_path.rglob("*")} | {tmp_path / ".git" / "packed-refs"}  # which Git itself writes
+    count = killed(bisected, NEVER)
+    assert {*tmp_path.rglob("*")} <= files
+    before = {*tmp_path.rglob("*")}
+    trees = 0
+    for step in range(1, count + 1, every):
+        assert killed(bisected, step) == 0
+        trees += len([*(tmp_path / ".git").glob("worktrees/*")])
+        remove_leftovers()
+        assert {*tmp_path.rglob("*")} == before, step
+        assert left_in(tmp_path) == []
+    assert trees
+    # One of the user stays, and so does one of a bisect that runs.
+    git(tmp_path, "worktree", "add", "-q", "--detach", str(tmp_path.with_name("mine")))
+    assert killed(bisected, count - 3) == 0
+    remove_leftovers()
+    assert [path.name for path in (tmp_path / ".git" / "worktrees").iterdir()] == ["mine"]
+    assert bisected().subject == "1"
+    shutil.rmtree(tmp_path.with_name("mine"))
+
+
+def test_what_bisect_runs_ends_with_it(tmp_path):
+    said = tmp_path / "pid"
+    pid = os.fork()
+    if pid == 0:
+        with suppress(BaseException):
+            _bisect._ran(["sh", "-c", f"echo $$ > '{said}'; exec sleep 60"], None, os.environ)
+        os._exit(0)
+    wait_for(lambda: said.exists() and said.read_text())
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    wait_for(lambda: start_time(int(said.read_text())) == 0)
+
+
+def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once, temporary_files):
+    made_once(keeps_going, toy)
+    toy.environment["TMPDIR"] = str(temporary_files)
+    process = toy.start("replay", "h")
+    wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/replay-1/*")])
+    process.terminate()
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGTERM
+    assert left_in(toy.folder) == []
+
+
+def wait_for(condition, timeout_s: float = 60.0):
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.01)
+    return found
+
+
+LEAVES_MEMORY = """
+from multiprocessing import shared_memory
+from crashhunt.agents import KeepLaneWithSpeed
+kept = []
+class Leaves(KeepLaneWithSpeed):
+    def __init__(self, **arguments):
+        super().__init__(**arguments)
+        kept.append(shared_memory.SharedMemory(create=True, size=64))
+        open("created.txt", "a").write(kept[-1].name + "\\n")
+"""
+
+
+def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(toy, temporary_files):
+    (toy.folder / "leaves.py").write_text(LEAVES_MEMORY)
+    toy.environment["TMPDIR"] = str(temporary_files)
+    words = ("run", "h", "2", "8", "40", "--scenario", "toy", "--agent", "leaves:Leaves", "--arg", "speed=5", "--set",
+             "step_wall_s=0.01", "--seed", "1")  # fmt: skip
+    process = toy.start(*words)
+    wait_for(lambda: rows(toy.folder / "h"))
+    created = toy.folder / "created.txt"
+    wait_for(lambda: not all(Path("/dev/shm", name).exists() for name in created.read_text().split()))
+    assert process.poll() is None  # what a trial left does not stay until the end of a long hunt
+    wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")])
+    process.kill()
+    process.communicate(timeout=60)
+    wait_for(lambda: not processes_of(toy.folder), timeout_s=10.0)
+    assert len([*toy.folder.glob("h/.scratch-*")]) == 1
+    toy.crashhunt("oracles")
+    assert left_in(toy.folder) == []
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
+    toy.crashhunt(*words)
+    assert sorted(rows(toy.folder / "h")) == [*range(8)]
+    assert len(created.read_text().split()) >= 8
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
+    assert left_in(toy.folder) == []
+
+
+def leftover(folder: Path, start: str, *, alive: bool = False, boot: str = "") -> Path:
+    """Make a folder with the name of something temporary, of this process or of one that has ended."""
+    here = this_process()
+    made = folder / f"{start}{Owner(here.pid, here.started - (not alive), boot or here.boot, here.namespace).token}"
+    made.mkdir(parents=True)
+    return made
+
+
+def test_what_no_link_leads_to_goes_where_it_lies(toy, made_once, monkeypatch):
+    """As after a reboot, or where the folder for temporary files was another one."""
+    made_once(keeps_going, toy)
+    monkeypatch.chdir(toy.folder)
+    hunt, corpus = toy.folder / "h", toy.folder / "kept"
+    (hunt / ".scratch").mkdir()  # of an earlier version
+    before = [leftover(hunt, ".scratch-"), leftover(hunt, ".scratch-", boot="0123456789ab"), hunt / ".scratch",
+              leftover(hunt / "crashes", ".000000-hang."), leftover(hunt / "probes", ".000001-hang."),
+              leftover(hunt / "snapshots", ".building-"), leftover(corpus, ".case.")]  # fmt: skip
+    stay = [leftover(hunt / "crashes", ".000000-hang.", alive=True), leftover(corpus, ".case.", alive=True),
+            leftover(hunt / "snapshots", ".building-", boot="0123456789ab")]  # fmt: skip
+    (found,) = check(hunt)
+    said = {finding.where for finding in found.findings}
+    assert {str(path) for path in before[:4]} <= said
+    assert str(stay[0]) not in said  # shrink may be writing it
+    toy.crashhunt("run", "h", "2", "25", "99", "--scenario", "toy", "--seed", "4", "--keep-going")
+    toy.crashhunt("corpus", "add", str(min((hunt / "crashes").glob("[!.]*"))), "--to", "kept")
+    assert [path for path in before if path.exists()] == []
+    assert [path for path in stay if not path.exists()] == []
+
+
+def test_a_hunt_that_is_stopped_while_it_confirms_is_resumed_by_a_rerun(toy, monkeypatch):
+    monkeypatch.chdir(toy.folder)
+    scenario, settings = plan(Request(scenario="toy", trials=3, max_steps=60, arguments={"speed": "20"}))
+    asked = []
+
+    def stop(status):
+        if status.phase == "confirming" and not asked:
+            asked.append(os.kill(os.getpid(), signal.SIGTERM))
+
+    report = Hunt(toy.folder / "h", scenario, settings).run(stop)
+    assert [crash.confirmed for crash in report.crashes] == [None]
+    assert hunt_state(toy.folder / "h").state == "interrupted"
+    (state,) = toy.crashhunt("rerun", "h", "--json").json["hunts"]
+    assert state["state"] == "crashed"
+    assert [bundle.confirmed for bundle in list_bundles(toy.folder / "h")] == [True]
+
+
+SUITE = """
+[defaults]
+scenario = "toy"
+trials = 6
+max_steps = 60
+seed = 2
+[[hunts]]
+id = "fast"
+[hunts.arguments]
+speed = "9:14"
+[[hunts]]
+id = "slow"
+[hunts.arguments]
+speed = "4:5"
+"""
+AGENT = ("--scenario", "toy", "--agent", "driver:Driver", "--arg", "speed=20:22", "--seed", "1", "--keep-going")
+# Command, and what it makes.
+COMMANDS = {
+    "run": (("run", "new", "2", "12", "60", *AGENT, "--near-misses", "2", "--keep", "2"), "new"),
+    "probes": (("run", "new", "2", "6", "60", "--scenario", "toy", "--seed", "3", "--arg", "speed=9", "--disturb",
+                "brake=0.02", "--probe", "0.5", "--branch", "--keep-going", "--audit", "0.5"), "new"),
+    "suite": (("suite", "run", "suite.toml", "many", "2"), "many"),
+    "shrink": (("shrink", "h", "--crash", "0", "--budget", "60"), "h"),
+    "judge": (("judge", "h", "--crash", "0", "--why", "10"), ""),
+    "corpus run": (("corpus", "run", "kept", "--keep", "today"), "today"),
+    "bisect": (("bisect", "../h", "--good", "HEAD~2"), ""),
+    "salvage": (("check", "h", "--salvage", "saved"), "saved"),
+    "export": (("export", "h", "crash.zip", "--crash", "0"), "crash.zip"),
+    "report": (("report", "h", "--output", "report.html"), "report.html"),
+    "replay": (("replay", "h", "--crash", "0", "--code", "current"), ""),
+    "archive": (("replay", "before.zip", "--trust"), ""),
+    "rerun": (("rerun", "h", "--to", "again", "--set", "trials=5"), "again"),
+    "film": (("replay", "h", "--crash", "0", "--from-log", "--frames", "frames"), "frames"),
+}  # fmt: skip
+
+
+LEAVING = """
+import _posixshmem, os, uuid
+def leave():
+    name = "/crashhunt-test-" + os.environ["TMPDIR"].replace("/", "-") + uuid.uuid4().hex
+    os.close(_posixshmem.shm_open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode=0o600))
+"""
+
+
+def prepared(shell):
+    """A folder with everything that is killed later."""
+    (shell.folder / "driver.py").write_text(LEAVING + DRIVER.replace("pass", "leave()"))
+    (shell.folder / "suite.toml").write_text(SUITE)
+    shell.crashhunt("run", "h", "2", "3", "60", *AGENT)
+    shell.crashhunt("corpus", "add", *map(str, (shell.folder / "h" / "crashes").glob("00000[01]-*")), "--to", "kept")
+    shell.crashhunt("export", "h", "before.zip", "--crash", "0")
+    project = shell.folder / "my project"
+    project.mkdir()
+    git(project, "init", "-q")
+    for number, code in enumerate((MENDED, f"{MENDED}# 1\n", DRIVER)):
+        (project / "driver.py").write_text(LEAVING + code.replace("pass", "leave()"))
+        git(project, "add", "driver.py")
+        git(project, "commit", "-qm", str(number))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", COMMANDS)
+def test_whatever_is_killed_whenever_nothing_is_lost_and_nothing_left(toy, made_once, temporary_files, name):
+    """Eight kills of each command: at steps on files, and after some time."""
+    kills = int(os.environ.get("CRASHHUNT_TEST_KILLS", "8"))
+    made_once(prepared, toy)
+    base, words = toy.folder, COMMANDS[name][0]
+    (base / "sitecustomize.py").write_text(AT_STEP)
+    environment = {**toy.environment, "TMPDIR": str(temporary_files), "PYTHONPATH": str(base)}
+    whole = base.with_name(f"whole of {base.name}")
+    shutil.copytree(base, whole, symlinks=True)
+    folder = base / "my project" if name == "bisect" else base
+
+    def begin(step: int) -> subprocess.Popen:
+        return subprocess.Popen(
+            [str(Path(sys.executable).parent / "crashhunt"), *words], cwd=folder, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, env={**environment, "KILL_AT_STEP": str(step), "STEPS_FILE": str(base / "steps")},
+        )  # fmt: skip
+
+    def ended(process: subprocess.Popen) -> int:
+        _, said = process.communicate(timeout=300)
+        assert b"Traceback" not in said, said
+        return process.returncode
+
+    def nothing_is_left() -> None:
+        wait_for(lambda: not processes_of(base), timeout_s=10.0)
+        subprocess.run([str(Path(sys.executable).parent / "crashhunt"), "oracles"], env=environment,
+                       cwd=base, check=True, capture_output=True)  # fmt: skip
+        assert left_in(base) == []
+        assert not [*base.glob("my project/.git/worktrees")]
+        assert not [*Path("/dev/shm").glob(f"crashhunt-test-{str(temporary_files).replace('/', '-')}*")]
+
+    began = time.monotonic()
+    code = ended(begin(NEVER))
+    took_s = time.monotonic() - began
+    assert code in (0, 1)
+    steps, right = int((base / "steps").read_text()), facts(base)
+    nothing_is_left()
+    generator = random.Random(name)
+    for number in range(kills):
+        shutil.rmtree(base)
+        shutil.copytree(whole, base, symlinks=True)
+        if number % 2:
+            process = begin(generator.randint(1, steps))
+        else:
+            process = begin(NEVER)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(generator.uniform(0.15, 1.0) * took_s)
+            process.kill()
+        process.communicate(timeout=60)
+        nothing_is_left()
+        if name == "film" and (base / "frames").exists():  # which takes no folder that has anything in it
+            assert facts(base) == right
+            remove_tree(base / "frames")
+        assert ended(begin(NEVER)) == code, (name, number)
+        assert facts(base) == right, (name, number)
+        nothing_is_left()
+
+
+def facts(base: Path) -> dict[str, object]:
+    """What commands have made, but for what tells when, and by which process."""
+    found: dict[str, object] = {}
+    for path in sorted(base.rglob("*")):
+        name = str(path.relative_to(base))
+        if path.name == "ledger.sqlite":
+            with closing(sqlite3.connect(path)) as database:
+                rows = database.execute("SELECT number, result FROM trials ORDER BY number")
+                found[name] = [(number, json.loads(row)["outcome"], json.loads(row)["digest"]) for number, row in rows]
+        elif path.name == "crash.json":
+            data = json.loads(path.read_text())
+            found[name] = [data.get(key) for key in ("outcome", "digest", "confirmed", "step", "shrunk")]
+        elif path.suffix in (".sqlite-wal", ".sqlite-shm", ".pyc", ".jsonl") or ".git/" in name or "__pyca" in name:
+            continue
+        elif path.is_file() and path.name not in ("steps", "run.log", ".lock"):
+            found[name] = path.name
+    return found
