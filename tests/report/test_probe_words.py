@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from types import SimpleNamespace
 
+from crashhunt.hunts import Ledger
 from crashhunt.hunts._branched import BranchReport
 from crashhunt.hunts._probed import ProbeReport
+from crashhunt.report._page import _trials
 from crashhunt.report._probes import describe_branches, describe_probes
+from crashhunt.trial import Outcome, Stress, TrialResult, TrialSpec
 
 WHY = "a copy was killed by SIGKILL"
 
@@ -44,3 +48,13 @@ def test_what_could_not_be_run_from_the_start_is_told_apart_from_what_did_not_cr
     assert lines[2] == "  1 trial was not fully asked: a copy was killed by SIGKILL"
     assert lines[3] == "  of the 5 likeliest, 0 crashed from the start as well, and 2 could not be run to the end:"
     assert branched.to_json()["not_fully_asked"] == 1
+
+
+def test_page_counts_trials_that_are_not_fully_asked_apart_from_the_least_margin(tmp_path):
+    half = Stress(None, moments=9, moments_asked=1, margin_upper_bound=0.125)
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        for number, stress in enumerate([Stress(0.5, moments=9, moments_asked=9), half, None]):
+            spec = TrialSpec(number, number, {}, {}, max_steps=20)
+            ledger.record(TrialResult(spec, Outcome.SURVIVED, steps=20, stress=stress), snapshot="")
+    found = _trials(tmp_path)
+    assert (found["stress"], found["not_fully_asked"]) == ({"margin": 0.5, "trial": 0}, 1)
