@@ -336,6 +336,7 @@ def test_who_empties_sys_modules_is_to_blame_for_what_fails_next(tmp_path):
                 sys.modules.clear()
             return super().act(observation)
 
+    np.ones((2, 2)).min(axis=1)  # NumPy imports a part of itself here when it is first used
     receive, send = os.pipe()
     child = os.fork()
     if child == 0:

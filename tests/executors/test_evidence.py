@@ -29,8 +29,9 @@ def left_behind(tmp_path_factory):
     result = run_episode(
         SPEC, simulator=parts.simulator(), make_agent=parts.agent, box=box, oracles=parts.oracles(), crash_on=()
     )
-    header = read_header(place / "box")
-    return header, bytes(box.committed()), result
+    header, records = read_header(place / "box"), bytes(box.committed())
+    box.close()
+    return header, records, result
 
 
 def report_of(result, key=KEY, **changes):
@@ -130,6 +131,7 @@ def test_black_box_file_says_what_the_process_wrote(tmp_path):
     with (tmp_path / "box").open("r+b") as file:
         file.truncate(70)
     assert not supervised.is_reusable()
+    box.close()
     supervised.close()
 
 
