@@ -1,4 +1,4 @@
-"""Requests to stop: Ctrl-C, SIGTERM, a hang-up."""
+"""Requests to stop: Ctrl-C, SIGTERM, a hang-up; and code that no signal handler may interrupt."""
 
 from __future__ import annotations
 
@@ -11,12 +11,38 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["stop_requests"]
+__all__ = ["block_signals", "blocked_signals", "stop_requests"]
+
+# Bound here, before an agent is imported that could replace them.
+_set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
 """GNU timeout sends its signal to the process and then to its group, and batch systems do the like: what comes twice
 within this is one request, not an impatient person."""
+
+
+def block_signals() -> None:
+    """Have no signal handler of Python run in this thread from now on.
+
+    A handler whose signal has come before may run once more meanwhile, and what it raises is dropped.
+    """
+    for _ in range(2):
+        try:
+            _set_mask(signal.SIG_BLOCK, _ALL)
+        except BaseException:
+            continue
+
+
+@contextmanager
+def blocked_signals() -> Iterator[None]:
+    """Have no signal handler of Python run in this thread meanwhile; signals that come are handled afterwards."""
+    before = _set_mask(signal.SIG_BLOCK, ())
+    try:
+        block_signals()
+        yield
+    finally:
+        _set_mask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
