@@ -63,7 +63,7 @@ def raises_error():
 
 @harm("raises")
 def raises_bare():
-    raise BareError
+    raise BareError("harm")
 
 
 @harm("raises")
@@ -137,6 +137,15 @@ def feigns_simulator():
 @harm("raises")
 def feigns_invalid():
     raise InvalidEpisodeError("no room")
+
+
+@harm("raises")
+def raises_forever():
+    def handle(*_):
+        raise ValueError("again")
+
+    signal.signal(signal.SIGALRM, handle)
+    signal.setitimer(signal.ITIMER_REAL, 0.0005, 0.0005)
 
 
 @harm("raises")
