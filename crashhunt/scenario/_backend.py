@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.errors import ScenarioError
     from crashhunt.scenario._scenario import Scenario
+    from crashhunt.scenario._traffic_survey import TrafficSurvey
     from crashhunt.trial import Value
     from crashhunt.world import RightOfWay
 
@@ -126,6 +127,7 @@ class Backend:
             scenario arguments, and the specifications of those that are texts. Without, strangers are refused.
         right_of_way: returns who has to give way at the junctions of the map; None where that is not known.
         plays_paths: whether it can move others along recorded ways.
+        survey: how it finds, before a hunt, the vehicles that an agent can replace in one of its ``configurations``.
         watched: the packages in whose classes it keeps settings that an episode may change: a worker in which one has
             is not used again.
     """
@@ -156,6 +158,7 @@ class Backend:
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
     plays_paths: bool = False
+    survey: TrafficSurvey | None = None
     watched: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
