@@ -114,6 +114,7 @@ def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline: floa
             if now - first_s >= WITHOUT_ROAD_VEHICLES_S:
                 return found
         elif found["steps"] >= MAX_STEPS_BEFORE_FIRST_ENTRY:
+            found["cut_short"] = True
             return found
         if libsumo.simulation.getMinExpectedNumber() == 0:  # every vehicle and person has left, and none is to come
             return found

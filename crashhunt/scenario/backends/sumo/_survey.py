@@ -67,6 +67,10 @@ def refine(scenario: Scenario, answer: Json) -> Scenario:
     known = _entering(runs)
     (agent,) = scenario.agents
     setup = scenario.agents[agent]
+    if not known and any(run["cut_short"] for run in runs):
+        steps = max(run["steps"] for run in runs)
+        note = f"warning: no vehicle that an agent can drive enters before step {steps}, where the look ahead ended"
+        return replace(scenario, notes=(scenario.notes[0], note, *scenario.notes[1:]))
     if not known:
         _refuse_undrivable(scenario, runs)
         if setup.route:
