@@ -75,9 +75,10 @@ class TrafficSurveyor:
                 return restored
         try:
             answer = _survey(scenario, _runs(settings, drawn))
-        except SimulatorError as error:
+        except (SimulatorError, OSError) as error:
             # The hunt goes on: where SUMO refuses its input, the first trial reports which file and line.
-            note = f"warning: the vehicles are as the route files list them, and may not enter: {error}"
+            why = f"the survey cannot run: {error}" if isinstance(error, OSError) else str(error)
+            note = f"warning: candidates are the vehicles that the route files list, entering or not: {why}"
             return replace(scenario, notes=(scenario.notes[0], note, *scenario.notes[1:]))
         return survey.refine(scenario, answer)
 

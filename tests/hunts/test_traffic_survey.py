@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import signal
@@ -122,7 +123,8 @@ def test_where_no_trial_can_be_valid_one_line_says_so_before_the_first(shell, de
     done = shell.crashhunt("run", "h", "1", "4", "20", *WORDS, expect=code)
     assert says in done.json["error"]["message"]
     assert done.json["error"]["fix"]
-    assert done.err.count("\n") == 1
+    (line,) = [line for line in done.err.splitlines() if not line.startswith("simulating the plain traffic")]
+    assert line.startswith("crashhunt: ")
     assert not (shell.folder / "h").exists()
 
 
@@ -150,6 +152,17 @@ def test_a_survey_that_takes_too_long_is_given_up(town, monkeypatch):
     scenario, settings = surveyed(town.folder)
     assert "took over 0 s of wall time" in scenario.notes[1]
     assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
+
+
+def test_without_room_for_the_survey_the_hunt_goes_on(town, monkeypatch):
+    monkeypatch.setattr(_traffic_survey, "Kept", lambda *_, **__: raise_full())
+    scenario, settings = surveyed(town.folder)
+    assert "the survey cannot run: [Errno 28]" in scenario.notes[1]
+    assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
+
+
+def raise_full():
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
