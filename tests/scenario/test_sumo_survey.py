@@ -45,6 +45,7 @@ def test_candidates_are_the_vehicles_that_enter_in_every_run(town):
     scenario = refine(town(), [first, second])
     assert candidates(scenario) == ["t200", "t250", "t400"]
     assert scenario.agents["ego"].depart_s == 402.0  # the latest of both runs
+    assert scenario.notes[1:] == town().notes[1:]
     assert scenario.notes[0] == "each trial replaces one random vehicle (3 candidates, entering at 203-402 s)"
     assert refine(town(ego=""), [first]).notes[0].startswith("no --ego given: each trial replaces")
 
@@ -95,7 +96,7 @@ def test_traffic_without_road_vehicles_is_refused(town, classes, says):
 
 def test_traffic_that_never_enters_leaves_no_valid_trial(town):
     with pytest.raises(NoValidTrialError, match=r"no vehicle enters in 700 s of simulation \(700 steps from 0 s\)"):
-        refine(town(), [run([]), run([])])
+        refine(town(), [run([], end_s=9.0, steps=9), run([])])
     assert NoValidTrialError.exit_code == 3
     parked = run([])
     parked["entries"] = [("x", 1.0, "passenger", True)]
@@ -105,10 +106,12 @@ def test_traffic_that_never_enters_leaves_no_valid_trial(town):
 
 @pytest.mark.parametrize("entries", [[], [("train", 5.0, "rail")]])
 def test_a_run_that_was_cut_short_refuses_nothing(town, entries):
-    scenario = town()
+    scenario = town(end=900)  # of which a note says that it is not heeded
+    assert len(scenario.notes) > 1
     found = refine(scenario, [run(entries, cut_short=True, steps=500_000)])
     assert found.arguments == scenario.arguments
     assert "no vehicle that an agent can drive enters before step 500000" in found.notes[1]
+    assert (found.notes[0], *found.notes[2:]) == scenario.notes
 
 
 def test_a_demand_of_0_at_one_end_is_no_reason_to_refuse(town):
@@ -120,6 +123,10 @@ def test_a_long_wait_is_told_in_one_line(town):
     (note,) = [note for note in refine(town(step_length=0.5), [late]).notes if note.startswith("warning")]
     assert "no vehicle enters before step 2000 (1000 s)" in note
     assert note.endswith("Fix: set begin to 999 in town.sumocfg")
+    in_the_morning = run([("a", 25800.0), ("b", 25900.0)], begin_s=25200.0)
+    at = '<trip id="{}" depart="{}" from="south" to="east"/>'
+    morning = town(at.format("a", 25800) + at.format("b", 25900), begin=25200)
+    assert "before step 600 (25800 s)" in refine(morning, [in_the_morning]).notes[1]
     soon = run([("a", 299.0), ("b", 300.0)])
     assert not [note for note in refine(town(), [soon]).notes if note.startswith("warning")]
 
@@ -128,6 +135,8 @@ def test_of_gridlocked_traffic_those_are_candidates_that_enter_before(town):
     jam = {"since_s": 150.0, "standing": 60, "vehicles": 62}
     entries = [(f"v{at}", float(at)) for at in range(0, 300, 10)]
     scenario = refine(town(), [run(entries, gridlock=jam), run(entries)])
+    later = {"since_s": 250.0, "standing": 70, "vehicles": 70}
+    assert refine(town(), [run(entries, gridlock=later), run(entries, gridlock=jam)]).arguments == scenario.arguments
     (note,) = [note for note in scenario.notes if note.startswith("warning")]
     assert "gridlocked from 150 s on: 60 of 62 vehicles stand still, in 1 of 2 runs" in note
     assert candidates(scenario)[0] == "v50"

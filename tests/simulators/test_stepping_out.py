@@ -18,7 +18,7 @@ from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators.sumo import SumoSimulator, _disturbances, _stepping_out
-from crashhunt.simulators.sumo._stepping_out import JunctionLanes, SteppingOut, can_step_out
+from crashhunt.simulators.sumo._stepping_out import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 NETS = Path(__file__).parent / "nets"
@@ -253,3 +253,43 @@ def test_who_cannot_step_out_is_not_commanded(drive, monkeypatch):
     assert not result.disturbances
     points = np.array(watch.of("person walker", "points"))
     assert np.ptp(points[:, 1]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((3, 4), (4, 90, 0)),
+        ((-3, 4), (5, 90, 8)),  # before the beginning: the next perpendicular is on the other part
+        ((-3, -4), (5, 90, math.hypot(13, 4) - 5)),  # the corner counts as one
+        ((13, -4), (5, 90, 0)),  # around a corner that is passed on the outside
+        ((14, 7), (4, 0, 0)),
+        ((10, 25), (5, 0, 20)),
+    ],
+)
+def test_the_nearest_point_of_a_lane(point, expected):
+    assert _nearest([(0, 0), (10, 0), (10, 20)], point) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("one", "other", "angle"), [(10, 350, 20), (350, 10, 20), (0, 180, 180), (-90, 270, 0)])
+def test_the_angle_between_two_directions(one, other, angle):
+    assert _between(one, other) == angle
+
+
+def test_lanes_of_junctions_are_looked_for_nearby_only(junction):
+    """At the first junction, 50 m from the second one: within how far a person gets, and how far others may be."""
+    junctions = JunctionLanes()
+    everything = {lane.shape for lane in junctions.near((25.0, 0.0), 100.0)}
+    walked = [lane for lane in libsumo.lane.getIDList() if lane.startswith(":") and lane[2:4] in ("_c", "_w")]
+    assert everything == {libsumo.lane.getShape(lane) for lane in walked}
+    areas = [lane for lane in walked if lane[2:4] == "_w"]
+    assert sum(lane.walking_area for lane in junctions.near((25.0, 0.0), 100.0)) == len(areas) > 8
+    for x, y in ((0.0, 0.0), (0.0, 20.0), (0.0, -25.0), (25.0, 0.0), (70.0, 5.0), (-45.0, 0.0), (25.0, 70.0)):
+        reach = 4.0 + 15.0 + 3.2
+        expected = {
+            shape
+            for shape in everything
+            if (np.min(shape, axis=0) <= np.array((x, y)) + reach).all()
+            and (np.max(shape, axis=0) >= np.array((x, y)) - reach).all()
+        }
+        assert {lane.shape for lane in junctions.near((x, y), 4.0)} == expected
+    assert not expected
