@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle
     from crashhunt.hunts import Hunt, HuntReport, HuntStatus
+    from crashhunt.plans import HuntSettings, Request
     from crashhunt.replays import Code, ReplayReport
+    from crashhunt.scenario import Scenario
     from crashhunt.snapshots import SnapshotOptions
 
 __all__ = ["HuntCall", "RunCall", "prepare", "replay", "run"]
@@ -78,7 +80,12 @@ def _prepared(asked: HuntCall) -> Hunt:
     request = request_of(asked, trials=asked.trials, max_steps=asked.max_steps, parallel=asked.parallel).checked()
     from crashhunt.plans import plan
 
-    found, settings = plan(request)
+    def survey(scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
+        from crashhunt.hunts import TrafficSurveyor
+
+        return TrafficSurveyor(Path(asked.directory), overwrite=asked.overwrite)(scenario, request, settings)
+
+    found, settings = plan(request, survey=survey)
     from crashhunt.hunts import Hunt
     from crashhunt.snapshots import SnapshotOptions
 

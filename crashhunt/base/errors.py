@@ -7,6 +7,7 @@
     │   ├── ArgumentError          an argument specification or value
     │   └── CallError              a call from Python with arguments that there are not; a TypeError as well
     ├── ScenarioError              a scenario file: which file, which key, which value
+    │   └── NoValidTrialError      no trial in it can be set up; exit code 3
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
     │   └── BusyError              another hunt is running in it
@@ -39,6 +40,7 @@ __all__ = [
     "EpisodeError",
     "HuntDirectoryError",
     "InvalidEpisodeError",
+    "NoValidTrialError",
     "PluginError",
     "RecorderError",
     "ScenarioError",
@@ -110,6 +112,12 @@ class CallError(UsageError, TypeError):
 
 class ScenarioError(CrashhuntError):
     """A scenario that cannot be used."""
+
+
+class NoValidTrialError(ScenarioError):
+    """No trial in a scenario can be set up."""
+
+    exit_code = 3
 
 
 class PluginError(CrashhuntError):

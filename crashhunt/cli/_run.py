@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from crashhunt.cli._common import Commands
 
 __all__ = ["add_run"]
+
+_LONG_WAIT_S = 3.0  # after which people wonder
 
 
 def add_run(commands: Commands) -> None:
@@ -48,15 +52,19 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from crashhunt.api import prepare
 
-    hunt = prepare(
-        options.directory,
-        options.parallel,
-        options.trials,
-        options.max_steps,
-        overwrite=options.overwrite,
-        command=["crashhunt", *words],
-        **chosen_options(options),
-    )
+    waiting = _tell_of_the_survey(options)
+    try:
+        hunt = prepare(
+            options.directory,
+            options.parallel,
+            options.trials,
+            options.max_steps,
+            overwrite=options.overwrite,
+            command=["crashhunt", *words],
+            **chosen_options(options),
+        )
+    finally:
+        waiting.cancel()
     from rich.console import Console
 
     from crashhunt.report import Watcher, describe_hunt
@@ -75,6 +83,22 @@ def _run(options: argparse.Namespace, words: list[str]) -> int:
         return INTERRUPTED
     found = report.crashes or report.copied is not None
     return THE_ANSWER_IS_NO if found and options.fail_on_crash else DONE
+
+
+def _tell_of_the_survey(options: argparse.Namespace) -> threading.Timer:
+    """Return a timer that explains a long wait; the caller cancels it."""
+
+    def tell() -> None:
+        if str(options.scenario).endswith((".sumocfg", ".sumo.cfg")):
+            print(
+                "simulating the plain traffic, to find vehicles that enter (60 s at most)", file=sys.stderr, flush=True
+            )
+
+    timer = threading.Timer(_LONG_WAIT_S, tell)
+    timer.daemon = True
+    if options.ego in (None, "", "any"):
+        timer.start()
+    return timer
 
 
 def _leave_at_once(*, as_json: bool) -> NoReturn:

@@ -21,3 +21,4 @@ from ._searching import SearchStatus as SearchStatus, StrategyStatus as Strategy
 from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
 from ._surplus import dropped_crashes as dropped_crashes
 from ._tables import write_parquet as write_parquet, write_text as write_text
+from ._traffic_survey import TrafficSurveyor as TrafficSurveyor

@@ -24,23 +24,37 @@ from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from crashhunt.disturbances import Disturber
     from crashhunt.plans._request import Request
     from crashhunt.trial import Signature
 
+    Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
+
 __all__ = ["disturber", "parse_crash_on", "plan", "sampler_of", "with_settings"]
 
 
-def plan(request: Request) -> tuple[Scenario, HuntSettings]:
+def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
     """Resolve a request.
+
+    Args:
+        request: what was asked.
+        survey: returns the scenario with the vehicles that an agent can replace. It is called last, as it may take
+            long: what cannot be meant is refused sooner.
 
     Raises:
         CrashhuntError: with what is wrong with it.
     """
     request = request.checked()
-    scenario = load_scenario(request.scenario, ego=request.ego)
+    loaded = load_scenario(request.scenario, ego=request.ego)
+    scenario, settings = _planned(request, loaded)
+    if survey is not None and (surveyed := survey(loaded, request, settings)) is not loaded:
+        scenario, settings = _planned(request, surveyed)
+    return scenario, settings
+
+
+def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettings]:
     scenario = _acting(
         scenario.with_agents(_locators(request, scenario)), dict.fromkeys(scenario.agents, request.action)
     )

@@ -21,3 +21,8 @@ from ._registry import (
 from ._scenario import Scenario as Scenario, argument_values as argument_values, with_action as with_action
 from ._shipped import shipped_folder as shipped_folder, shipped_scenarios as shipped_scenarios
 from ._tables import AgentSetup as AgentSetup, ArgumentSetup as ArgumentSetup, ObservationSetup as ObservationSetup
+from ._traffic_survey import (
+    RunToSurvey as RunToSurvey,
+    SurveyJob as SurveyJob,
+    TrafficSurvey as TrafficSurvey,
+)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.errors import ScenarioError
     from crashhunt.scenario._scenario import Scenario
+    from crashhunt.scenario._traffic_survey import TrafficSurvey
     from crashhunt.trial import Value
     from crashhunt.world import RightOfWay
 
@@ -128,6 +129,7 @@ class Backend:
         plays_paths: whether it can move others along recorded ways.
         forkable: whether it is known that a process can be forked after it has made the simulator, which starts no
             threads. Otherwise a fork finds out before the first trial.
+        survey: how it finds, before a hunt, the vehicles that an agent can replace in one of its ``configurations``.
     """
 
     title: str = ""
@@ -157,6 +159,7 @@ class Backend:
     right_of_way: Callable[[Scenario], RightOfWay | None] | None = None
     plays_paths: bool = False
     forkable: bool = False
+    survey: TrafficSurvey | None = None
 
     def __post_init__(self) -> None:
         if self.table is not None and not is_dataclass(self.table):

@@ -267,7 +267,10 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 def _planned(folder: Path, request: Request, run: Given) -> tuple[Scenario, HuntSettings]:
     """What to run: what is there already, or what was asked for."""
     if not (folder / layout.HUNT).exists():
-        return plan(replace(request, run=replace(request.run, **run)))
+        from crashhunt.hunts import TrafficSurveyor
+
+        survey = TrafficSurveyor(folder, overwrite=False)
+        return plan(replace(request, run=replace(request.run, **run)), survey=survey)
     settings = read_settings(folder / layout.HUNT)
     snapshot = latest_snapshot(folder)
     scenario = load_scenario(request.scenario, ego=request.ego) if snapshot is None else snapshot.scenario()

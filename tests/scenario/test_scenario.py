@@ -209,7 +209,7 @@ def test_a_bare_sumocfg_is_a_scenario(town):
         "time-to-teleport": "300",
     }
     assert scenario.arguments["scale"].option == "scale"
-    assert "drawn from 3 that depart from 50 to 57 s" in scenario.notes[0]
+    assert scenario.notes[0].endswith("each trial replaces one random vehicle (3 candidates, departing at 50-57 s)")
 
 
 def test_whom_a_controlled_vehicle_may_replace(town):

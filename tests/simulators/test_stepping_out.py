@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import os
+import resource
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import libsumo
@@ -13,7 +17,8 @@ from onlookers import Steady, Watch
 from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
-from crashhunt.simulators.sumo import SumoSimulator
+from crashhunt.simulators.sumo import SumoSimulator, _disturbances, _stepping_out
+from crashhunt.simulators.sumo._stepping_out import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 NETS = Path(__file__).parent / "nets"
@@ -132,3 +137,159 @@ def test_whose_lane_goes_on_merges_nowhere(drive):
     ego, other = MERGING.format("ego", 10, 0), MERGING.format("other", 25, 1)
     _, watch = drive(ego + other, Disturbance(2, "left ahead", "late_merge", 10.0, 60.0, "ego"), net="taper", steps=5)
     assert [one.vehicle for one in watch.told] == [""]
+
+
+def traffic_at_two_junctions():
+    """Persons who walk from each street to each other one, and vehicles that drive likewise."""
+    streets = {"w": "c", "n": "c", "s": "c", "e": "d", "m": "d", "t": "d"}
+    ways = [(f"{a}{streets[a]}", f"{streets[b]}{b}") for a in streets for b in streets if a != b]
+    people = [
+        f'<person id="p{at}.{a}.{b}" depart="{at * 10 + number * 0.3:.2f}" departPos="25">'
+        f'<walk from="{a}" to="{b}"/></person>'
+        for at in range(4)
+        for number, (a, b) in enumerate(ways)
+    ]
+    cars = [
+        f'<trip id="v{at}.{a}.{b}" depart="{at * 60 + number * 2}" from="{a}" to="{b}"/>'
+        for at in range(2)
+        for number, (a, b) in enumerate(ways)
+    ]
+    return "".join(people), "".join(cars)
+
+
+@pytest.fixture
+def junction(tmp_path):
+    routes = []
+    for index, traffic in enumerate(traffic_at_two_junctions()):
+        routes.append(str(tmp_path / f"{index}.rou.xml"))
+        Path(routes[-1]).write_text(f"<routes>{traffic}</routes>")
+    files = [f"--net-file={NETS / 'walks.net.xml'}", f"--route-files={','.join(routes)}"]
+    options = [
+        "--step-length=0.5",
+        "--seed=3",
+        "--collision.check-junctions",
+        "--collision.action=warn",
+        "--no-warnings",
+    ]
+    (libsumo.load if libsumo.isLoaded() else lambda words: libsumo.start(["sumo", *words]))([*files, *options])
+    yield
+    libsumo.close()
+
+
+def meetings(person):
+    """The vehicles into whose way a person may step."""
+    x, y = libsumo.person.getPosition(person)
+    for vehicle in libsumo.vehicle.getIDList():
+        heading = math.radians(90 - libsumo.vehicle.getAngle(vehicle))
+        dx, dy = x - libsumo.vehicle.getPosition(vehicle)[0], y - libsumo.vehicle.getPosition(vehicle)[1]
+        ahead, left = dx * math.cos(heading) + dy * math.sin(heading), dy * math.cos(heading) - dx * math.sin(heading)
+        if 0 < ahead <= 60 and 1.6 < abs(left) <= 15:
+            yield vehicle
+
+
+MAPPED = 2  # exit code: SUMO has put the person onto a crossing, a walking area or the inside of a junction
+
+
+def outcome_of_stepping_out(person, vehicle, seconds=6.0):
+    """How a copy of this process ends in which that happens: 0, `MAPPED`, or minus the signal that ended it."""
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        code = 1
+        try:
+            steps = round(seconds / 0.5)
+            stepping = SteppingOut(f"person {person}", vehicle, 1.4, steps, 0.5, {})
+            roads = set()
+            for _ in range(steps - 1):
+                libsumo.simulationStep()
+                roads.add(libsumo.person.getRoadID(person))
+                stepping.keep()
+            libsumo.simulationStep()
+            stepping.end()
+            for _ in range(20):
+                libsumo.simulationStep()
+            code = MAPPED if any(road.startswith(":") for road in roads) else 0
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+@pytest.mark.parametrize("every", [45, pytest.param(2, marks=pytest.mark.nightly)])
+def test_near_junctions_persons_step_out_only_where_sumo_keeps_them_on_their_sidewalk(junction, every):
+    """Elsewhere SUMO may map them to a crossing or a walking area, and on large networks the process may die then."""
+    junctions, refused, outcomes = JunctionLanes(), Counter(), Counter()
+    for step in range(120):
+        libsumo.simulationStep()
+        for person in libsumo.person.getIDList()[step % every :: every]:
+            inside = libsumo.person.getRoadID(person).startswith(":")
+            for vehicle in list(meetings(person))[:1]:
+                if can_step_out(f"person {person}", vehicle, 4.2, junctions):
+                    assert not inside
+                    outcomes[outcome_of_stepping_out(person, vehicle)] += 1
+                else:
+                    refused[inside] += 1
+    assert set(outcomes) == {0}
+    assert outcomes[0] > 10
+    assert refused[True] > 10
+    assert refused[False] > 10
+
+
+def test_the_next_person_steps_out_where_the_nearest_cannot(drive, monkeypatch):
+    further = WALKER.removeprefix(STEADY).replace("walker", "further").replace('departPos="60"', 'departPos="70"')
+    _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
+    assert [one.vehicle for one in watch.told] == ["person walker"]
+    able = _stepping_out.can_step_out
+    monkeypatch.setattr(
+        _stepping_out, "can_step_out", lambda actor, *more: actor != "person walker" and able(actor, *more)
+    )
+    _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
+    assert [one.vehicle for one in watch.told] == ["person further"]
+
+
+def test_who_cannot_step_out_is_not_commanded(drive, monkeypatch):
+    """Not even where somebody else has chosen the person, as in a crash that is made smaller."""
+    monkeypatch.setattr(_disturbances, "can_step_out", lambda *_: False)
+    result, watch = drive(EGO + WALKER, stepping(20), steps=40)
+    assert not result.disturbances
+    points = np.array(watch.of("person walker", "points"))
+    assert np.ptp(points[:, 1]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((3, 4), (4, 90, 0)),
+        ((-3, 4), (5, 90, 8)),  # before the beginning: the next perpendicular is on the other part
+        ((-3, -4), (5, 90, math.hypot(13, 4) - 5)),  # the corner counts as one
+        ((13, -4), (5, 90, 0)),  # around a corner that is passed on the outside
+        ((14, 7), (4, 0, 0)),
+        ((10, 25), (5, 0, 20)),
+    ],
+)
+def test_the_nearest_point_of_a_lane(point, expected):
+    assert _nearest([(0, 0), (10, 0), (10, 20)], point) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("one", "other", "angle"), [(10, 350, 20), (350, 10, 20), (0, 180, 180), (-90, 270, 0)])
+def test_the_angle_between_two_directions(one, other, angle):
+    assert _between(one, other) == angle
+
+
+def test_lanes_of_junctions_are_looked_for_nearby_only(junction):
+    """At the first junction, 50 m from the second one: within how far a person gets, and how far others may be."""
+    junctions = JunctionLanes()
+    everything = {lane.shape for lane in junctions.near((25.0, 0.0), 100.0)}
+    walked = [lane for lane in libsumo.lane.getIDList() if lane.startswith(":") and lane[2:4] in ("_c", "_w")]
+    assert everything == {libsumo.lane.getShape(lane) for lane in walked}
+    areas = [lane for lane in walked if lane[2:4] == "_w"]
+    assert sum(lane.walking_area for lane in junctions.near((25.0, 0.0), 100.0)) == len(areas) > 8
+    for x, y in ((0.0, 0.0), (0.0, 20.0), (0.0, -25.0), (25.0, 0.0), (70.0, 5.0), (-45.0, 0.0), (25.0, 70.0)):
+        reach = 4.0 + 15.0 + 3.2
+        expected = {
+            shape
+            for shape in everything
+            if (np.min(shape, axis=0) <= np.array((x, y)) + reach).all()
+            and (np.max(shape, axis=0) >= np.array((x, y)) - reach).all()
+        }
+        assert {lane.shape for lane in junctions.near((x, y), 4.0)} == expected
+    assert not expected

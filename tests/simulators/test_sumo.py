@@ -74,7 +74,7 @@ def test_another_vehicle_is_driven_in_each_trial(town):
     words = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--keep-trials", "--seed", "3")
     done = town.crashhunt("run", "h", "2", "6", "100", *words, "--json")
     assert "invalid" not in done.json["outcomes"]
-    assert "takes the place of another one, drawn from 3" in done.err
+    assert "each trial replaces one random vehicle (3 candidates, entering at 2" in done.err
     specs = [json.loads(path.read_text())["spec"] for path in (town.folder / "h" / "trials").glob("*/params.json")]
     assert {"ego"} == {agent for spec in specs for agent in spec["arguments"]}
     assert len({spec["scenario_arguments"]["vehicle"] for spec in specs}) > 1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import libsumo
 from libsumo import _libsumo as sumo
 
-from crashhunt.simulators.sumo._stepping_out import SteppingOut, roadside
+from crashhunt.simulators.sumo._stepping_out import JunctionLanes, SteppingOut, can_step_out, roadside
 from crashhunt.trial import steps_of
 from crashhunt.world import is_person
 
@@ -52,6 +52,7 @@ class SumoDisturbances:
         self._dt = step_length_s
         self._driving = driving
         self.speeds: dict[str, float] = {}
+        self._junctions = JunctionLanes()
 
     def whom(self, disturbance: Disturbance, scene: Scene) -> str:
         """Return who is at a place around an agent; empty where nobody is who is not controlled."""
@@ -59,7 +60,8 @@ class SumoDisturbances:
             if disturbance.what == "ignore_priority":
                 found = self._crossing(disturbance.agent, disturbance.who, scene)
             elif disturbance.what == "step_out":
-                found = roadside(scene, disturbance.agent, disturbance.who)
+                reach_m = disturbance.how_strong * disturbance.how_long / 2
+                found = roadside(scene, disturbance.agent, disturbance.who, reach_m, self._junctions)
             else:
                 found = _at(disturbance.agent, disturbance.who, left_hand=self._driving.left_hand)
         except libsumo.TraCIException:  # the agent has just arrived
@@ -71,6 +73,8 @@ class SumoDisturbances:
         strong = disturbance.how_strong
         try:
             if disturbance.what == "step_out":
+                if not can_step_out(vehicle, disturbance.agent, strong * disturbance.how_long / 2, self._junctions):
+                    return None
                 steps = steps_of(disturbance.how_long, self._dt)
                 return SteppingOut(vehicle, disturbance.agent, strong, steps, self._dt, self.speeds)
             if disturbance.what == "late_merge":

@@ -14,6 +14,7 @@ from ._options import (
 )
 from ._says import explained as explained
 from ._sumocfg import load_sumocfg as load_sumocfg
+from ._survey import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
 from ._table import SumoSetup as SumoSetup
 from ._xml import (
     READ as READ,

@@ -7,6 +7,7 @@ from importlib import metadata
 from typing import TYPE_CHECKING
 
 from crashhunt.scenario._backend import Backend, CompiledCore, Configuration
+from crashhunt.scenario._traffic_survey import TrafficSurvey
 from crashhunt.scenario.backends.sumo._options import INPUTS, canonical, writes
 from crashhunt.scenario.backends.sumo._table import SumoSetup
 from crashhunt.world import EVENT_WORDS
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.errors import ScenarioError
+    from crashhunt.base.plain import Json
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
     from crashhunt.world import RightOfWay
@@ -103,6 +105,18 @@ def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications
     return side_effect(scenario, values, specifications)
 
 
+def _refined(scenario: Scenario, answer: Json) -> Scenario:
+    from crashhunt.scenario.backends.sumo._survey import refine
+
+    return refine(scenario, answer)
+
+
+def _restored(scenario: Scenario, kept: Scenario) -> Scenario | None:
+    from crashhunt.scenario.backends.sumo._survey import restore
+
+    return restore(scenario, kept)
+
+
 def _without_core(scenario: Scenario) -> Scenario:
     return scenario.with_table(replace(scenario.table(SumoSetup), native=False))
 
@@ -138,4 +152,5 @@ BACKEND = Backend(
     explained=_explained,
     side_effect=_side_effect,
     right_of_way=_right_of_way,
+    survey=TrafficSurvey(module="crashhunt.simulators.sumo._traffic_survey", refine=_refined, restore=_restored),
 )

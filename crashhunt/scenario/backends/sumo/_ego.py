@@ -7,15 +7,21 @@ import os
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
 from crashhunt.scenario._tables import AgentSetup, ArgumentSetup
 from crashhunt.scenario.backends.sumo._xml import nested_files, read_xml
 
-__all__ = ["Ego", "choose_ego", "number", "seconds"]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["EGO_VEHICLE", "NOT_GIVEN", "Departure", "Ego", "choose_ego", "draw_among", "number", "seconds"]
 
 _EGO = "ego"
-_VEHICLE = "vehicle"  # the argument that says whose place the controlled vehicle takes
+EGO_VEHICLE = "vehicle"
+"""The scenario argument that names the vehicle that the controlled one replaces."""
+NOT_GIVEN = "no --ego given: "
 _BUSY_AFTER_S, _WINDOW_S = 200.0, 300.0
 """Whoever departs in an empty town meets nobody; and what is simulated before a trial is paid in every trial."""
 _MANY = 10_000  # of one flow
@@ -41,8 +47,8 @@ class Ego:
 
 
 @dataclass(frozen=True, slots=True)
-class _Departure:
-    """A vehicle that the route files promise."""
+class Departure:
+    """A vehicle that departs, as the route files promise, or that enters, as a simulation has shown."""
 
     vehicle: str
     depart_s: float
@@ -109,41 +115,65 @@ def choose_ego(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
 
 def _anybody(ego: str, files: list[Path], begin: float, path: Path) -> Ego:
     """Draw the vehicle in each trial, of those that depart when there is traffic; where none departs, add one."""
-    why = "" if ego else "no --ego was given: "
+    why = "" if ego else NOT_GIVEN
     # Who would have departed before the simulation begins never does.
     known = [one for one in _departures(files) if one.depart_s >= begin and not one.off_road]
     known.sort(key=lambda one: one.depart_s)
     if not known:
         return _on_any_route(files, path)
+    return draw_among(known, why=why, verb="depart")
+
+
+def draw_among(
+    known: Sequence[Departure], *, why: str = "", verb: str = "enter", few: int = 1, keep_agent: str = ""
+) -> Ego:
+    """Return a controlled vehicle that replaces another one in each trial, drawn from those that enter amid traffic.
+
+    Args:
+        known: the vehicles, at least one, by time.
+        why: the beginning of the note.
+        verb: of the note: what the vehicles do at their times.
+        few: with fewer candidates than this in the window of times, all of ``known`` are candidates.
+        keep_agent: the id that the controlled vehicle keeps, where that is possible; empty to choose one.
+    """
     first, last = known[0].depart_s, known[-1].depart_s
     since = first + min(_BUSY_AFTER_S, (last - first) / 3)
-    found = [one for one in known if since <= one.depart_s <= since + _WINDOW_S] or known
-    names = list(dict.fromkeys(one.vehicle for one in found if "|" not in one.vehicle)) or [known[0].vehicle]
+    found = [one for one in known if since <= one.depart_s <= since + _WINDOW_S]
+    names = _nameable(found)
+    if not found or (few > 1 and len(names) < few and len(_nameable(known)) > len(names)):
+        found, names = list(known), _nameable(known)
+    names = names or [known[0].vehicle]
     count = len(names)
-    if count == 1:
+    if count == 1 and not (keep_agent and "|" not in names[0]):
         depart = next(one.depart_s for one in known if one.vehicle == names[0])
         when = "" if len(known) == 1 else f" from {since:.0f} to {since + _WINDOW_S:.0f} s"
-        note = f"{why}the controlled vehicle is {names[0]!r}, the only one that departs{when}"
+        note = f"{why}the controlled vehicle is {names[0]!r}, the only one that {verb}s{when}"
         return Ego(names[0], AgentSetup(existing=True, depart_s=depart), note, {})
     if count > _AT_MOST:
         names = [names[index * count // _AT_MOST] for index in range(_AT_MOST)]
-    agent = next(name for name in (_EGO, f"crashhunt.{_EGO}") if all(one.vehicle != name for one in known))
+    others = {one.vehicle for one in known}
+    agent = next(name for name in (keep_agent or _EGO, _EGO, f"crashhunt.{_EGO}") if name not in others)
     note = (
-        f"{why}in each trial the controlled vehicle takes the place of another one, drawn from {len(names)} that "
-        f"depart from {found[0].depart_s:.0f} to {found[-1].depart_s:.0f} s"
+        f"{why}each trial replaces one random vehicle ({len(names)} candidate{'s' * (len(names) > 1)}, "
+        f"{verb}ing at {found[0].depart_s:.0f}-{found[-1].depart_s:.0f} s)"
     )
     return Ego(
         agent,
-        AgentSetup(replaces=_VEHICLE, depart_s=found[-1].depart_s),
+        AgentSetup(replaces=EGO_VEHICLE, depart_s=found[-1].depart_s),
         note,
         {
-            _VEHICLE: ArgumentSetup(
-                range="|".join(names),
+            EGO_VEHICLE: ArgumentSetup(
+                range="|".join(names) if len(names) > 1 else "",
                 default=names[0],
                 help="whose place the controlled vehicle takes",
             )
         },
     )
+
+
+def _nameable(vehicles: Sequence[Departure]) -> list[str]:
+    """Return the ids that a specification can list: its separator is ``|``."""
+    return list(dict.fromkeys(one.vehicle for one in vehicles if "|" not in one.vehicle))
 
 
 def _on_any_route(files: list[Path], path: Path) -> Ego:
@@ -156,7 +186,7 @@ def _on_any_route(files: list[Path], path: Path) -> Ego:
     )
 
 
-def _departures(files: list[Path]) -> list[_Departure]:
+def _departures(files: list[Path]) -> list[Departure]:
     """The vehicles that can be named before the simulation has run; of a flow, those that soon depart."""
     found = []
     elements = _elements(files, "vehicle", "trip", "flow", "vType")
@@ -172,11 +202,11 @@ def _departures(files: list[Path]) -> list[_Departure]:
         if element.tag == "flow":
             found += _of_flow(element, name, depart, element.get("type") in elsewhere)
         else:
-            found.append(_Departure(name, depart, element.get("type") in elsewhere))
+            found.append(Departure(name, depart, element.get("type") in elsewhere))
     return found
 
 
-def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[_Departure]:
+def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[Departure]:
     """The vehicles of a flow that depart until whoever is drawn has."""
     try:
         interval = _interval(flow, begin)
@@ -185,8 +215,8 @@ def _of_flow(flow: ET.Element, name: str, begin: float, off_road: bool) -> list[
         span = min(end - begin, 2 * (_BUSY_AFTER_S + _WINDOW_S))
         count = max(1, min(most, _MANY, int(span / interval) if interval > 0 else 1))
     except (ScenarioError, ZeroDivisionError, OverflowError, ValueError):
-        return [_Departure(f"{name}.0", begin, off_road)]
-    return [_Departure(f"{name}.{index}", begin + index * interval, off_road) for index in range(count)]
+        return [Departure(f"{name}.0", begin, off_road)]
+    return [Departure(f"{name}.{index}", begin + index * interval, off_road) for index in range(count)]
 
 
 def _departure_of(vehicle: str, files: list[Path]) -> float:

@@ -1,0 +1,130 @@
+"""Simulates the plain traffic of a scenario, without a controlled vehicle, and reports which vehicles enter and when.
+
+libsumo holds one simulation per process, so this module runs in a process of its own:
+``python -m crashhunt.simulators.sumo._traffic_survey JOB`` reads the job from a JSON file, writes the answer to another
+one, and SUMO's own output goes to standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.scenario import scenario_from_dict
+from crashhunt.scenario.backends.sumo import NOT_ON_A_ROAD, StagedFiles, SurveyedRun
+
+if TYPE_CHECKING:
+    from crashhunt.scenario import SurveyJob
+    from crashhunt.trial import Value
+
+__all__ = ["main"]
+
+AFTER_FIRST_ENTRY_S = 600.0
+"""Simulation time after the first road vehicle has entered: candidates are drawn from the first 500 s."""
+WITHOUT_ROAD_VEHICLES_S = 3600.0
+"""Simulation time after the first vehicle of any class has entered, while no road vehicle has."""
+MAX_STEPS_BEFORE_FIRST_ENTRY = 500_000
+MAX_VEHICLE_STEPS = 1_500_000
+"""Sum over steps of the vehicles on the road: 5 to 20 s of processor time. The bound counts vehicles and not seconds,
+so that every machine finds the same candidates."""
+LOOK_EVERY_S = 5.0
+GRIDLOCK_S = 120.0
+"""Longer than a usual cycle of a traffic light, so that a red phase in a small network is no gridlock."""
+GRIDLOCK_SHARE = 0.95
+MIN_VEHICLES_IN_GRIDLOCK = 5
+STANDING_MPS = 0.1
+STOPPED = 1  # bit of SUMO's stop state
+
+
+def main() -> None:
+    """Run what the job asks for; the answer holds the runs that were completed."""
+    job: SurveyJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    deadline = time.monotonic() + job["time_limit_s"]
+    scenario = scenario_from_dict(job["scenario"], where="survey", folder=Path(job["folder"]), tolerant=True)
+    stage = Path(job["stage"])
+    stage.mkdir(exist_ok=True)
+    files = StagedFiles(scenario, stage)
+    runs: list[SurveyedRun] = []
+    for asked in job["runs"]:
+        if runs and time.monotonic() >= deadline:
+            break
+        runs.append(_run(files, asked["seed"], asked["values"], deadline))
+    answer = Path(job["answer"])
+    temporary = answer.with_suffix(".part")
+    temporary.write_text(json.dumps(runs), encoding="utf-8")
+    temporary.replace(answer)
+    sys.stdout.flush()
+    os._exit(0)  # libsumo needs seconds to take down a large network
+
+
+def _run(files: StagedFiles, seed: int, values: dict[str, Value], deadline: float) -> SurveyedRun:
+    command = files.arguments(seed, values)
+    if libsumo.isLoaded():
+        libsumo.load(command)
+    else:
+        libsumo.start(["sumo", *command])
+    begin = libsumo.simulation.getTime()
+    dt = libsumo.simulation.getDeltaT()
+    look_every = max(1, round(LOOK_EVERY_S / dt))
+    found: SurveyedRun = {
+        "begin_s": begin, "end_s": begin, "steps": 0, "entries": [], "gridlock": None, "cut_short": False,
+    }  # fmt: skip
+    first_s = first_on_road_s = None
+    vehicle_steps = standing_looks = 0
+    while True:
+        libsumo.simulationStep()
+        found["steps"] += 1
+        now = libsumo.simulation.getTime()
+        found["end_s"] = now
+        on_the_road = set(sumo.vehicle_getIDList()) if (departed := libsumo.simulation.getDepartedIDList()) else ()
+        for vehicle in departed:
+            if vehicle not in on_the_road:
+                continue  # it left in the step in which it entered
+            vehicle_class = sumo.vehicle_getVehicleClass(vehicle)
+            parked = libsumo.vehicle.isStoppedParking(vehicle)
+            found["entries"].append((vehicle, now, vehicle_class, parked))
+            first_s = now if first_s is None else first_s
+            if first_on_road_s is None and not parked and vehicle_class not in NOT_ON_A_ROAD:
+                first_on_road_s = now
+        if found["steps"] % look_every:
+            continue
+        present = sumo.vehicle_getIDList()
+        vehicle_steps += len(present) * look_every
+        standing, free = _standing(present)
+        jammed = free >= MIN_VEHICLES_IN_GRIDLOCK and standing >= GRIDLOCK_SHARE * free
+        standing_looks = standing_looks + 1 if jammed else 0
+        if standing_looks * look_every * dt >= GRIDLOCK_S:
+            since = now - (standing_looks - 1) * look_every * dt
+            found["gridlock"] = {"since_s": since, "standing": standing, "vehicles": free}
+            return found
+        if vehicle_steps > MAX_VEHICLE_STEPS or time.monotonic() >= deadline:
+            found["cut_short"] = True
+            return found
+        if first_on_road_s is not None:
+            if now - first_on_road_s >= AFTER_FIRST_ENTRY_S:
+                return found
+        elif first_s is not None:
+            if now - first_s >= WITHOUT_ROAD_VEHICLES_S:
+                return found
+        elif found["steps"] >= MAX_STEPS_BEFORE_FIRST_ENTRY:
+            found["cut_short"] = True
+            return found
+        if libsumo.simulation.getMinExpectedNumber() == 0:  # every vehicle and person has left, and none is to come
+            return found
+
+
+def _standing(present: tuple[str, ...]) -> tuple[int, int]:
+    """Return how many vehicles stand still, and of how many: those at a planned stop do not count."""
+    free = [vehicle for vehicle in present if not sumo.vehicle_getStopState(vehicle) & STOPPED]
+    return sum(sumo.vehicle_getSpeed(vehicle) < STANDING_MPS for vehicle in free), len(free)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""The plain traffic is simulated before ``--ego any`` hunts, in a process of its own."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import signal
+import time
+import tomllib
+
+import pytest
+
+from crashhunt.hunts import TrafficSurveyor, _traffic_survey
+from crashhunt.plans import plan, request_of
+from crashhunt.plans._options import HuntOptions
+from crashhunt.scenario import shipped_folder
+
+WAY = '<route id="way" edges="south east north west"/>'
+# It stands where `blocked` departs, and for longer than trials wait.
+BLOCKED = (
+    f'{WAY}<vehicle id="plug" route="way" depart="0" departPos="7" departLane="0">'
+    '<stop lane="south_0" endPos="8" duration="9999"/></vehicle>'
+    '<flow id="blocked" route="way" begin="1" period="1" number="30" departPos="7" departLane="0"/>'
+    '<flow id="free" route="way" begin="2" period="3" number="9" departPos="30" departLane="1"/>'
+)
+WORDS = ("--scenario", "town.sumocfg", "--arg", "speed=5:9", "--keep-going", "--json")
+
+
+def write(folder, demand, options=""):
+    shutil.copy(shipped_folder() / "loop" / "loop.net.xml", folder / "net.net.xml")
+    (folder / "r.rou.xml").write_text(f"<routes>{demand}</routes>")
+    (folder / "town.sumocfg").write_text(
+        f'<configuration><n v="net.net.xml"/><r v="r.rou.xml"/><step-length v="0.5"/>{options}</configuration>'
+    )
+
+
+@pytest.fixture
+def town(shell):
+    write(shell.folder, BLOCKED)
+    return shell
+
+
+def hunted(folder, hunt="h"):
+    return tomllib.loads((folder / hunt / "hunt.toml").read_text())
+
+
+def surveyed(folder, *, hunt="h", survey=True, **options):
+    request = request_of(HuntOptions(scenario=str(folder / "town.sumocfg"), **options), trials=2, max_steps=9)
+    surveyor = TrafficSurveyor(folder / hunt, overwrite=False)
+    return plan(request, survey=surveyor if survey else None)
+
+
+def test_trials_replace_vehicles_that_enter_only(town):
+    done = town.crashhunt("run", "h", "2", "4", "20", *WORDS)
+    assert "invalid" not in done.json["outcomes"]
+    assert "no --ego given: each trial replaces one random vehicle (" in done.err
+    spec = hunted(town.folder)["scenario_arguments"]["vehicle"]["spec"]
+    assert spec
+    assert all(name.startswith("free.") for name in spec.split("|"))
+    # The files alone promise others, and would do so again: the hunt that is there keeps what it has drawn from.
+    before = hunted(town.folder)
+    _, settings = surveyed(town.folder, survey=False)
+    assert "blocked." in settings.scenario_arguments["vehicle"].spec
+    more = town.crashhunt("run", "h", "2", "6", "20", *WORDS)
+    assert more.json["trials_run"] == 6
+    assert {**hunted(town.folder), "trials": 4} == before
+
+
+def test_two_hunts_draw_from_the_same_vehicles(town):
+    one, other = (surveyed(town.folder, hunt=hunt, seed=1)[1] for hunt in "ab")
+    assert one == other
+
+
+def test_a_hunt_of_before_goes_on_with_the_vehicles_that_its_files_promised(town):
+    _, before = surveyed(town.folder, survey=False)
+    promised = before.scenario_arguments["vehicle"].spec
+    town.crashhunt("run", "h", "1", "1", "5", *WORDS, "--ego", "any", "--set", f"vehicle={promised}", expect=None)
+    found = hunted(town.folder)
+    assert found["scenario_arguments"]["vehicle"]["spec"] == promised
+    assert found["scenario_digest"] == before.scenario_digest  # that of a hunt without a survey
+    done = town.crashhunt("run", "h", "1", "2", "5", *WORDS, expect=None)
+    assert done.json["trials_planned"] == 2
+    assert hunted(town.folder)["scenario_arguments"] == found["scenario_arguments"]
+
+
+def test_no_survey_where_the_user_names_the_vehicle(town, monkeypatch):
+    monkeypatch.setattr(_traffic_survey, "_survey", lambda *_: pytest.fail("simulated"))
+    for options in ({"ego": "free.1"}, {"ego": "route=way"}, {"scenario_arguments": {"vehicle": "blocked.1"}},
+                    {"scenario_arguments": {"scenario.vehicle": "blocked.1"}}):  # fmt: skip
+        surveyed(town.folder, **options)
+    request = request_of(HuntOptions(scenario="loop"), trials=1, max_steps=1)
+    plan(request, survey=TrafficSurveyor(town.folder, overwrite=False))
+
+
+def test_the_demand_is_simulated_at_both_ends_of_its_range(town, monkeypatch):
+    asked = []
+
+    def survey(_scenario, runs):
+        asked.extend(runs)
+        return [{"begin_s": 0.0, "end_s": 9.0, "steps": 9, "entries": [("free.0", 2.0, "passenger", False)],
+                 "gridlock": None, "cut_short": False}]  # fmt: skip
+
+    monkeypatch.setattr(_traffic_survey, "_survey", survey)
+    _, settings = surveyed(town.folder, scenario_arguments={"scale": "0.5:2"})
+    assert [run["values"] for run in asked] == [{"scale": 0.5}, {"scale": 2.0}]
+    assert len({run["seed"] for run in asked}) == 2
+    assert settings.scenario_arguments["vehicle"].spec == "free.0"
+
+
+@pytest.mark.parametrize(
+    ("demand", "code", "says"),
+    [
+        (f'<vType id="train" vClass="rail_urban"/>{WAY}<vehicle id="a" type="train" route="way" depart="5"/>', 2,
+         "only rail vehicles enter"),
+        ('<flow id="f" begin="10" end="20" probability="0.00001" from="south" to="east"/>', 3,
+         "no vehicle enters in 25 s of simulation (50 steps from 0 s)"),
+    ],
+    ids=["rails", "nobody"],
+)  # fmt: skip
+def test_where_no_trial_can_be_valid_one_line_says_so_before_the_first(shell, demand, code, says):
+    write(shell.folder, demand)
+    done = shell.crashhunt("run", "h", "1", "4", "20", *WORDS, expect=code)
+    assert says in done.json["error"]["message"]
+    assert done.json["error"]["fix"]
+    (line,) = [line for line in done.err.splitlines() if not line.startswith("simulating the plain traffic")]
+    assert line.startswith("crashhunt: ")
+    assert not (shell.folder / "h").exists()
+
+
+def test_vehicles_that_stand_for_ever_are_a_gridlock(shell):
+    slow = '<vType id="slow" maxSpeed="0.01"/>'
+    flow = '<flow id="f" type="slow" route="way" begin="0" period="1" number="9" departPos="random_free"/>'
+    write(shell.folder, f"{slow}{WAY}{flow}")
+    scenario, _ = surveyed(shell.folder)
+    (note,) = [note for note in scenario.notes if note.startswith("warning")]
+    assert "gridlocked from" in note
+    assert "9 of 9 vehicles stand still" in note
+    assert "in 2 of 2 runs" in note
+
+
+def test_where_sumo_refuses_its_input_the_hunt_says_so(town):
+    (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
+    done = town.crashhunt("run", "h", "1", "2", "20", *WORDS, expect=3)
+    assert "simulating the plain traffic failed" in done.err
+    assert done.json["stopped_because"] == "no_valid_trial"
+
+
+def test_a_survey_that_takes_too_long_is_given_up(town, monkeypatch):
+    monkeypatch.setattr(_traffic_survey, "MAX_WALL_TIME_S", 0.0)
+    monkeypatch.setattr(_traffic_survey, "LOADING_WALL_TIME_S", 0.0)
+    scenario, settings = surveyed(town.folder)
+    assert "took over 0 s of wall time" in scenario.notes[1]
+    assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
+
+
+def test_without_room_for_the_survey_the_hunt_goes_on(town, monkeypatch):
+    monkeypatch.setattr(_traffic_survey, "Kept", lambda *_, **__: raise_full())
+    scenario, settings = surveyed(town.folder)
+    assert "the survey cannot run: [Errno 28]" in scenario.notes[1]
+    assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
+
+
+def raise_full():
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
+    far = '<trip id="a" depart="99999999" from="south" to="east"/>'
+    write(shell.folder, far)
+    temporary = shell.folder / "tmp"
+    temporary.mkdir()
+    shell.environment["TMPDIR"] = str(temporary)
+    process = shell.start("run", "h", "1", "4", "20", *WORDS)
+    deadline = time.monotonic() + 60
+    while not list(temporary.glob("crashhunt-survey-*/stage")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert json.loads(out)["error"]["message"] == "interrupted before the hunt began"
+    assert not list(temporary.glob("crashhunt-survey-*"))
+    assert not (shell.folder / "h").exists()
