@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
 from crashhunt.cli._bisect import add_bisect
@@ -112,6 +113,8 @@ def _explained(error: Exception) -> CrashhuntError:
             _give_up_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
         return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
+    if limit := limit_behind(error):
+        return CrashhuntError(f"the memory does not suffice: {type(error).__name__}", fix=limit)
     from crashhunt.base.blame import in_words
 
     frames = traceback.extract_tb(error.__traceback__)

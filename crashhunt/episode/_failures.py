@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.agents import Closes
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
 from crashhunt.base.faculties import offers
+from crashhunt.base.limits import limit_behind
 from crashhunt.trial import Failure
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ def failure_of(error: BaseException, agent: str) -> Failure:
     if len(words) > _MESSAGE:
         words = f"{words[:_MESSAGE]}… ({len(words) - _MESSAGE} more characters are left out)"
     message = words if isinstance(error, EpisodeError) else " ".join(words.split())
+    if limit := limit_behind(error):
+        message = f"{message} ({limit})" if message else limit
     if is_emptied():
         message = f"somebody has emptied sys.modules, upon which this fails: {message}"
     return Failure(_KINDS.get(type(error), type(error).__name__[:_NAME]), message, _shortened(text), agent)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import DISK, CrashhuntError
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
 from crashhunt.episode import WorkerSettings, answer_file, words_of
@@ -149,6 +150,7 @@ def _explained(error: BaseException, *, used: bool) -> Answer:
     if used and not (isinstance(error, OSError) and error.errno in DISK):
         return {"damaged": said}
     fix = "free some space" if isinstance(error, OSError) and error.errno in DISK else "see to what it needs"
+    fix = limit_behind(error) or fix
     return CrashhuntError(f"a worker cannot begin: {said}", fix=f"{fix}, and run the same command again").to_json()
 
 
