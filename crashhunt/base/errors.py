@@ -5,7 +5,8 @@
     CrashhuntError                 exit code 2 unless said otherwise
     ├── UsageError                 a command line, call or setting that cannot be meant
     │   ├── ArgumentError          an argument specification or value
-    │   └── CallError              a call from Python with arguments that there are not; a TypeError as well
+    │   ├── CallError              a call from Python with arguments that there are not; a TypeError as well
+    │   └── UntrustedError         code that this user has neither made on this machine nor trusted
     ├── ScenarioError              a scenario file: which file, which key, which value
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
     ├── HuntDirectoryError         the directory of a hunt: busy, foreign, unwritable, full
@@ -44,6 +45,7 @@ __all__ = [
     "ScenarioError",
     "SimulatorError",
     "SnapshotError",
+    "UntrustedError",
     "UsageError",
     "remedy",
 ]
@@ -106,6 +108,10 @@ class ArgumentError(UsageError):
 
 class CallError(UsageError, TypeError):
     """A call from Python with arguments that there are not, or without some that there must be."""
+
+
+class UntrustedError(UsageError):
+    """Code would run that this user has neither made on this machine nor trusted."""
 
 
 class ScenarioError(CrashhuntError):

@@ -37,6 +37,7 @@ from crashhunt.cli._shrink import add_shrink
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
+from crashhunt.cli._trust import add_trust_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,8 +152,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_check, add_compare, add_lists,
-        add_guide, add_completion,
+        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_trust_command, add_check, add_compare,
+        add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

@@ -59,6 +59,7 @@ class CrashData(Protected):
     planned_disturbances: NotRequired[list[DisturbanceData]]
     only: NotRequired[list[str] | None]
     script: NotRequired[PathsData | None]
+    authentication_code: NotRequired[str]
 
 
 class CrashSummary(TypedDict):

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.crashes import write_bundle
+from crashhunt.base.errors import UntrustedError
+from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.hunts._workers import settings_again
@@ -43,6 +44,7 @@ class RunsAgain:
         notes: gets a line for whatever went wrong.
         failed: gets what was to confirm something, and ended otherwise.
         stops: has something in it as soon as somebody wants to stop.
+        taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
 
     place: HuntDirectory
@@ -52,6 +54,7 @@ class RunsAgain:
     notes: list[str]
     failed: list[TrialResult]
     stops: Sized
+    taken: str = ""
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until somebody wants to stop.
@@ -69,6 +72,13 @@ class RunsAgain:
         scratch = self.place.scratch / folder
         for digest, group in by_snapshot.items():
             snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
+            if digest != self.taken and not is_snapshot_trusted(snapshot):
+                self.notes.append(
+                    f"{len(group)} trials for {folder} did not run again: nothing proves that you took the snapshot "
+                    f"{digest} on this machine; if you trust its code, run crashhunt trust {self.place.path}, and then "
+                    "the same command again"
+                )
+                continue
             scratch.mkdir(exist_ok=True)
             try:
                 again = settings_again(self.settings, snapshot, scratch)
@@ -88,7 +98,13 @@ class RunsAgain:
 
         def confirmed(bundle: Bundle) -> Bundle:
             if bundle.confirmed is None and not len(self.stops):
-                found = confirm(bundle, lambda: bool(len(self.stops)), failed=self.failed)
+                try:
+                    found = confirm(
+                        bundle, lambda: bool(len(self.stops)), failed=self.failed, trusted=self._is_made_now(bundle)
+                    )
+                except UntrustedError as refusal:
+                    self.notes.append(f"{bundle.id} was not confirmed: {refusal.message}; {refusal.fix}")
+                    return bundle
                 if found is not None:
                     found.write()
                     return found
@@ -96,6 +112,10 @@ class RunsAgain:
 
         with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
             return list(threads.map(confirmed, crashes))
+
+    def _is_made_now(self, bundle: Bundle) -> bool | None:
+        """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""
+        return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,8 +164,9 @@ class Hunt:
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         again = RunsAgain(
-            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops
-        )
+            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
+            taken=snapshot.digest,
+        )  # fmt: skip
         copies = FromTheStart(again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor
 from crashhunt.recording import Recording, read_black_box
@@ -54,7 +54,11 @@ def replay(bundle: Bundle, options: ReplayOptions | None = None) -> ReplayReport
 
 
 def confirm(
-    bundle: Bundle, stopped: Callable[[], bool] = lambda: False, *, failed: list[TrialResult] | None = None
+    bundle: Bundle,
+    stopped: Callable[[], bool] = lambda: False,
+    *,
+    failed: list[TrialResult] | None = None,
+    trusted: bool | None = None,
 ) -> Bundle | None:
     """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
 
@@ -62,15 +66,21 @@ def confirm(
         bundle: the crash.
         stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
         failed: gets what came of the replay, where that is not the crash.
+        trusted: whether its code may run; None to find out.
 
     Returns:
         None where it was given up.
+
+    Raises:
+        UntrustedError: its code is neither made here nor trusted.
     """
     try:
-        rerun = prepare(bundle, ReplayOptions(force=True))
+        rerun = prepare(bundle, ReplayOptions(force=True, trusted=trusted))
         report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped)
     except _StoppedError:
         return None
+    except UntrustedError:  # which says nothing about the crash
+        raise
     except CrashhuntError as error:
         failure: DivergenceData = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
     from crashhunt.snapshots._data import Environment, Manifest
 
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
 
 __all__ = ["SnapshotOptions", "take_snapshot"]
 
@@ -118,7 +118,8 @@ def take_snapshot(
         }
         digest = digest_of_described(stored, says=[found.paths, argument_files])
         final = snapshots / digest
-        if final.exists() and not _is_damaged(Snapshot(final)):
+        # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
+        if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:
             shutil.rmtree(building)
             return Snapshot(final)
         write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
@@ -127,10 +128,11 @@ def take_snapshot(
             facts["core"] = core
         (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
         manifest["described"] = describe_files(building)
+        manifest["authentication_code"] = code_of_manifest(manifest)
         manifest["integrity"] = digest_of_data(manifest)
         (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         sync_tree(building)
-        if final.exists():  # what is in it is the same, but for the damage
+        if final.exists():  # what is in it is the same, but for damage and the user who took it
             shutil.rmtree(final)
         building.rename(final)
         sync_folder(snapshots)

@@ -75,7 +75,7 @@ def test_temporary_folder_that_others_may_have_made_keeps_no_key(home, tmp_path,
     home.parent.write_text("a file where the folder should be")
     place = tmp_path / "temporary" / f"crashhunt-{os.geteuid()}"
     theirs = tmp_path / "theirs"
-    theirs.mkdir(mode=0o755)
+    theirs.mkdir(mode=0o700)
     if planted == "readable":
         place.mkdir()
         place.chmod(0o755)
