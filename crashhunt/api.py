@@ -122,6 +122,7 @@ def replay(
     force: bool = False,
     scenario: str | Path = "",
     accelerate: bool = True,
+    trust: bool = False,
 ) -> ReplayReport:
     """Run a saved crash again in a fresh process, as ``crashhunt replay`` does.
 
@@ -134,11 +135,14 @@ def replay(
         force: replay even from a snapshot that is damaged.
         scenario: the name or path of another scenario in which the same agents drive, on another simulator too.
         accelerate: speed simulators up where that changes no bit.
+        trust: run its code even if it is neither made here nor trusted. With the actions of the ``log``, its scenario
+            may then do more than simulate.
 
     Returns:
         The verdict, and everything behind it.
 
     Raises:
+        UntrustedError: its code would run, and it is neither made here nor trusted.
         CrashhuntError: it cannot be run.
     """
     from crashhunt.crashes import Bundle, find_bundle
@@ -148,6 +152,7 @@ def replay(
     bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
     edits = spec_words(changes)
     options = ReplayOptions(
-        code=code, changes=edits, times=times, force=force, scenario=str(scenario), accelerate=accelerate
-    )
+        code=code, changes=edits, times=times, force=force, scenario=str(scenario), accelerate=accelerate,
+        trusted=True if trust else None,
+    )  # fmt: skip
     return replayed(bundle, options)

@@ -27,6 +27,7 @@ from commands import CRASHHUNT, Begun, Commands
 
 from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.native import _core
+from crashhunt.snapshots._snapshot import code_of_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
@@ -299,11 +300,12 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[S
 
 
 def rewritten(snapshot: Path, name: str, text: str) -> None:
-    """Write a file that describes a snapshot as if it had been written so, digests and all."""
+    """Write a file that describes a snapshot as if it had been written so, digests, proof and all."""
     (snapshot / name).write_text(text)
     manifest = json.loads((snapshot / "manifest.json").read_text())
     del manifest["integrity"]
     manifest["described"] = {kept: describe_files(snapshot)[kept] for kept in manifest["described"]}
+    manifest["authentication_code"] = code_of_manifest(manifest)
     (snapshot / "manifest.json").write_text(json.dumps({**manifest, "integrity": digest_of_data(manifest)}))
 
 

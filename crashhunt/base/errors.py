@@ -5,7 +5,8 @@
     CrashhuntError                 exit code 2 unless said otherwise
     ├── UsageError                 a command line, call or setting that cannot be meant
     │   ├── ArgumentError          an argument specification or value
-    │   └── CallError              a call from Python with arguments that there are not; a TypeError as well
+    │   ├── CallError              a call from Python with arguments that there are not; a TypeError as well
+    │   └── UntrustedError         code that this user has neither made on this machine nor trusted
     ├── ScenarioError              a scenario file: which file, which key, which value
     │   └── NoValidTrialError      no trial in it can be set up; exit code 3
     ├── PluginError                a name or ``module:attribute`` that leads nowhere
@@ -46,6 +47,7 @@ __all__ = [
     "ScenarioError",
     "SimulatorError",
     "SnapshotError",
+    "UntrustedError",
     "UsageError",
     "remedy",
 ]
@@ -110,6 +112,10 @@ class CallError(UsageError, TypeError):
     """A call from Python with arguments that there are not, or without some that there must be."""
 
 
+class UntrustedError(UsageError):
+    """Code would run that this user has neither made on this machine nor trusted."""
+
+
 class ScenarioError(CrashhuntError):
     """A scenario that cannot be used."""
 
@@ -164,6 +170,8 @@ def remedy(error: OSError) -> str:
     """Return what to do about an error of the operating system, as an imperative."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return "raise the limit on open files (ulimit -n), and run the same command again"
+    if error.errno == errno.EFBIG:
+        return "raise the limit on the size of a file (ulimit -f), and run the same command again"
     if error.errno in (errno.EAGAIN, errno.ENOMEM):
-        return "leave it more processes (ulimit -u) or memory, and run the same command again"
+        return "leave it more processes (ulimit -u) or memory (ulimit -v), and run the same command again"
     return "free some space or make the folder writable, and run the same command again"

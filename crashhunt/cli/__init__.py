@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.signals import ended_by_signals
 from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
@@ -38,6 +39,7 @@ from crashhunt.cli._shrink import add_shrink
 from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
+from crashhunt.cli._trust import add_trust_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,6 +118,8 @@ def _explained(error: Exception) -> CrashhuntError:
             _give_up_output()
             return CrashhuntError(f"the output cannot be written: {error.strerror}", fix="send it elsewhere")
         return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
+    if limit := limit_behind(error):
+        return CrashhuntError(f"the memory does not suffice: {type(error).__name__}", fix=limit)
     from crashhunt.base.blame import in_words
 
     frames = traceback.extract_tb(error.__traceback__)
@@ -152,8 +156,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_check, add_compare, add_lists,
-        add_guide, add_completion,
+        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_trust_command, add_check, add_compare,
+        add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

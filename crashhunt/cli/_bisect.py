@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_crash, add_json, say
+from crashhunt.cli._common import add_crash, add_json, add_trust, check_trust, opened_crash, run_trusted, say
 
 if TYPE_CHECKING:
     import argparse
@@ -34,19 +35,20 @@ def add_bisect(commands: Commands) -> None:
         "--from", metavar="FOLDER", type=Path, dest="folder",
         help="of the repository, from which the agent is imported; default: the current one",
     )  # fmt: skip
+    add_trust(bisect)
     add_json(bisect)
     bisect.set_defaults(command=_bisect)
 
 
 def _bisect(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.corpus import bisect
-    from crashhunt.crashes import find_bundle
 
     def tell(revision: str, got: Got) -> None:
         say(f"{revision[:12]}  {got.replace('_', ' ')}", as_json=options.json)
 
-    bundle = find_bundle(options.directory, options.crash)
-    found = bisect(bundle, options.good, bad=options.bad, folder=options.folder, watch=tell)
+    with opened_crash(options.directory, options.crash) as (bundle, archive):
+        run_trusted(partial(check_trust, bundle), bundle, archive, options)
+        found = bisect(bundle, options.good, bad=options.bad, folder=options.folder, watch=tell)
     if found.commit:
         say(in_lines([f"{found.commit[:12]} is the first in which it crashes: {found.subject}"]), as_json=options.json)
     else:

@@ -7,26 +7,27 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from crashhunt.base import layout
-from crashhunt.base.errors import UsageError
+from crashhunt.base.errors import UntrustedError, UsageError
 from crashhunt.base.names import did_you_mean, one_of
 from crashhunt.base.text import visible
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from _typeshed import SupportsWrite
 
     from crashhunt.crashes import Archive, Bundle
 
 __all__ = [
-    "Commands", "Parser", "add_crash", "add_json", "chosen_runs", "integer", "is_trusted", "number", "opened_crash",
-    "opened_hunt", "pairs", "refuse_strangers", "say",
+    "Commands", "Parser", "add_crash", "add_json", "add_trust", "ask_to_trust", "check_trust", "chosen_runs", "integer",
+    "number", "opened_crash", "opened_hunt", "pairs", "run_trusted", "say",
 ]  # fmt: skip
 
 
+T = TypeVar("T")
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
@@ -186,19 +187,65 @@ def number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
-def is_trusted(archive: Archive | None, said: bool) -> bool:
-    """Return whether the code of a crash may run: this user made it on this machine, or has ``said`` ``--trust``."""
-    return archive is None or archive.made_here or said
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add ``--trust``, the same for every command that runs code of a crash."""
+    parser.add_argument(
+        "--trust", action="store_true",
+        help="run the code even if you did not make it on this machine; crashhunt trust DIR remembers it",
+    )  # fmt: skip
 
 
-def refuse_strangers(archive: Archive, bundle: Bundle, path: Path, *, fix: str) -> UsageError:
-    """Return the refusal to run the code of an archive that nobody here has made."""
-    from crashhunt.plans import read_settings
+def run_trusted(
+    run: Callable[[bool | None], T],
+    bundle: Bundle,
+    archive: Archive | None,
+    options: argparse.Namespace,
+    *,
+    path: Path | None = None,
+) -> T:
+    """Run what runs the code of a crash; where that is not trusted, ask the user at the terminal, once per origin.
 
-    agents = {agent.agent for agent in read_settings(bundle.hunt / layout.HUNT).agents.values()}
-    return UsageError(
-        f"it says that {archive.made_by} made it on {archive.made_at}, and a replay runs the code in it "
-        f"({', '.join(sorted(agents))})",
-        fix=fix,
-        where=str(path),
-    )
+    Args:
+        run: called with True where the code is trusted; else with None, to find out. It raises `UntrustedError` before
+            anything runs.
+        bundle: the crash.
+        archive: which the crash was in, if any.
+        options: ``trust``, ``json`` and ``directory``.
+        path: what the user named; ``directory`` by default.
+
+    Raises:
+        UntrustedError: the code is not trusted, and nobody is there to ask, or the user says no.
+    """
+    from crashhunt.crashes import refuse_untrusted, snapshot_of, trust_snapshot
+
+    place = path or options.directory
+    try:
+        return run(True if options.trust or (archive is not None and archive.made_here) else None)
+    except UntrustedError:
+        made_by = f"{archive.made_by} on {archive.made_at}" if archive is not None else ""
+        refusal = refuse_untrusted(bundle, where=str(place), made_by=made_by)
+        if snapshot_of(bundle).faults() or not ask_to_trust(refusal, as_json=options.json):
+            raise refusal from None
+    trust_snapshot(snapshot_of(bundle), place)
+    return run(True)
+
+
+def check_trust(bundle: Bundle, trusted: bool | None) -> None:
+    """Refuse a crash that is not trusted; for `run_trusted`, before something runs that does not find out itself.
+
+    Raises:
+        UntrustedError: the crash is neither made here nor trusted.
+    """
+    from crashhunt.crashes import is_bundle_trusted, refuse_untrusted
+
+    if not trusted and not is_bundle_trusted(bundle):
+        raise refuse_untrusted(bundle)
+
+
+def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
+    """Whether the user trusts code from now on; no where nobody is at the terminal."""
+    if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
+        return False
+    print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)
+    print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")

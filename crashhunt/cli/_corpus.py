@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_json, integer, is_trusted, opened_crash, say
+from crashhunt.cli._common import add_json, add_trust, check_trust, integer, opened_crash, run_trusted, say
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._progress import shown_progress
 from crashhunt.cli._told import add_told, tell
@@ -56,7 +57,7 @@ def _add_add(commands: Commands) -> None:
         help="what is expected from now on: still, while it is known to crash (the default), or fixed",
     )  # fmt: skip
     add.add_argument("--note", metavar="TEXT", help="what people should know of it")
-    add.add_argument("--trust", action="store_true", help="add an exported crash that a stranger made")
+    add_trust(add)
     add_json(add)
     add.set_defaults(command=_add)
 
@@ -74,6 +75,7 @@ def _add_run(commands: Commands) -> None:
         help="keep what crashes there, each as the directory of a hunt, for crashhunt show, replay and report",
     )  # fmt: skip
     run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
+    add_trust(run)
     add_told(run)
     add_json(run)
     run.set_defaults(command=_run)
@@ -89,12 +91,8 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
     answers = []
     for path in options.bundles:
         with opened_crash(path, "") as (bundle, archive):
-            if archive is not None and not is_trusted(archive, options.trust):
-                raise UsageError(
-                    f"it says that {archive.made_by} made it, and whoever runs the corpus runs what it names",
-                    fix="look at its hunt.toml and scenario, and give --trust if you trust whoever gave it to you",
-                    where=str(path),
-                )
+            # Every run of the corpus runs what its cases name.
+            run_trusted(partial(check_trust, bundle), bundle, archive, options, path=path)
             added = add_case(bundle, options.to, expect=options.expect, note=options.note)
             told = added.case.to_json()
             answers.append({**told, "new": added.new})
@@ -119,10 +117,13 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     if options.parallel < 0:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 1, or 0 for one per core")
     cases = find_cases(options.places)
+    if not options.trust:
+        _trust_cases(cases, options)
     with stop_requests() as asked, shown_progress("running the corpus", as_json=options.json) as watch:
         reports = run_cases(
-            cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked)
-        )
+            cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked),
+            trusted=True,
+        )  # fmt: skip
     say(_told(reports, len(cases)), as_json=options.json)
     tell(options, corpus_summary(reports), corpus_annotations(reports))
     if options.json:
@@ -130,6 +131,16 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     if len(reports) < len(cases):
         return INTERRUPTED
     return 0 if all(report.ok for report in reports) else 1
+
+
+def _trust_cases(cases: list[Path], options: argparse.Namespace) -> None:
+    """See that every case is trusted before the first one runs; ask at the terminal once for each origin."""
+    from crashhunt.corpus import untrusted_case
+
+    for path in cases:
+        bundle = untrusted_case(path)
+        if bundle is not None:
+            run_trusted(partial(check_trust, bundle), bundle, None, options, path=path)
 
 
 def _told(reports: list[CaseReport], count: int) -> str:

@@ -53,10 +53,12 @@ def _export(options: argparse.Namespace, _words: list[str]) -> int:
         return _hand_on(options)
     if options.recorded_agent:
         raise UsageError("--recorded-agent is for another format", fix=f"add --as {' or '.join(_FORMATS)}")
-    from crashhunt.crashes import export_crash, find_bundle
+    from crashhunt.crashes import export_crash
 
-    bundle = find_bundle(options.directory, options.crash)
-    with shown_progress(f"writing {options.file}", as_json=options.json) as watch:
+    with (
+        opened_crash(options.directory, options.crash) as (bundle, _),
+        shown_progress(f"writing {options.file}", as_json=options.json) as watch,
+    ):
         size = export_crash(bundle, options.file, watch=watch)
     say(f"{bundle.id} is in {options.file} ({size / 1e6:.2f} MB)", as_json=options.json)
     if options.json:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, integer, is_trusted, opened_crash, refuse_strangers, say
+from crashhunt.cli._common import add_crash, add_json, add_trust, check_trust, integer, opened_crash, run_trusted, say
 from crashhunt.cli._exit_codes import DONE, INTERRUPTED
 from crashhunt.cli._progress import shown_progress
 
@@ -46,7 +47,7 @@ def add_judge(commands: Commands) -> None:
     judge.add_argument(
         "--parallel", metavar="N", type=integer, default=0, help="trials at a time; default: one per core"
     )
-    judge.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
+    add_trust(judge)
     add_json(judge)
     judge.set_defaults(command=_judge)
 
@@ -65,12 +66,18 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
     told: list[dict[str, object]] = []
     with stop_requests() as stops:
         if options.all:
-            told += (_judge_one(options, bundle, stops, write=True) for bundle in _unjudged(options) if not stops)
+            bundles = _unjudged(options)
+            for bundle in bundles:  # before the first one runs
+                run_trusted(partial(check_trust, bundle), bundle, None, options)
+            told += (_judge_one(options, bundle, stops, True, write=True) for bundle in bundles if not stops)
         else:
             with opened_crash(options.directory, options.crash) as (bundle, archive):
-                if archive is not None and not is_trusted(archive, options.trust):
-                    raise refuse_strangers(archive, bundle, options.directory, fix="give --trust if you trust them")
-                told.append(_judge_one(options, bundle, stops, write=archive is None))
+                told.append(
+                    run_trusted(
+                        lambda trusted: _judge_one(options, bundle, stops, trusted, write=archive is None),
+                        bundle, archive, options,
+                    )
+                )  # fmt: skip
     if options.json:
         print(json.dumps({"judged": told}))
     return INTERRUPTED if stops else DONE
@@ -92,7 +99,9 @@ def _unjudged(options: argparse.Namespace) -> list[Bundle]:
     ]
 
 
-def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *, write: bool) -> dict[str, object]:
+def _judge_one(
+    options: argparse.Namespace, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
+) -> dict[str, object]:
     from crashhunt.crashes import judgement_of, with_judgement
     from crashhunt.replays import ReplayOptions, judge
     from crashhunt.report import Story
@@ -100,7 +109,7 @@ def _judge_one(options: argparse.Namespace, bundle: Bundle, stops: list[int], *,
     with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
         found: Judgement = judge(
             bundle,
-            ReplayOptions(force=True),
+            ReplayOptions(force=True, trusted=trusted),
             runs=options.runs,
             why=options.why,
             parallel=options.parallel or len(os.sched_getaffinity(0)),

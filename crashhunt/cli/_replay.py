@@ -6,18 +6,18 @@ import json
 import math
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.cli._common import (
     add_crash,
     add_json,
+    add_trust,
     integer,
-    is_trusted,
     number,
     opened_crash,
     pairs,
-    refuse_strangers,
+    run_trusted,
     say,
 )
 from crashhunt.cli._film import (
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from crashhunt.replays import Look, ReplayData, ReplayOptions, ReplayReport
 
 __all__ = ["add_replay"]
-
-_TRUST = "give --trust if you trust whoever gave it to you, or --from-log to run none of it"
 
 
 def add_replay(commands: Commands) -> None:
@@ -107,8 +105,11 @@ def add_replay(commands: Commands) -> None:
         help="with --gui: wall time between two steps, in s; default: as long as a step simulates",
     )  # fmt: skip
     add_film_options(replay)
-    replay.add_argument("--trust", action="store_true", help="run the code of an exported crash that a stranger made")
-    replay.add_argument("--force", action="store_true", help="replay even from a snapshot that is damaged")
+    add_trust(replay)
+    replay.add_argument(
+        "--force", action="store_true",
+        help="replay even from a snapshot that is damaged; with --trust, or with --from-log, which runs none of it",
+    )  # fmt: skip
     add_json(replay)
     replay.set_defaults(command=_replay)
 
@@ -132,17 +133,18 @@ def _replay(options: argparse.Namespace, _words: list[str]) -> int:
     answers, shots, good = [], [], True
     for crash in crashes:
         with opened_crash(options.directory, crash) as (bundle, archive):
-            trusted = is_trusted(archive, options.trust)
             if film is not None and options.from_log:
                 shots.append(recorded_shot(bundle))
                 continue
-            if archive is not None and not trusted and not options.from_log:
-                raise refuse_strangers(archive, bundle, options.directory, fix=_TRUST)
-            one = replace(chosen, trusted=trusted, look=_look(options, bundle))
-            with filmed(one, bundle, film, to_stderr=options.json) as asked:
-                report, answer = _replay_one(options, bundle, asked)
-                if film is not None:
-                    shots.append(replayed_shot(report, asked))
+            one = replace(chosen, look=_look(options, bundle))
+
+            def run(trusted: bool | None, bundle: Bundle = bundle, one: ReplayOptions = one) -> tuple[Any, ...]:
+                with filmed(replace(one, trusted=trusted), bundle, film, to_stderr=options.json) as asked:
+                    report, answer = _replay_one(options, bundle, asked)
+                    return report, answer, replayed_shot(report, asked) if film is not None else None
+
+            report, answer, shot = run_trusted(run, bundle, archive, options)
+            shots += [shot] if shot is not None else []
             answers.append(answer)
             good = good and set(report.verdicts) == {options.expect}
     written = write_films(options, shots, film) if film is not None else {}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_crash, add_json, integer, say
+from crashhunt.cli._common import add_crash, add_json, add_trust, integer, opened_crash, run_trusted, say
 from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._progress import shown_progress
 
@@ -51,13 +51,13 @@ def add_shrink(commands: Commands) -> None:
         "either, traffic where that leaves few of them",
     )  # fmt: skip
     shrink.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
+    add_trust(shrink)
     add_json(shrink)
     shrink.set_defaults(command=_shrink)
 
 
 def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
-    from crashhunt.crashes import find_bundle
     from crashhunt.plans import seconds_of
     from crashhunt.shrinking import shrink
 
@@ -70,15 +70,20 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     if options.directory.is_file():
         raise UsageError(
-            f"{str(options.directory)!r} is a file, and what is left would be written beside the crash",
-            fix="unpack it (it is a zip file), see whose code it has, and give the folder",
+            "shrink writes the minimized crash beside the crash, and cannot write into an exported file",
+            fix="unpack it (a zip file) into a new folder and give that folder; shrink asks before it runs the code",
+            where=str(options.directory),
         )
-    bundle = find_bundle(options.directory, options.crash)
-    with stop_requests() as asked, shown_progress(f"making {bundle.id} smaller", as_json=options.json) as watch:
-        found = shrink(
-            bundle, budget=options.budget, time_s=time_s, form=options.form, parallel=options.parallel,
-            watch=watch, stopped=lambda: bool(asked),
-        )  # fmt: skip
+    with opened_crash(options.directory, options.crash) as (bundle, _), stop_requests() as asked:
+
+        def run(trusted: bool | None) -> Shrunk:
+            with shown_progress(f"making {bundle.id} smaller", as_json=options.json) as watch:
+                return shrink(
+                    bundle, budget=options.budget, time_s=time_s, form=options.form, parallel=options.parallel,
+                    watch=watch, stopped=lambda: bool(asked), trusted=trusted,
+                )  # fmt: skip
+
+        found = run_trusted(run, bundle, None, options)
     say(_told(found), as_json=options.json)
     if options.json:
         print(json.dumps(found.to_json()))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from crashhunt.cli._common import add_json, chosen_runs, integer, pairs, say
+from crashhunt.base.errors import UntrustedError
+from crashhunt.cli._common import add_json, add_trust, ask_to_trust, chosen_runs, integer, pairs, say
 from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
 from crashhunt.cli._options import add_options_of_machine, chosen_of_machine
 from crashhunt.cli._status import show_states, states_console, states_table
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from crashhunt.hunts import HuntState
 
 __all__ = ["add_rerun", "add_suite"]
+
+T = TypeVar("T")
 
 
 def add_suite(commands: Commands) -> None:
@@ -40,6 +43,7 @@ def add_suite(commands: Commands) -> None:
     run.add_argument("parallel", metavar="PARALLEL", type=integer, nargs="?", default=0,
                      help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
     add_options_of_machine(run)
+    add_trust(run)
     add_json(run)
     run.set_defaults(command=_run)
     defaults = verbs.add_parser(
@@ -78,6 +82,7 @@ def add_rerun(commands: Commands) -> None:
     rerun.add_argument("--parallel", metavar="N", type=integer, default=0,
                        help="trials at a time, of all hunts together; default: one per core")  # fmt: skip
     add_options_of_machine(rerun)
+    add_trust(rerun)
     add_json(rerun)
     rerun.set_defaults(command=_rerun)
 
@@ -89,7 +94,13 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
     suite = Suite.read(options.file)
     watch, finish = _watcher(as_json=options.json)
     try:
-        states = suite.run(options.directory, options.parallel, watch=watch, machine=chosen_of_machine(options))
+        machine = chosen_of_machine(options)
+        states = _asking(
+            lambda trusted: suite.run(
+                options.directory, options.parallel, watch=watch, machine=machine, trusted=trusted
+            ),
+            options,
+        )
     except KeyboardInterrupt:
         finish()
         _tell([hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json)
@@ -113,20 +124,38 @@ def _rerun(options: argparse.Namespace, _words: list[str]) -> int:
     hunts = list(chosen_runs(options.directory, options.run))
     watch, finish = _watcher(as_json=options.json)
     try:
-        states, replaced = rerun(
-            hunts,
-            everything=options.all,
-            changes=pairs(options.sets, "--set"),
-            to=options.to,
-            parallel=options.parallel,
-            watch=watch,
-            machine=chosen_of_machine(options),
-        )
+        changes, machine = pairs(options.sets, "--set"), chosen_of_machine(options)
+        states, replaced = _asking(
+            lambda trusted: rerun(
+                hunts, everything=options.all, changes=changes, to=options.to, parallel=options.parallel, watch=watch,
+                machine=machine, trusted=trusted,
+            ),
+            options,
+        )  # fmt: skip
     finally:
         finish()
     for place in replaced:
         say(f"replaced: {place}", as_json=options.json)
     return _tell(states, options.to or options.directory, as_json=options.json, replaced=replaced)
+
+
+def _asking(run: Callable[[bool], T], options: argparse.Namespace) -> T:
+    """Run hunts; ask at the terminal for each that is not trusted, before the first one runs.
+
+    Raises:
+        UntrustedError: a hunt is not trusted, and nobody is there to ask, or the user says no.
+    """
+    from crashhunt.suites import trust_hunt
+
+    asked: set[str] = set()
+    while True:
+        try:
+            return run(options.trust)
+        except UntrustedError as refusal:
+            if refusal.where in asked or not ask_to_trust(refusal, as_json=options.json):
+                raise
+            asked.add(refusal.where)
+            trust_hunt(Path(refusal.where), Path(refusal.where))
 
 
 def _watcher(*, as_json: bool) -> tuple[Callable[[list[HuntState]], None], Callable[[], None]]:

@@ -14,7 +14,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import in_lines, one_line
 from crashhunt.corpus._case import Case, Expectation, read_case
-from crashhunt.crashes import Bundle, write_bundle
+from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.plans import read_settings, with_settings, write_settings
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import TrialResult
 
-__all__ = ["CaseReport", "Got", "ReportData", "run_cases"]
+__all__ = ["CaseReport", "Got", "ReportData", "run_cases", "untrusted_case"]
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _LOOK_EVERY_S = 0.01  # at each of those that run
@@ -136,6 +136,7 @@ def run_cases(
     keep: Path | None = None,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    trusted: bool = False,
 ) -> list[CaseReport]:
     """Run cases with today's code, each in a fresh process.
 
@@ -145,13 +146,17 @@ def run_cases(
         keep: where to keep what crashes, as the directory of a hunt with everything in it, by the name of the case.
         watch: called after each with how many are done, and how many there are.
         stopped: asked now and then whether to give up.
+        trusted: whether what the cases name may run; otherwise each has to be trusted, before the first one runs.
 
     Returns:
         What came of each, in their order; of those that had not ended when it was given up, nothing.
 
     Raises:
+        UntrustedError: what a case names is neither made here nor trusted.
         CrashhuntError: the scratch folder, or the one to keep crashes in, cannot be written.
     """
+    if not trusted:
+        _refuse_untrusted_cases(cases)
     reports: dict[Path, CaseReport] = {}
     waiting, running = deque(cases), dict[Path, _Running]()
     with ExitStack() as stack:
@@ -172,6 +177,28 @@ def run_cases(
             if watch is not None:
                 watch(len(reports), len(cases))
     return [reports[path] for path in cases if path in reports]
+
+
+def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
+    """Refuse cases of which nothing proves that they are this user's; those that cannot be read do not run anyway.
+
+    Raises:
+        UntrustedError: with the first of them.
+    """
+    for path in cases:
+        bundle = untrusted_case(path)
+        if bundle is not None:
+            raise refuse_untrusted(bundle, where=str(path))
+
+
+def untrusted_case(path: Path) -> Bundle | None:
+    """Return the crash of a case that is not trusted; None where it is, or cannot run because it is damaged."""
+    try:
+        bundle = read_case(path).bundle()
+        snapshot_of(bundle).verify()
+    except CrashhuntError:
+        return None
+    return None if is_bundle_trusted(bundle, faults=()) else bundle
 
 
 class _Running:

@@ -11,6 +11,7 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.files import cannot_write, sync_folder, sync_tree
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.corpus._case import Case, read_case
+from crashhunt.crashes import authenticate_bundle
 from crashhunt.recording import write_log
 from crashhunt.snapshots import Snapshot, without_code
 from crashhunt.triage import signature_of
@@ -43,7 +44,8 @@ class Added:
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
     """Put a crash into a corpus; what is there already only gets the expectation and the note that are given.
 
-    No code is run. Two may add to the same corpus at once.
+    No code is run. The case is this user's from then on, whoever made the crash, so see first that it is trusted. Two
+    may add to the same corpus at once.
 
     Args:
         bundle: the crash.
@@ -94,7 +96,8 @@ def _build(bundle: Bundle, case: Case, folder: Path) -> None:
     shutil.copyfile(bundle.hunt / layout.HUNT, folder / layout.HUNT)
     snapshot = without_code(Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot), folder / layout.SNAPSHOTS)
     case.write(folder)
-    kept = replace(bundle, path=crash, snapshot=snapshot.digest, files={})
+    kept = replace(bundle, path=crash, snapshot=snapshot.digest, files={}, authentication_code="")
+    kept = replace(kept, authentication_code=authenticate_bundle(kept))
     kept.write(into=crash)
     write_log(crash / layout.LOG, recording, views=False)
     if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > _MOST:

@@ -32,7 +32,8 @@ class _CaseItem(pytest.Item):
     def runtest(self) -> None:
         from crashhunt.corpus import run_cases
 
-        (report,) = run_cases([self.path.parent], parallel=1)
+        # pytest imports every conftest.py of the folders that it runs, so whoever runs it trusts them.
+        (report,) = run_cases([self.path.parent], parallel=1, trusted=True)
         self.user_properties += [("crashhunt_expected", report.expected), ("crashhunt_got", report.got)]
         told = report.describe()
         if not report.ok:

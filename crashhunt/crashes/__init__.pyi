@@ -1,9 +1,8 @@
 from ._archive import Archive as Archive, export_crash as export_crash, open_archive as open_archive
-from ._beside import files_of as files_of
+from ._beside import files_of as files_of, read_params as read_params
 from ._bundle import (
     Bundle as Bundle,
     read_bundle as read_bundle,
-    read_params as read_params,
     write_bundle as write_bundle,
     write_trial as write_trial,
 )
@@ -34,7 +33,25 @@ from ._judgement import (
     judgement_of as judgement_of,
     with_judgement as with_judgement,
 )
+from ._origins import (
+    authenticate_bundle as authenticate_bundle,
+    describe_code as describe_code,
+    is_bundle_made_here as is_bundle_made_here,
+    is_bundle_trusted as is_bundle_trusted,
+    is_hunt_trusted as is_hunt_trusted,
+    is_snapshot_trusted as is_snapshot_trusted,
+    refuse_untrusted as refuse_untrusted,
+    snapshot_of as snapshot_of,
+    trust_snapshot as trust_snapshot,
+)
 from ._side_effects import refuse_side_effects as refuse_side_effects
+from ._trust_store import (
+    TrustedOrigin as TrustedOrigin,
+    add_trusted as add_trusted,
+    is_fingerprint_trusted as is_fingerprint_trusted,
+    list_trusted as list_trusted,
+    remove_trusted as remove_trusted,
+)
 from ._visible import visible_from as visible_from
 from ._why import (
     Factor as Factor,

@@ -22,6 +22,7 @@ from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.watching import watched
 from crashhunt.crashes._data import ArchiveIndex
+from crashhunt.crashes._origins import is_bundle_made_here
 from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
@@ -95,7 +96,8 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
             "made_at": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
             "files": entries,
         }
-        index["signature"] = signature(index)
+        if is_bundle_made_here(bundle):  # else a stranger's crash would become this user's
+            index["signature"] = signature(index)
         archive.writestr(zipfile.ZipInfo(layout.ARCHIVE_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
     return target.stat().st_size
 

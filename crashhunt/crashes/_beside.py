@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.integrity import FILES, describe_files, digest_of_data, read_object, typed
+from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
 from crashhunt.crashes._data import Protected
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
     from crashhunt.trial import TrialResult
 
-__all__ = ["collect_output", "files_beside", "files_of", "see_that_it_is_whole"]
+__all__ = ["collect_output", "files_beside", "files_of", "read_params", "see_that_it_is_whole"]
 
 
 def see_that_it_is_whole(data: Protected) -> None:
@@ -52,6 +52,18 @@ def files_beside(folder: Path) -> dict[str, FileEntry]:
     return {
         name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
     }
+
+
+def read_params(folder: Path) -> list[str]:
+    """Return what of a trial that was kept is not as it was written."""
+    try:
+        data = read_object(folder / layout.PARAMS, Protected)
+        if "integrity" in data:  # which earlier versions did not write
+            see_that_it_is_whole(data)
+        files = data.get("files", {}).items()
+        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
+    except (OSError, ValueError) as error:
+        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
 
 
 def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -15,7 +15,8 @@ from crashhunt.base.integrity import changed_file, digest_of_data, read_object, 
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
 from crashhunt.crashes._beside import collect_output, files_beside, see_that_it_is_whole
-from crashhunt.crashes._data import CrashData, Protected
+from crashhunt.crashes._data import CrashData
+from crashhunt.crashes._origins import authenticate_bundle
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
 from crashhunt.trial import (
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Bundle",
     "read_bundle",
-    "read_params",
     "write_bundle",
     "write_trial",
 ]
@@ -71,6 +71,7 @@ _TYPES: Plain = {
     "only": list[str] | None,
     **dict.fromkeys(("why_unconfirmed", "why_no_escape"), str),
     "script": dict | None,
+    "authentication_code": str,
 }
 _KEYS = CrashData.__required_keys__ | CrashData.__optional_keys__
 _PARTS: Mapping[str, type] = {
@@ -94,6 +95,7 @@ class Bundle:
         files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
         added: what a later version says of it, which is written back.
         why_unconfirmed: why the try did not come to its end; empty where it did, or nobody tried.
+        authentication_code: proves to the user who made it what determines the trial; empty where nothing does.
     """
 
     path: Path
@@ -105,6 +107,7 @@ class Bundle:
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     added: Plain = field(default_factory=dict)
     why_unconfirmed: str = ""
+    authentication_code: str = ""
 
     @property
     def is_fully_confirmed(self) -> bool:
@@ -234,6 +237,8 @@ class Bundle:
             data["only"] = spec["only"]
         if "script" in spec:
             data["script"] = spec["script"]
+        if self.authentication_code:
+            data["authentication_code"] = self.authentication_code
         whole = merged(data, self.added)
         whole["integrity"] = digest_of_data(whole)
         with whole_file(folder / layout.CRASH) as temporary:
@@ -329,6 +334,7 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
         files,
         added=_added(data),
         why_unconfirmed=data.get("why_unconfirmed", ""),
+        authentication_code=data.get("authentication_code", ""),
     )
 
 
@@ -353,6 +359,7 @@ def write_bundle(
     name: str = "",
     place: str = layout.CRASHES,
     confirmed: bool | None = None,
+    authenticate: bool = True,
 ) -> Bundle:
     """Make the bundle of a crash, or of a near miss, from what its trial left behind.
 
@@ -366,6 +373,7 @@ def write_bundle(
         name: of its folder, where that is not made of the trial's number and the outcome.
         place: the folder of the directory that it goes into.
         confirmed: whether a fresh process did the same, where that is known already.
+        authenticate: whether to write down the proof that this user made it; only where the snapshot is this user's.
     """
     from crashhunt.recording import foxglove_layout, write_log
 
@@ -381,6 +389,8 @@ def write_bundle(
         (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
         collect_output(result, scratch, building)
         bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
+        if authenticate:
+            bundle = replace(bundle, authentication_code=authenticate_bundle(bundle))
         bundle.write(into=building)
         sync_tree(building)
         put_in_place(building, final)
@@ -399,15 +409,3 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
     shutil.rmtree(scratch, ignore_errors=True)
-
-
-def read_params(folder: Path) -> list[str]:
-    """Return what of a trial that was kept is not as it was written."""
-    try:
-        data = read_object(folder / layout.PARAMS, Protected)
-        if "integrity" in data:  # which earlier versions did not write
-            see_that_it_is_whole(data)
-        files = data.get("files", {}).items()
-        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
-    except (OSError, ValueError) as error:
-        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]

@@ -61,6 +61,7 @@ class CrashData(Protected):
     script: NotRequired[PathsData | None]
     why_unconfirmed: NotRequired[str]
     why_no_escape: NotRequired[str]
+    authentication_code: NotRequired[str]
 
 
 class CrashSummary(TypedDict):

@@ -70,6 +70,11 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
         bundles = list_bundles(directory) or list_near_misses(directory)[:1] or _of_copies(directory)
         bundles = bundles or _made_smaller(directory)
     if not bundles:
+        if directory.is_file():
+            raise BundleError(
+                f"{str(directory)!r} is a file, not the directory of a hunt",
+                fix="unpack it into a new folder if crashhunt export wrote it, and give that folder",
+            )
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
             raise BundleError(f"{str(directory)!r} does not exist", fix=fix)

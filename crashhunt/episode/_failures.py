@@ -10,6 +10,7 @@ from crashhunt.agents import Closes
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
 from crashhunt.base.exception_text import class_name, format_error, message_of
 from crashhunt.base.faculties import offers
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.signals import blocked_signals
 from crashhunt.trial import Failure
 
@@ -44,6 +45,8 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
         kind = next((kind for one, kind in _KINDS if type(error) is one), None) or class_name(error)
     message = words if issubclass(type(error), EpisodeError) else " ".join(words.split())
+    if limit := limit_behind(error):
+        message = f"{message} ({limit})" if message else limit
     if not cause and is_emptied():
         cause = "somebody has emptied sys.modules"
     return Failure(kind, f"{cause}, upon which this fails: {message}" if cause else message, text, agent)

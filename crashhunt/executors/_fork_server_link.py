@@ -124,7 +124,7 @@ class ForkServerLink:
             again = f", {_DEATHS} times" if -code in _FROM_OUTSIDE else ""
             raise CrashhuntError(
                 f"the process that starts the workers {how}{again}{said}",
-                fix="see that the limits on memory and processes leave it room, and run the same command again",
+                fix="raise the limits on memory (ulimit -v) and processes (ulimit -u), and run the same command again",
             )
         return ForkServerLink(self._settings, late=self._late, deaths=self.deaths + 1, snapshot=self._snapshot)
 

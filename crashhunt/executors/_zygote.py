@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, cast
 
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.forks import ended
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
 from crashhunt.episode import stage_of, words_of
@@ -239,6 +240,7 @@ def _why_not(error: BaseException) -> FromZygote:
     if isinstance(error, CrashhuntError):
         return {"error": error.to_json()["error"]}
     full = isinstance(error, OSError) and error.errno in DISK
-    fix = f"{'free some space' if full else 'see to what it needs'}, and run the same command again"
+    fix = limit_behind(error) or ("free some space" if full else "see to what it needs")
+    fix = f"{fix}, and run the same command again"
     said = f"{type(error).__name__}: {words_of(error)}"
     return {"error": CrashhuntError(f"the simulator cannot be made: {said}", fix=fix).to_json()["error"]}

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.errors import UntrustedError
 from crashhunt.base.temporary import remove_scratch
-from crashhunt.crashes import write_bundle
+from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, read_map, snapshot_executor
 from crashhunt.hunts._workers import settings_again
@@ -44,6 +45,7 @@ class RunsAgain:
         failed: gets what was to confirm something, and ended otherwise.
         stops: has something in it as soon as somebody wants to stop.
         executors: which run crashes again.
+        taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
 
     place: HuntDirectory
@@ -54,6 +56,7 @@ class RunsAgain:
     failed: list[TrialResult]
     stops: Sized
     executors: SharedExecutors
+    taken: str = ""
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
         """Yield each trial as it ends, until somebody wants to stop.
@@ -71,6 +74,13 @@ class RunsAgain:
         scratch = self.place.scratch / folder
         for digest, group in by_snapshot.items():
             snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
+            if digest != self.taken and not is_snapshot_trusted(snapshot):
+                self.notes.append(
+                    f"{len(group)} trials for {folder} did not run again: nothing proves that you took the snapshot "
+                    f"{digest} on this machine; if you trust its code, run crashhunt trust {self.place.path}, and then "
+                    "the same command again"
+                )
+                continue
             scratch.mkdir(exist_ok=True)
             try:
                 again = settings_again(self.settings, snapshot, scratch)
@@ -99,13 +109,27 @@ class RunsAgain:
         """
         if bundle.is_fully_confirmed or len(self.stops) or stopped():
             return bundle
-        found = confirm(
-            bundle, lambda: bool(len(self.stops)) or stopped(), failed=self.failed, executors=self.executors
-        )
+        try:
+            found = confirm(
+                bundle,
+                lambda: bool(len(self.stops)) or stopped(),
+                failed=self.failed,
+                executors=self.executors,
+                trusted=self._is_made_now(bundle),
+            )
+        except UntrustedError as refusal:
+            note = f"{bundle.id} was not confirmed: {refusal.message}; {refusal.fix}"
+            if note not in self.notes:  # the end of the hunt asks again
+                self.notes.append(note)
+            return bundle
         if found is None or not bundle.path.is_dir():  # a hunt with --keep may have given it up meanwhile
             return bundle
         found.write()
         return found
+
+    def _is_made_now(self, bundle: Bundle) -> bool | None:
+        """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""
+        return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,6 +177,7 @@ class Hunt:
         runs_again = RunsAgain(
             self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
             SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+            taken=snapshot.digest,
         )  # fmt: skip
         try:
             return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)

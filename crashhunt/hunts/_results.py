@@ -12,10 +12,10 @@ import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
-from crashhunt.base.errors import HuntDirectoryError, UsageError
+from crashhunt.base.errors import HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.names import one_of
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.crashes import Bundle, list_bundles
+from crashhunt.crashes import Bundle, describe_code, is_hunt_trusted, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
 from crashhunt.hunts._ledger import Ledger, has_begun
 from crashhunt.hunts._row import BRANCHES, DISTURBANCES, FACTS, ORIGINS, STRESS, TrialRow
@@ -176,16 +176,25 @@ class HuntResults:
             raise UsageError("a dataframe needs pandas", fix="pip install pandas, or take trials()") from None
         return pd.DataFrame(self.trials())
 
-    def agent(self, trial: int, agent: str = "") -> Agent:
+    def agent(self, trial: int, agent: str = "", *, trust: bool = False) -> Agent:
         """Return an agent made as in a trial, with today's code.
 
         Args:
             trial: its number.
             agent: the vehicle's id; may be empty where there is one.
+            trust: import what the hunt names even if the hunt is neither made here nor trusted.
 
         Raises:
             UsageError: there is no such vehicle or trial.
+            UntrustedError: what the hunt names would run, and the hunt is neither made here nor trusted.
         """
+        if not trust and not is_hunt_trusted(self.directory, self._snapshot()):
+            runs = describe_code(self._snapshot(), self.settings)
+            raise UntrustedError(
+                f"nothing proves that you began this hunt on this machine, and this would import what it names: {runs}",
+                fix="run crashhunt trust DIR once, or give trust=True, if you trust that code",
+                where=str(self.directory),
+            )
         arguments = self.trial(trial).spec.arguments
         name = agent or next(iter(arguments))
         if name not in arguments:

@@ -10,7 +10,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import UsageError
 from crashhunt.base.sandbox import landlock_version
-from crashhunt.crashes import refuse_side_effects
+from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_untrusted
 from crashhunt.episode import WorkerSettings
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.replays._edits import edited_spec
@@ -45,8 +45,8 @@ class ReplayOptions:
         times: how often.
         scenario: the name or path of another scenario to drive in; empty for that of the crash.
         accelerate: whether simulators are sped up where that changes no bit.
-        trusted: whether it is ours. Of a stranger's, recorded actions are driven only where that cannot do anything
-            but simulate.
+        trusted: whether its code may run; None to find out. Without trust only recorded actions are replayed, and
+            only where that does nothing but simulate.
         look: what to look at, in a process that has this one's terminal; without it, it runs in one of its own.
     """
 
@@ -56,7 +56,7 @@ class ReplayOptions:
     times: int = 1
     scenario: str = ""
     accelerate: bool = True
-    trusted: bool = True
+    trusted: bool | None = None
     look: Look | None = None
 
 
@@ -104,6 +104,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     Raises:
         BundleError: the bundle is damaged.
         UsageError: an edit cannot be meant.
+        UntrustedError: its code would run, and it is neither made here nor trusted.
     """
     recorded = bundle.recording()
     snapshot = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
@@ -112,10 +113,15 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     if code == "snapshot" and not snapshot.has_code:
         code = "current"
         warnings.append("the hunt kept no snapshot of the code (--no-snapshot), so that today's code drives")
+    faults: list[str] = []
     if options.force:
-        warnings += [f"the snapshot is damaged: {fault}" for fault in snapshot.faults()]
+        faults = snapshot.faults()
+        warnings += [f"the snapshot is damaged: {fault}" for fault in faults]
     else:
         snapshot.verify()
+    trusted = is_bundle_trusted(bundle, faults=faults) if options.trusted is None else options.trusted
+    if not trusted and options.code != "log":
+        raise refuse_untrusted(bundle)
     warnings += [f"{name} was not in the snapshot, and may make a difference" for name in snapshot.additions()]
     settings = read_settings(bundle.hunt / layout.HUNT)
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
@@ -125,7 +131,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     there, here = environment.get("cpu", ""), processor()
     if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")
-    runs = None if code == "log" or not options.trusted else snapshot.code if code == "snapshot" else ()
+    runs = None if code == "log" or not trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
     if not options.scenario and (odd := _kind_it_cannot_do(scenario, spec)):
@@ -136,7 +142,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
             raise UsageError(
                 f"recorded actions belong to the recorded trial, and {edits.all[0]}", fix="replay with --code snapshot"
             )
-        if not options.trusted:
+        if not trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)
             if not landlock_version():
                 warnings.append("this kernel has no Landlock, with which the simulator could write in its folder only")
@@ -162,7 +168,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         argument_files=snapshot.argument_files if code == "snapshot" else {},
         timeout_s=settings.run.timeout_s,
         keep_trials=True,
-        sealed=None if code != "log" or options.trusted else (str(bundle.path),),
+        sealed=None if code != "log" or trusted else (str(bundle.path.resolve()),),
     )
     return Rerun(
         bundle,

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
+from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError, UsageError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import scratch_of
 from crashhunt.executors import run_alone
@@ -58,6 +58,7 @@ def confirm(
     *,
     failed: list[TrialResult] | None = None,
     executors: SharedExecutors | None = None,
+    trusted: bool | None = None,
 ) -> Bundle | None:
     """Return the bundle with the verdict of a first replay, and until when braking would have avoided the crash.
 
@@ -66,16 +67,22 @@ def confirm(
         stopped: asked now and then whether to give up; what a replay does afterwards says nothing about the crash.
         failed: gets what came of the replay, where that is not the crash.
         executors: which run it; a new Python process where there are none.
+        trusted: whether its code may run; None to find out.
 
     Returns:
         None where it was given up. A replay that cannot be run to its end, as when it is killed from outside again and
         again, says nothing about the crash: then `confirmed` is None, and `why_unconfirmed` has the reason.
+
+    Raises:
+        UntrustedError: its code is neither made here nor trusted.
     """
     try:
-        rerun = prepare(bundle, ReplayOptions(force=True))
+        rerun = prepare(bundle, ReplayOptions(force=True, trusted=trusted))
         report = _run(replace(rerun, worker=replace(rerun.worker, find_escapes=True)), stopped, executors)
     except _StoppedError:
         return None
+    except UntrustedError:  # which says nothing about the crash
+        raise
     except _NotSetUpError as error:
         failure: DivergenceData = {"step": 0, "agent": "", "field": "replay", "recorded": None, "replayed": str(error)}
         return replace(bundle, confirmed=False, divergence=failure, why_unconfirmed="")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import CrashhuntError
@@ -30,8 +31,10 @@ def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, s
     units = {} if scenario is None else {("", name): setup.unit for name, setup in scenario.arguments.items()}
     for agent, chosen in settings.agents.items():
         if chosen.agent.startswith("crashhunt.agents:"):
-            arguments = signature_of(locate("agents", chosen.agent)).arguments
-            units |= {(agent, name): argument.unit for name, argument in arguments.items()}
+            # Another version of crashhunt may have an agent that this one does not have.
+            with suppress(CrashhuntError):
+                arguments = signature_of(locate("agents", chosen.agent)).arguments
+                units |= {(agent, name): argument.unit for name, argument in arguments.items()}
         setup = scenario.agents.get(agent) if scenario is not None else None
         if setup is not None and setup.agent == chosen.agent:
             units |= {(agent, name): known.unit for name, known in setup.arguments.items() if known.unit}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypedDict
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.temporary import remove_at_once, temporary_folder
-from crashhunt.crashes import write_bundle
+from crashhunt.crashes import is_bundle_made_here, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.replays import ReplayOptions, confirm, prepare
@@ -134,6 +134,7 @@ def shrink(
     parallel: int = 0,
     watch: Watch | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    trusted: bool | None = None,
 ) -> Shrunk:
     """Make a crash smaller while it stays the same kind of crash, and write what is left as a bundle beside it.
 
@@ -151,9 +152,11 @@ def shrink(
         parallel: how many at a time; 0 for one per core.
         watch: called with how many have been run, and how many may be.
         stopped: asked now and then whether to give up.
+        trusted: whether its code may run; None to find out.
 
     Raises:
         BundleError: the crash is damaged.
+        UntrustedError: its code is neither made here nor trusted.
         CrashhuntError: no trial can be run, or the bundle cannot be written.
     """
     if bundle.id.endswith(layout.SMALL):
@@ -165,7 +168,7 @@ def shrink(
         raise UsageError(f"the budget is {budget}", fix="give at least 1 trial")
     if time_s is not None and not time_s > 0:
         raise UsageError(f"the time is {time_s} s", fix="give more than 0")
-    rerun = prepare(bundle, ReplayOptions())
+    rerun = prepare(bundle, ReplayOptions(trusted=trusted))
     signature = signature_of(bundle)
     memory = bundle.path.with_name(f".{shrunk_name(bundle.id)}.jsonl")
     with temporary_folder("shrink") as scratch:
@@ -230,7 +233,7 @@ def _kept(small: Bundle) -> Bundle:
     """Have it confirmed; what is left says of what it is left before that, which may take a minute."""
     try:
         small.write()
-        small = confirm(small) or small
+        small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
         small.write()
     except BaseException:  # else it would pass for a crash of the hunt, or for one that nobody has looked at
         remove_at_once(small.path)
@@ -254,7 +257,7 @@ def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
         trial = scratch_of(scratch, spec.number)
         return write_bundle(
             bundle.hunt, results[0], trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
-            lanes=read_map(scratch, trial), name=shrunk_name(bundle.id),
+            lanes=read_map(scratch, trial), name=shrunk_name(bundle.id), authenticate=is_bundle_made_here(bundle),
         )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ class Manifest(TypedDict):
     """``manifest.json``: which files there are, and from where modules are imported.
 
     ``described`` are the files that say what the snapshot is and are no part of its digest; the earliest had neither
-    them nor ``integrity``.
+    them nor ``integrity``. ``authentication_code`` proves to the user who took the snapshot that it is unchanged.
     """
 
     schema: int
@@ -23,6 +23,7 @@ class Manifest(TypedDict):
     left_out: list[str]
     files: dict[str, FileEntry]
     described: NotRequired[dict[str, FileEntry]]
+    authentication_code: NotRequired[str]
     integrity: NotRequired[str]
 
 

@@ -10,7 +10,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import changed_file, describe_files, digest_of_data
 from crashhunt.scenario import digest_of_described
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,6 +51,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
     (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")
     manifest: Manifest = {"schema": SCHEMA, "paths": [], "argument_files": {}, "left_out": [], "files": kept}
     manifest["described"] = describe_files(final)
+    manifest["authentication_code"] = code_of_manifest(manifest)
     manifest["integrity"] = digest_of_data(manifest)
     (final / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     return Snapshot(final)

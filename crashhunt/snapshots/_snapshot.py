@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.machinery
+import json
 import os
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
 from crashhunt.base import layout
+from crashhunt.base.authentication import authentication_code, is_authentic
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import (
     FILES,
@@ -22,7 +25,7 @@ from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
 from crashhunt.snapshots._data import Environment, Manifest
 
-__all__ = ["Snapshot", "latest_snapshot"]
+__all__ = ["Snapshot", "code_of_manifest", "latest_snapshot"]
 
 SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
@@ -127,6 +130,30 @@ class Snapshot:
             raise BundleError(f"cannot be read: {reason}", fix=_UNDAMAGED, where=str(file)) from None
         return found
 
+    @property
+    def is_made_here(self) -> bool:
+        """Whether this user took the snapshot on this machine; `faults` says whether its files have changed since.
+
+        Raises:
+            BundleError: the manifest is missing or damaged.
+        """
+        manifest = self.manifest
+        return is_authentic("snapshot", _authenticated(manifest), manifest.get("authentication_code"))
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of everything that says what would run, in hexadecimal, whoever took the snapshot.
+
+        Raises:
+            BundleError: the manifest is missing or damaged.
+        """
+        found = hashlib.sha256(json.dumps(_authenticated(self.manifest), sort_keys=True).encode())
+        for name in (layout.HUNT, layout.ENVIRONMENT):  # which the manifests of the earliest versions do not list
+            content = b""
+            with suppress(OSError):
+                content = (self.path / name).read_bytes()
+            found.update(len(content).to_bytes(8, "little") + content)
+        return found.hexdigest()
+
     def faults(self) -> list[str]:
         """Return what is not as it was: files that are missing or changed, and modules that were not there.
 
@@ -178,9 +205,18 @@ class Snapshot:
             more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
             raise BundleError(
                 f"the snapshot is damaged: {faults[0]}{more}",
-                fix="get an undamaged copy of the hunt's directory; crashhunt replay --force takes it as it is",
+                fix="get an undamaged copy of the hunt's directory; crashhunt replay --force --trust runs it as it is",
                 where=str(self.path),
             )
+
+
+def code_of_manifest(manifest: Manifest) -> str:
+    """Return the authentication code of a manifest, which lists all files with their digests."""
+    return authentication_code("snapshot", _authenticated(manifest))
+
+
+def _authenticated(manifest: Manifest) -> dict[str, object]:
+    return {name: value for name, value in manifest.items() if name not in ("authentication_code", "integrity")}
 
 
 _UNDAMAGED = "get an undamaged copy of the hunt's directory"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.base.integrity import FileEntry
     from crashhunt.snapshots._data import Environment, Manifest
 
-from crashhunt.snapshots._snapshot import SCHEMA, Snapshot
+from crashhunt.snapshots._snapshot import SCHEMA, Snapshot, code_of_manifest
 
 __all__ = ["SnapshotOptions", "take_snapshot"]
 
@@ -138,7 +138,8 @@ def _build(
     }
     digest = digest_of_described(stored, says=[found.paths, argument_files])
     final = building.with_name(digest)
-    if final.exists() and not _is_damaged(Snapshot(final)):
+    # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
+    if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:
         return Snapshot(final)
     write_settings(building / layout.HUNT, settings, ["crashhunt", "run", "as resolved"])
     facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
@@ -146,10 +147,11 @@ def _build(
         facts["core"] = core
     (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
     manifest["described"] = describe_files(building)
+    manifest["authentication_code"] = code_of_manifest(manifest)
     manifest["integrity"] = digest_of_data(manifest)
     (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     sync_tree(building)
-    put_in_place(building, final)  # what is there already is the same, but for the damage
+    put_in_place(building, final)  # what is there already is the same, but for damage and the user who took it
     sync_folder(final.parent)
     return Snapshot(final)
 

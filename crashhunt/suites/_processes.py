@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.base.authentication import authentication_code
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.base.files import exchange, put_in_place, whole_file
 from crashhunt.base.signals import stop_requests
@@ -41,9 +42,19 @@ if TYPE_CHECKING:
     from crashhunt.plans import Given, HuntSettings
     from crashhunt.scenario import Scenario
 
-__all__ = ["REQUEST", "RunRequest", "check_machine", "run_all", "set_aside", "slots_of", "write_request"]
+__all__ = [
+    "PURPOSE_OF_REQUEST",
+    "REQUEST",
+    "RunRequest",
+    "check_machine",
+    "run_all",
+    "set_aside",
+    "slots_of",
+    "write_request",
+]
 
 REQUEST = layout.REQUEST
+PURPOSE_OF_REQUEST = "request of a suite"  # of its authentication code
 _LOOK_EVERY_S = 0.1  # at processes that may have ended
 _WATCH_EVERY_S = 1.0  # the table of `suite run --watch`
 _BUSY_S = 15.0  # for the process of an earlier run to leave the directory
@@ -91,8 +102,10 @@ class RunRequest:
 
 def write_request(folder: Path, request: RunRequest) -> None:
     """Write ``request.json``, all of it or nothing."""
+    data = json.loads(json.dumps(request.to_json(), default=str))
+    data["authentication_code"] = authentication_code(PURPOSE_OF_REQUEST, data)
     with whole_file(folder / REQUEST) as temporary:
-        temporary.write_text(json.dumps(request.to_json(), indent=1, default=str), encoding="utf-8")
+        temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 def slots_of(parallel: int) -> int:

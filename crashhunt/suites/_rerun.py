@@ -17,6 +17,7 @@ from crashhunt.hunts import HuntState, Ledger, hunt_state
 from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
+from crashhunt.suites._origins import refuse_untrusted_hunt
 from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, set_aside, write_request
 from crashhunt.trial import Outcome
 
@@ -39,6 +40,7 @@ def rerun(
     parallel: int = 0,
     watch: Callable[[list[HuntState]], None] | None = None,
     machine: Given | None = None,
+    trusted: bool = False,
 ) -> tuple[list[HuntState], list[Path]]:
     """Run hunts again; return where they stand now, and where what they replace is kept.
 
@@ -53,12 +55,16 @@ def rerun(
         parallel: trials at a time, of all hunts together; 0 for one per core.
         watch: called about once a second.
         machine: options such as ``executor`` that hold for all of them, whatever each says.
+        trusted: whether what the hunts name may run; otherwise each has to be trusted, before the first one runs.
 
     Raises:
         UsageError: a change cannot be meant.
+        UntrustedError: a hunt is neither made here nor trusted.
         HuntDirectoryError: a directory cannot be used.
     """
     check_machine(parallel, machine)
+    for hunt in () if trusted else hunts:
+        refuse_untrusted_hunt(hunt)
     changes = changes or {}
     if to is not None:
         return _elsewhere(hunts, to, changes, parallel, watch, machine), []

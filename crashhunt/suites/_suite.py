@@ -19,6 +19,7 @@ from crashhunt.base.validation import validate
 from crashhunt.hunts import HuntState, hunt_state, is_hunt
 from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, request_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
+from crashhunt.suites._origins import refuse_untrusted_hunt
 from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, write_request
 
 if TYPE_CHECKING:
@@ -157,6 +158,7 @@ class Suite:
         *,
         watch: Callable[[list[HuntState]], None] | None = None,
         machine: Given | None = None,
+        trusted: bool = False,
     ) -> list[HuntState]:
         """Run what has not ended, whatever becomes of the others; return where each run stands.
 
@@ -165,14 +167,19 @@ class Suite:
             parallel: trials at a time, of all hunts together; 0 for one per core.
             watch: called about once a second.
             machine: options such as ``executor`` that hold for all of them, whatever each says.
+            trusted: whether what hunts name that are there already may run; otherwise each has to be trusted, before
+                the first one runs.
 
         Raises:
+            UntrustedError: a hunt that is there already is neither made here nor trusted.
             HuntDirectoryError: the directory has another suite in it, or cannot be written.
             PluginError: there is no such executor.
         """
         check_machine(parallel, machine)
         folders = self.plan(directory)
         waiting = [folder for folder in folders if hunt_state(folder).state in ("queued", "interrupted", "killed")]
+        for folder in () if trusted else waiting:
+            refuse_untrusted_hunt(folder)
         run_all(
             waiting,
             parallel,

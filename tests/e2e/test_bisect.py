@@ -55,7 +55,9 @@ def test_the_first_of_them_is_told(repository):
     git(repository.folder, "rebase", "-q", "--autostash", "--onto", "HEAD~2", "HEAD~1", "-X", "theirs")
     done = repository.crashhunt("bisect", "../h", "--good", "HEAD~2")
     assert "is the first in which it crashes: change 3" in done.out
-    assert "the crash is still, and not fixed" in repository.crashhunt("bisect", "../h", "--good", "HEAD", expect=2).err
+    repository.crashhunt("export", "../h", "../crash.zip")
+    refused = repository.crashhunt("bisect", "../crash.zip", "--good", "HEAD", expect=2)
+    assert "the crash is still, and not fixed" in refused.err
 
 
 def test_what_is_no_revision_is_told(toy, made_once):

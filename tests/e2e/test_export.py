@@ -10,6 +10,7 @@ import zipfile
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from crashhunt.base.integrity import digest_of_content
 from crashhunt.crashes import open_archive
 from crashhunt.errors import BundleError
 
@@ -76,12 +77,21 @@ def with_index(change):
 
 
 def test_a_forged_signature_is_a_strangers(exported):
-    forged = rewritten(
-        exported.folder / "crash ä.zip",
-        exported.folder / "forged.zip",
-        with_index(lambda index: index.update(made_by="you@here")),
-    )
-    assert "you@here made it" in exported.crashhunt("replay", forged.name, expect=2).err
+    def forge(name, data):
+        if name == "hunt.toml":
+            data = data.replace(b"mine:Agent", b"evil:Agent")
+            digests["hunt.toml"] = {"size": len(data), "blake2b": digest_of_content(data)}
+        if name == "archive.json":
+            index = json.loads(data)
+            index.update(made_by="you@here", files=index["files"] | digests)
+            data = json.dumps(index).encode()
+        yield name, data
+
+    digests: dict[str, object] = {}
+    forged = rewritten(exported.folder / "crash ä.zip", exported.folder / "forged.zip", forge)
+    refused = exported.crashhunt("replay", forged.name, expect=2).err
+    assert "you@here on " in refused
+    assert "evil:Agent" in refused
 
 
 def test_what_should_not_be_there_is_refused(exported, tmp_path):

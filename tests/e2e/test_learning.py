@@ -61,7 +61,7 @@ def test_a_hunt_that_learns_and_is_killed_runs_the_same_trials(own, sampler):
     chance = random.Random(5)
     for ends in (chance.randrange(2, 30), chance.randrange(30, 50)):
         process = own.begin("run", "killed", *words, "--set", "step_wall_s=0.002")
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 120
         while len(trials(own.folder / "killed")) < ends:
             assert time.monotonic() < deadline
             time.sleep(0.01)

@@ -92,7 +92,10 @@ def test_a_change_is_found_where_it_happens(crash):
     refused = crash.crashhunt("replay", "h", expect=2)
     assert "code/my_pkg/agents.py has changed" in refused.err
     assert "--force" in refused.err
-    done = crash.crashhunt("replay", "h", "--force", "--json", expect=1)
+    again = crash.crashhunt("replay", "h", "--force", expect=2)
+    assert "code/my_pkg/agents.py has changed" in again.err  # whoever changed it
+    assert "--trust" in again.err
+    done = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1)
     assert done.json["verdict"] == "diverged"
     assert any("agents.py has changed" in warning for warning in done.json["warnings"])
     assert done.json["divergence"]["step"] == 18
@@ -117,7 +120,7 @@ def test_a_change_is_found_where_it_happens(crash):
 @pytest.mark.parametrize(("step", "field"), [(25, "length"), (35, "action")])
 def test_a_run_that_is_shorter_or_longer_diverges(crash, step, field):
     change_snapshot(crash, "== 30", f"== {step}")
-    divergence = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json["divergence"]
+    divergence = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json["divergence"]
     assert divergence["step"] == min(step, 30)
     assert divergence["field"] in (field, "action")
 
@@ -231,7 +234,7 @@ def test_what_cannot_be_compared_says_which(crash_on_sumo):
     (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
     scenario = snapshot / "scenario" / "scenario.toml"
     edit(scenario, "vehicles = 8", "vehicles = 4")
-    done = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json
+    done = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json
     assert done["verdict"] == "not_comparable"
     assert "(8, 7)" in done["reason"]
     assert "(4, 7)" in done["reason"]
@@ -244,7 +247,7 @@ def test_what_cannot_be_compared_says_which(crash_on_sumo):
     same = crash.crashhunt("replay", "h", "--json").json
     assert same["warnings"] == [f"libsumo was 1.2.3 and is {now}"]
     change_snapshot(crash, "self.step * helper.GAIN", "self.step * helper.GAIN * 2")
-    other = crash.crashhunt("replay", "h", "--force", "--json", expect=1).json
+    other = crash.crashhunt("replay", "h", "--force", "--trust", "--json", expect=1).json
     assert (other["verdict"], other["reason"]) == (
         "not_comparable", f"the simulator differs: libsumo was 1.2.3 and is {now}"
     )  # fmt: skip
@@ -256,10 +259,11 @@ def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash
     edit(code / "episode" / "_settings.py", "_SCHEMA = 1", "_SCHEMA = 99")
     edit(code / "base" / "version.py", f'__version__ = "{__version__}"', '__version__ = "7.8.9"')
     for words in ((), ("--until", "5")):
-        refused = crash.crashhunt("replay", "h", "--force", *words, expect=2)
+        refused = crash.crashhunt("replay", "h", "--force", "--trust", *words, expect=2)
         assert "the snapshot has crashhunt 7.8.9" in refused.err
         assert "pip install crashhunt==7.8.9" in refused.err
-    assert crash.crashhunt("replay", "h", "--force", "--code", "current", "--json").json["verdict"] == "reproduced"
+    current = crash.crashhunt("replay", "h", "--force", "--trust", "--code", "current", "--json")
+    assert current.json["verdict"] == "reproduced"
 
 
 def test_the_recorded_actions_run_no_code_of_the_bundle(crash):

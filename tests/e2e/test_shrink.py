@@ -90,7 +90,7 @@ def test_a_full_disk_is_told_and_what_came_of_the_trials_is_remembered(hunt, mon
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return write_bundle(hunt_folder, result, trial, **how)
 
-    def full_later(small):
+    def full_later(small, **_):
         assert "shrunk" in read_bundle(small.path).added  # whoever kills it now leaves what says what it is
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -186,7 +186,7 @@ def test_ctrl_c_leaves_the_best(hunt):
 def test_what_is_asked_for_must_make_sense(hunt):
     assert "--budget is 0" in hunt.crashhunt("shrink", "h", "--budget", "0", expect=2).err
     hunt.crashhunt("export", "h", "crash.zip")
-    assert "unpack it" in hunt.crashhunt("shrink", "crash.zip", expect=2).err
+    assert "unpack it (a zip file) into a new folder" in hunt.crashhunt("shrink", "crash.zip", expect=2).err
 
 
 @pytest.mark.nightly

@@ -158,7 +158,7 @@ def test_a_missing_file_is_named_and_a_new_module_too(project):
     (package / "numpy.py").unlink()
     (package / "untracked.py").unlink()
     assert "untracked.py is missing" in project.crashhunt("replay", "../out", expect=2).err
-    warned = project.crashhunt("replay", "../out", "--force")
+    warned = project.crashhunt("replay", "../out", "--force", "--trust")
     assert "untracked.py is missing" in warned.out
     (snapshot / "manifest.json").write_text("[]")
     assert "manifest" in project.crashhunt("replay", "../out", expect=2).err

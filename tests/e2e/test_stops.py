@@ -210,3 +210,11 @@ def test_too_few_files_are_one_line(toy):
     assert "ulimit -n" in done.stderr
     assert done.stderr.count("\n") == 1
     wait_for(lambda: not left_in(toy.folder))
+
+
+def test_limit_on_the_size_of_files_is_named(toy):
+    command = ["bash", "-c", 'ulimit -f 1000; exec "$0" "$@"', str(CRASHHUNT), "run", "h", "1", "1", "20", *FINE]
+    done = subprocess.run(command, cwd=toy.folder, env=toy.environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "the limit on the size of a file is 0.9766 MiB: raise it with ulimit -f" in done.stderr
+    assert done.stderr.count("\n") == 1

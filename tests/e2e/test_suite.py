@@ -148,8 +148,9 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     wait_for(lambda: "running" not in states(toy).values())
-    assert states(toy)["c/0"] == "queued"
-    before = {name: dict(digests(toy, f"out/{name}/0")) for name in ("a", "b")}
+    killed = states(toy)
+    begun = [name for name in "abc" if killed[f"{name}/0"] != "queued"]
+    before = {name: dict(digests(toy, f"out/{name}/0")) for name in begun}
     assert any(before.values())
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     assert set(states(toy).values()) == {"finished"}
@@ -159,7 +160,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
         after = digests(toy, f"out/{name}/0")
         assert {number: after[number] for number in rows} == rows
     log = toy.crashhunt("logs", "out", "--run", "a/0", "--type", "state").out
-    assert log.count("running") == 2
+    assert log.count("running") == (1 if killed["a/0"] == "finished" else 2)  # as on a machine that is busy
 
 
 def test_a_damaged_plan_leaves_the_others_untouched(toy):
@@ -193,7 +194,7 @@ def digests(shell, hunt: str) -> dict[int, tuple[str, str]]:
 
 
 def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
-    written(toy, SLOW)
+    written(toy, SLOW.replace("80", "5000"))  # so that none ends before it is looked at, on no machine
     process = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
     process.send_signal(signal.SIGINT)

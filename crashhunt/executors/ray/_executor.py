@@ -263,7 +263,7 @@ class RayExecutor:
             lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise CrashhuntError(
                 f"Ray has ended on its own{f': {lines[-1]}' if lines else ''}",
-                fix="see that the limits on memory and processes leave it room, and run the same command again",
+                fix="raise the limits on memory (ulimit -v) and processes (ulimit -u), and run the same command again",
             )
         self._notes.add(f"the Ray cluster was lost{f' ({why})' if why else ''}; the hunt waits until it is back")
 

@@ -1,0 +1,71 @@
+"""A resource limit that makes something fail is named, with how to raise it."""
+
+from __future__ import annotations
+
+import errno
+import resource
+
+import pytest
+
+from crashhunt.base.limits import limit_behind
+from crashhunt.episode._failures import failure_of
+
+MEMORY = (
+    MemoryError(),
+    OSError(errno.ENOMEM, "Cannot allocate memory"),
+    RuntimeError("can't start new thread"),
+    ImportError("libarrow.so: failed to map segment from shared object"),
+)
+OTHERS = (
+    ValueError("can't start new thread"),
+    RuntimeError("no thread"),
+    OSError(errno.ENOSPC, "No space left on device"),
+    ImportError("No module named 'x'"),
+)
+
+
+class UnsayableError(ImportError):
+    def __str__(self):
+        raise KeyboardInterrupt
+
+
+@pytest.fixture
+def limits(monkeypatch):
+    """The limits that this process seems to have, in bytes."""
+    found = {}
+    infinite = resource.RLIM_INFINITY
+    monkeypatch.setattr("resource.getrlimit", lambda which: (found.get(which, infinite), infinite))
+    return found
+
+
+@pytest.mark.parametrize("error", MEMORY, ids=repr)
+def test_limit_on_memory_is_named_where_there_is_one(limits, error):
+    assert limit_behind(error) == ""
+    limits[resource.RLIMIT_FSIZE] = 1 << 20
+    assert limit_behind(error) == ""
+    limits[resource.RLIMIT_AS] = 1500 << 20
+    assert limit_behind(error) == "the limit on memory is 1500 MiB: raise it with ulimit -v"
+
+
+def test_limit_on_files_is_named_where_there_is_one(limits):
+    error = OSError(errno.EFBIG, "File too large")
+    limits[resource.RLIMIT_AS] = 1 << 20
+    assert limit_behind(error) == ""
+    limits[resource.RLIMIT_FSIZE] = 1 << 19
+    assert limit_behind(error) == "the limit on the size of a file is 0.5 MiB: raise it with ulimit -f"
+
+
+@pytest.mark.parametrize(
+    "error", [*OTHERS, UnsayableError("failed to map segment")], ids=lambda one: type(one).__name__
+)
+def test_what_no_limit_has_caused_names_none(limits, error):
+    limits |= {resource.RLIMIT_AS: 1 << 30, resource.RLIMIT_FSIZE: 1 << 30}
+    assert limit_behind(error) == ""
+
+
+def test_trial_that_failed_by_a_limit_says_so(limits):
+    assert failure_of(MemoryError(), "ego").message == ""
+    limits |= {resource.RLIMIT_AS: 1 << 30, resource.RLIMIT_FSIZE: 1 << 30}
+    assert failure_of(MemoryError(), "ego").message == "the limit on memory is 1024 MiB: raise it with ulimit -v"
+    said = failure_of(OSError(errno.EFBIG, "File too large"), "ego").message
+    assert said == "[Errno 27] File too large (the limit on the size of a file is 1024 MiB: raise it with ulimit -f)"
