@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import importlib.util
 import io
 import os
 import re
@@ -178,6 +179,18 @@ def test_a_node_says_what_differs(monkeypatch):
     assert Site().differs(here, code_digest()) == ""
     said = Site().differs({**here, "python": "3.0.0", "gone": "2"}, code_digest())
     assert re.fullmatch(r"python is [\d.]+ there and 3.0.0 here, gone is not installed there and 2 here", said)
+    lacks = {**here, "_crashhunt_link_order": "installed"}
+    find = importlib.util.find_spec
+    for name, said in (
+        ("os", ""),
+        ("no_such_module", "_crashhunt_link_order is not installed there and installed here"),
+    ):
+        with monkeypatch.context() as context:
+            context.setattr(
+                "crashhunt.executors.ray._site.importlib.util.find_spec",
+                lambda asked, name=name: find(name if asked == "_crashhunt_link_order" else asked),
+            )
+            assert Site().differs(lacks, code_digest()) == said
     assert Site().differs(here, "other") == "crashhunt has the same version and other code there"
     monkeypatch.setattr("crashhunt.executors.ray._site.importlib.util.find_spec", lambda name: None)
     assert Site().differs(here, code_digest.__name__) == "crashhunt cannot be found there (no such package)"
