@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import weakref
-from functools import cache
-from importlib import metadata
 from types import MethodType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -15,7 +13,7 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.native import core_for, link_order, why_no_link_order
+from crashhunt.native import core_for
 from crashhunt.scenario import ObservationSetup
 from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
@@ -26,12 +24,12 @@ from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._driving import Driving
 from crashhunt.simulators.sumo._entering import enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._holding import held_back
+from crashhunt.simulators.sumo._loading import VERSION, Loading
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._taking_part import TakingPart
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.simulators.sumo._usual import Present, UsualSteps
-from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
@@ -51,13 +49,10 @@ __all__ = ["SumoSimulator"]
 _FOLLOWED, _MARKED = (224, 138, 0, 255), (198, 40, 40, 255)
 _SEEN_M = 150.0  # of the network, in a window that follows a vehicle
 _KEEPS_DECELERATION = 4  # bit of SUMO's speed mode: no braking harder than the decel of the type
-_VERSION = metadata.version("libsumo")  # the module itself says it since 1.26
-_UNORDERED = "the order of SUMO's links is not fixed, and trials may differ between processes"
 _DISTRUSTED = "the compiled core says something else than libsumo's own getters, and is not used"
 P = ParamSpec("P")
 T = TypeVar("T")
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
-_keep_xml_ready = cache(keep_xml_ready)  # once a process
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
 
 
@@ -86,10 +81,9 @@ class SumoSimulator:
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
-        self._link_order = link_order(_VERSION, sumo.__file__)
-        self._fixes_link_order = scenario.table(SumoSetup).fix_link_order is not False
+        self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
         native = scenario.table(SumoSetup).native is not False
-        core = core_for(_VERSION, sumo.__file__) if native else None
+        core = core_for(VERSION, sumo.__file__) if native else None
         self._sight = Sight(
             tuple(scenario.agents),
             scenario.step_length_s,
@@ -144,15 +138,11 @@ class SumoSimulator:
         self.setup_steps = 0
         self._begin(options.get("only"), options.get("script"), arguments)
         command = self._files.arguments(seed, arguments)
-        self._link_order.use(self._fixes_link_order)
         try:
-            if libsumo.isLoaded():
-                libsumo.load(command)
-            else:
-                libsumo.start([*self._program, *command])
-                _keep_xml_ready()
-            self._check_link_order()
+            notice = self._loading.load(self._program, command)
             _current = weakref.ref(self)
+            if notice and notice not in self.notices:
+                self.notices.append(notice)
             with steps_counted(self, self.step_length_s):
                 enter(self._scenario, self._setups, self._replaced, self._taking_part)
             if script := options.get("script"):
@@ -294,14 +284,6 @@ class SumoSimulator:
         self._moved = {**self._scenario.agents, **dict.fromkeys(script.names if script is not None else ())}
         stay = (*(only or ()), *setups, *self._replaced)
         self._taking_part = None if only is None else TakingPart(stay, self._sight.leaving)
-
-    def _check_link_order(self) -> None:
-        """Report once where the links of a load are not in the fixed order, though the library is installed."""
-        reason = self._link_order.check_load()
-        if reason and self._fixes_link_order and not why_no_link_order(_VERSION):
-            notice = f"{_UNORDERED}: {reason}"
-            if notice not in self.notices:
-                self.notices.append(notice)
 
     def _stop_going_ahead(self) -> None:
         """Another episode begins in this process, whoever's the last one was."""
