@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from crashhunt.native import LinkOrder, _link_order, link_order, why_no_link_order
-from crashhunt.plans import load_order_change, load_order_of, with_recorded_load_order
+from crashhunt.plans import RunSettings, load_order_change, load_order_of, with_recorded_load_order
+from crashhunt.plans._plan import _noted
 from crashhunt.scenario import load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
 
@@ -281,6 +282,23 @@ def test_recorded_order_is_kept(tmp_path, monkeypatch):
     toy = replace(scenario, simulator="toy")
     assert load_order_of(toy) is None
     assert with_recorded_load_order(toy, None) is toy
+
+
+def test_hunt_says_where_the_order_is_not_fixed(tmp_path, monkeypatch):
+    scenario = sumo_scenario(tmp_path)
+    monkeypatch.setattr(_link_order, "_installed", lambda: "/somewhere/library.so")
+    monkeypatch.setattr(_link_order, "_interface", lambda: _link_order._INTERFACE)
+    monkeypatch.setattr(metadata, "version", lambda _: "1.28.0")
+    assert not [note for note in _noted(scenario, RunSettings()).notes if "order" in note]
+    text = (tmp_path / "scenario.toml").read_text().replace("[sumo]\n", "[sumo]\nfix_link_order = false\n")
+    (tmp_path / "scenario.toml").write_text(text)
+    (note,) = (note for note in _noted(load_scenario(tmp_path), RunSettings()).notes if "order" in note)
+    assert note == (
+        "the order of SUMO's links is not fixed: the scenario says so; a trial may differ between processes"
+    )
+    monkeypatch.setattr(_link_order, "_installed", lambda: None)
+    (note,) = (note for note in _noted(scenario, RunSettings(native=False)).notes if "order" in note)
+    assert "not fixed: the library is not built;" in note
 
 
 @pytest.fixture(scope="module")
