@@ -82,11 +82,10 @@ bool is_empty_set(void *variable) {
     if (found.dli_saddr != variable || symbol->st_size != sizeof(Pairs)) {
         return false;
     }
-    const Pairs *pairs = static_cast<const Pairs *>(variable);
-    const char *begin = static_cast<const char *>(variable), *end = begin + sizeof(Pairs);
-    const char *const *words = static_cast<const char *const *>(variable);
     // libstdc++: comparator, color, root, leftmost, rightmost, count. Without elements, both ends are the header.
-    return !words[2] && words[3] == begin + 8 && words[4] == words[3] && words[3] < end && pairs->empty();
+    const char *header = static_cast<const char *>(variable) + 8;
+    const char *const *words = static_cast<const char *const *>(variable);
+    return !words[2] && words[3] == header && words[4] == header && static_cast<const Pairs *>(variable)->empty();
 }
 
 // The entries of a function in the table of addresses of a library.
@@ -121,10 +120,13 @@ std::vector<void **> entries_of(const link_map *library, const char *function) {
 }
 
 // Whether libsumo calls its own function there, or will when it has looked the function up.
-bool all_lead_into(const link_map *library, const std::vector<void **> &entries) {
+bool all_lead_into_library_of(void *function, const std::vector<void **> &entries) {
+    Dl_info library, found;
+    if (!dladdr(function, &library)) {
+        return false;
+    }
     for (void **entry : entries) {
-        Dl_info found;
-        if (!dladdr(*entry, &found) || found.dli_fbase != reinterpret_cast<void *>(library->l_addr)) {
+        if (!dladdr(*entry, &found) || found.dli_fbase != library.dli_fbase) {
             return false;
         }
     }
@@ -219,7 +221,7 @@ EXPORTED const char *crashhunt_link_order_bind(const char *path) {
         return "MSLink::myRecheck of libsumo is not an empty std::set";
     }
     const std::vector<void **> rechecks = entries_of(map, RECHECK), constructs = entries_of(map, CONSTRUCT);
-    if (!all_lead_into(map, rechecks) || !all_lead_into(map, constructs)) {
+    if (!all_lead_into_library_of(found.pairs, rechecks) || !all_lead_into_library_of(found.pairs, constructs)) {
         return "libsumo calls functions of its class MSLink in another way";
     }
     if (!make_writable(rechecks) || !make_writable(constructs)) {

@@ -12,12 +12,14 @@ import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors.ray import RayExecutor
 from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
@@ -194,6 +196,17 @@ def test_a_node_says_what_differs(monkeypatch):
     assert Site().differs(here, "other") == "crashhunt has the same version and other code there"
     monkeypatch.setattr("crashhunt.executors.ray._site.importlib.util.find_spec", lambda name: None)
     assert Site().differs(here, code_digest.__name__) == "crashhunt cannot be found there (no such package)"
+
+
+@pytest.mark.parametrize(
+    ("order", "wanted"),
+    [("fixed", {"_crashhunt_link_order": "installed"}), ("not fixed: the scenario says so", {}), (None, {})],
+)
+def test_a_node_needs_the_library_that_fixes_an_order(monkeypatch, order, wanted):
+    monkeypatch.setattr("crashhunt.executors.ray._executor.load_order_of", lambda _: order)
+    made = RayExecutor.__new__(RayExecutor)
+    made._settings = SimpleNamespace(scenario=None)
+    assert made._load_order() == wanted
 
 
 def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypatch):
