@@ -1,6 +1,7 @@
-"""Builds the compiled core into wheels and editable installations, where that can be done; crashhunt goes without it.
+"""Builds the compiled parts into wheels and editable installations, where that can be done; crashhunt goes without.
 
-CRASHHUNT_CORE=0 leaves it out; CRASHHUNT_CORE=1, for the wheels of a release, fails where it cannot be built.
+They are the compiled core and the library that fixes the order of SUMO's links. CRASHHUNT_CORE=0 leaves both out;
+CRASHHUNT_CORE=1, for the wheels of a release, fails where one of them cannot be built.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
          "-fno-builtin-sin", "-fno-builtin-cos", "-Wall", "-Wextra")  # fmt: skip
 INTERFACE = re.compile(r"^_INTERFACE = (\d+)$", re.MULTILINE)
+LINK_ORDER = "_crashhunt_link_order.so"  # a library, not a module, and so of any version of Python
 
 
 class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take none
-    """Adds the module ``_crashhunt_core`` beside the package."""
+    """Adds the module ``_crashhunt_core`` and the library ``_crashhunt_link_order`` beside the package."""
 
     PLUGIN_NAME = "custom"
 
@@ -35,17 +37,18 @@ class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take
         if self.target_name != "wheel" or asked == "0":
             return
         self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-core-"))
-        try:
-            built = build(Path(self.root), self._folder)
-        except (OSError, subprocess.SubprocessError, ValueError) as error:
-            if asked == "1":
-                raise
-            self.app.display_warning(f"crashhunt goes without its compiled core: {error}")
-            return
-        where = "force_include_editable" if version == "editable" else "force_include"
-        build_data[where][str(built)] = built.name
-        build_data["pure_python"] = False
-        build_data["infer_tag"] = True
+        for what, compile_part in (("compiled core", build), ("fixed order of SUMO's links", build_link_order)):
+            try:
+                built = compile_part(Path(self.root), self._folder)
+            except (OSError, subprocess.SubprocessError, ValueError) as error:
+                if asked == "1":
+                    raise
+                self.app.display_warning(f"crashhunt goes without its {what}: {error}")
+                continue
+            where = "force_include_editable" if version == "editable" else "force_include"
+            build_data[where][str(built)] = built.name
+            build_data["pure_python"] = False
+            build_data["infer_tag"] = True
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was built."""
@@ -60,18 +63,34 @@ def build(root: Path, folder: Path) -> Path:
         OSError: there is no compiler.
         subprocess.SubprocessError: it fails, such as where Python's headers are missing.
     """
-    if sys.platform != "linux" or sys.implementation.name != "cpython" or sys.byteorder != "little":
+    if sys.implementation.name != "cpython" or sys.byteorder != "little":
+        raise ValueError("it is for CPython on Linux")
+    built = folder / f"_crashhunt_core{sysconfig.get_config_var('EXT_SUFFIX')}"
+    return _compile(root / "crashhunt" / "native", "core.cpp", "_core.py", built)
+
+
+def build_link_order(root: Path, folder: Path) -> Path:
+    """Compile the library that fixes the order of SUMO's links into a folder; return the file.
+
+    Raises:
+        ValueError: the system is not Linux.
+        OSError: there is no compiler.
+        subprocess.SubprocessError: it fails.
+    """
+    return _compile(root / "crashhunt" / "native", "link_order.cpp", "_link_order.py", folder / LINK_ORDER)
+
+
+def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
+    if sys.platform != "linux":
         raise ValueError("it is for CPython on Linux")
     compiler = os.environ.get("CXX") or next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
     if not compiler:
         raise FileNotFoundError("there is no C++ compiler")
-    source = root / "crashhunt" / "native"
-    match = INTERFACE.search((source / "_core.py").read_text())
+    match = INTERFACE.search((folder / interface).read_text())
     if match is None:
-        raise ValueError("crashhunt/native/_core.py does not say which interface it has")
-    built = folder / f"_crashhunt_core{sysconfig.get_config_var('EXT_SUFFIX')}"
+        raise ValueError(f"crashhunt/native/{interface} does not say which interface it has")
     words = [*shlex.split(compiler), *FLAGS, *shlex.split(os.environ.get("CXXFLAGS", ""))]
-    words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-I{sysconfig.get_path('include')}", str(source / "core.cpp")]
+    words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-I{sysconfig.get_path('include')}", str(folder / source)]
     done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)
     if done.returncode:
         raise subprocess.SubprocessError(f"the compiler says: {done.stderr.strip()[-2000:]}")

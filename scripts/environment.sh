@@ -18,7 +18,7 @@ find_python() {
 
 environment() {
     extra=$1
-    wanted=$(cat "$root/pyproject.toml" "$root/scripts/build_core.py" "$root"/crashhunt/native/{_core.py,*.?pp} | cksum)
+    wanted=$(cat "$root/pyproject.toml" "$root/scripts/build_core.py" "$root"/crashhunt/native/{_core.py,_link_order.py,*.?pp} | cksum)
     # A development environment serves users too.
     for have in dev "$extra"; do
         if [ "$(cat "$venv/made-for-${have:-users}" 2>/dev/null)" = "$wanted" ]; then return; fi
@@ -34,6 +34,10 @@ environment() {
         if ! "$venv/bin/python" -c 'import _crashhunt_core' 2>/dev/null; then
             echo "crashhunt goes without its compiled core, which needs a C++ compiler and Python's headers:" \
                 "steps on SUMO take longer, and results are the same" >&2
+        fi
+        if ! "$venv/bin/python" -c 'import importlib.util as u, sys; sys.exit(not u.find_spec("_crashhunt_link_order"))'; then
+            echo "crashhunt goes without the fixed order of SUMO's links, which needs a C++ compiler:" \
+                "trials on SUMO may differ between processes" >&2
         fi
         echo "$wanted" >"$venv/made-for-${extra:-users}"
     fi

@@ -17,7 +17,13 @@ from crashhunt.corpus._case import Case, Expectation, read_case
 from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
-from crashhunt.plans import read_settings, with_settings, write_settings
+from crashhunt.plans import (
+    load_order_change,
+    read_settings,
+    with_recorded_load_order,
+    with_settings,
+    write_settings,
+)
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
 from crashhunt.triage import signature_of
 from crashhunt.trial import Outcome
@@ -209,7 +215,8 @@ class _Running:
         self._warnings = _warnings(snapshot)
         self._folder = TemporaryFolder("corpus")
         self._scratch = self._folder.path
-        self._scenario = with_settings(snapshot.scenario(), settings)
+        order = snapshot.environment().get("load_order")
+        self._scenario = with_recorded_load_order(with_settings(snapshot.scenario(), settings), order)
         self._executor = FreshProcessExecutor(
             WorkerSettings(
                 scenario=self._scenario,
@@ -299,6 +306,9 @@ def _whole(snapshot: Snapshot) -> Snapshot:
 
 def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
     """What else than the code is another: the same seed then draws other traffic."""
-    changed = environment_changes(snapshot.environment())
-    names = (name for name in snapshot.scenario().backend.versions if name in changed)
-    return tuple(f"{name} was {changed[name][0]} and is {changed[name][1]}, which may be why" for name in names)
+    environment, scenario = snapshot.environment(), snapshot.scenario()
+    changed = environment_changes(environment)
+    names = (name for name in scenario.backend.versions if name in changed)
+    found = [f"{name} was {changed[name][0]} and is {changed[name][1]}" for name in names]
+    found += filter(None, [load_order_change(scenario, environment.get("load_order"))])
+    return tuple(f"{difference}, which may be why" for difference in found)

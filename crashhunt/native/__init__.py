@@ -1,4 +1,4 @@
-"""The compiled core: what every step on SUMO does, in C++, where it is there; optional, and never another bit."""
+"""The compiled parts: the core, which is optional and never another bit, and the fixed order of SUMO's links."""
 
 import lazy_loader
 

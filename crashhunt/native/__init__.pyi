@@ -12,3 +12,8 @@ from ._core import (
     core_for as core_for,
     why_not as why_not,
 )
+from ._link_order import (
+    LinkOrder as LinkOrder,
+    link_order as link_order,
+    why_no_link_order as why_no_link_order,
+)

@@ -1,6 +1,12 @@
 from ._declaration import Given as Given, HuntOption as HuntOption
 from ._duration import seconds_of as seconds_of
 from ._executor import SizesItself as SizesItself, executor_of as executor_of, parallel_here as parallel_here
+from ._load_order import (
+    FIXED as FIXED,
+    load_order_change as load_order_change,
+    load_order_of as load_order_of,
+    with_recorded_load_order as with_recorded_load_order,
+)
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,

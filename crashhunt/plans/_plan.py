@@ -14,6 +14,7 @@ from crashhunt.base.names import one_of
 from crashhunt.base.plugins import locate
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
+from crashhunt.plans._load_order import FIXED, load_order_of
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
 from crashhunt.plans._scope import Owners, Takes, agent_of
@@ -101,6 +102,9 @@ def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
     accelerator, core = scenario.backend.accelerator, core_of(scenario, run)
     notes = [accelerator.note(scenario) if accelerator is not None and run.accelerate else ""]
     notes.append(f"the compiled core is {core}" if core is not None else "")
+    load_order = scenario.backend.load_order
+    if load_order is not None and (order := load_order_of(scenario)) != FIXED:
+        notes.append(f"the order of {load_order.what} is {order}; a trial may differ between processes")
     return replace(scenario, notes=(*scenario.notes, *filter(None, notes)))
 
 

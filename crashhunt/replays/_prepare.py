@@ -12,7 +12,7 @@ from crashhunt.base.errors import UsageError
 from crashhunt.base.sandbox import landlock_version
 from crashhunt.crashes import is_bundle_trusted, refuse_side_effects, refuse_untrusted
 from crashhunt.episode import WorkerSettings
-from crashhunt.plans import read_settings, with_settings
+from crashhunt.plans import load_order_change, read_settings, with_recorded_load_order, with_settings
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.snapshots import Snapshot, environment_changes, processor
@@ -127,7 +127,10 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
     scenario = with_settings(snapshot.scenario(), settings)
     environment = snapshot.environment()
+    if code != "snapshot" or "load_order" in environment:  # an earlier crashhunt inside has the simulator's own order
+        scenario = with_recorded_load_order(scenario, environment.get("load_order"))
     warnings += [f"{name} was {then} and is {now}" for name, (then, now) in environment_changes(environment).items()]
+    warnings += filter(None, [load_order_change(scenario, environment.get("load_order"))])
     there, here = environment.get("cpu", ""), processor()
     if scenario.backend.per_processor and there != here:
         warnings.append(f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise")

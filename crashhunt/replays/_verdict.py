@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
 
+from crashhunt.plans import load_order_change
 from crashhunt.recording import Divergence, Recording, Tag, first_divergence, values_around
 from crashhunt.snapshots import environment_changes
 
@@ -134,7 +135,10 @@ def _judge(
     was, now = rerun.recorded.prologue, replayed.prologue
     if was != now:
         return "not_comparable", f"what is recorded is another: {_prologue_change(was, now)}"
-    changed = environment_changes(rerun.snapshot.environment())
+    environment = rerun.snapshot.environment()
+    if order := load_order_change(rerun.worker.scenario, environment.get("load_order")):
+        return "not_comparable", f"the simulator differs: {order}"
+    changed = environment_changes(environment)
     for name in rerun.worker.scenario.backend.versions:
         if name in changed:
             return "not_comparable", f"the simulator differs: {name} was {changed[name][0]} and is {changed[name][1]}"

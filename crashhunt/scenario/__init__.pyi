@@ -3,6 +3,7 @@ from ._backend import (
     Backend as Backend,
     CompiledCore as CompiledCore,
     Configuration as Configuration,
+    LoadOrder as LoadOrder,
 )
 from ._digest import (
     as_in_file as as_in_file,

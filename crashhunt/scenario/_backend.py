@@ -72,6 +72,23 @@ class CompiledCore:
     why_not: Callable[[Scenario], str]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadOrder:
+    """An order in which a simulator processes a scenario at load, which crashhunt fixes where it can.
+
+    Without it, results depend on the memory addresses in a process.
+
+    Args:
+        what: the objects that are in the order, in words.
+        keep: returns a scenario that keeps the simulator's own order.
+        why_not: returns why the order is not fixed, in words that follow "not fixed: "; empty where it is.
+    """
+
+    what: str
+    keep: Callable[[Scenario], Scenario]
+    why_not: Callable[[Scenario], str]
+
+
 def _nothing(_scenario: Scenario) -> Iterable[str]:
     return ()
 
@@ -119,6 +136,7 @@ class Backend:
         actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
         accelerator: where it has one.
         core: its compiled part, where it has one.
+        load_order: the order at load on which its results depend, where there is one.
         configurations: files of its own that are run as they are.
         explained: returns what is wrong with the scenario, from the message with which no episode could be set up and
             from what it printed; None where it is not to blame.
@@ -153,6 +171,7 @@ class Backend:
     actions: tuple[str, ...] = ()
     accelerator: Accelerator | None = None
     core: CompiledCore | None = None
+    load_order: LoadOrder | None = None
     configurations: tuple[Configuration, ...] = ()
     explained: Callable[[str, str, Scenario], ScenarioError | None] | None = None
     side_effect: Callable[[Scenario, Mapping[str, Value], Iterable[str]], str] | None = None

@@ -30,7 +30,8 @@ class Manifest(TypedDict):
 class Environment(TypedDict):
     """``environment.json``: what a result depends on besides code. ``git`` has the revision of each work tree.
 
-    ``core`` is whether the simulator's compiled core was used, which makes no difference to results.
+    ``core`` is whether the simulator's compiled core was used, which makes no difference to results. ``load_order`` is
+    ``fixed`` or ``not fixed: REASON`` where results depend on an order at load; snapshots of earlier versions lack it.
     """
 
     schema: int
@@ -44,4 +45,5 @@ class Environment(TypedDict):
     loaded: list[str]
     variables: dict[str, str]
     core: NotRequired[str]
+    load_order: NotRequired[str]
     git: NotRequired[dict[str, str]]

@@ -23,7 +23,7 @@ from crashhunt.base.integrity import (
 from crashhunt.base.owners import this_process
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.oracles import modules_of
-from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, write_settings
+from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, load_order_of, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, digest_of_described
 from crashhunt.snapshots._environment import environment
 from crashhunt.snapshots._sources import Sources, find_sources, git
@@ -145,6 +145,8 @@ def _build(
     facts: Environment = {**environment(), "git": _describe_trees(found.trees, building / layout.GIT_DIFF)}
     if (core := core_of(scenario, settings.run)) is not None:
         facts["core"] = core
+    if (load_order := load_order_of(scenario)) is not None:
+        facts["load_order"] = load_order
     (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
     manifest["described"] = describe_files(building)
     manifest["authentication_code"] = code_of_manifest(manifest)

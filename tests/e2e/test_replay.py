@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from conftest import add_toy, rewritten
 
 from crashhunt.base.version import __version__
+from crashhunt.corpus._run import _begin
+from crashhunt.crashes import find_bundle
+from crashhunt.replays import ReplayOptions, prepare
+from crashhunt.replays._verdict import judged
+from crashhunt.scenario.backends.sumo import SumoSetup
+from crashhunt.trial import Outcome
 
 AGENT = '''
 import helper
@@ -251,6 +260,68 @@ def test_what_cannot_be_compared_says_which(crash_on_sumo):
     assert (other["verdict"], other["reason"]) == (
         "not_comparable", f"the simulator differs: libsumo was 1.2.3 and is {now}"
     )  # fmt: skip
+
+
+def test_a_crash_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo, monkeypatch):
+    crash = crash_on_sumo
+    (snapshot,) = (crash.folder / "h" / "snapshots").iterdir()
+    environment = json.loads((snapshot / "environment.json").read_text())
+
+    def prepared(code, **recorded):
+        rewritten(snapshot, "environment.json", json.dumps({**environment, **recorded}))
+        rerun = prepare(find_bundle(crash.folder / "h"), ReplayOptions(code=code))
+        return rerun.worker.scenario.table(SumoSetup).fix_link_order, rerun.warnings
+
+    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: "/somewhere/library.so")
+    monkeypatch.setattr("crashhunt.native._link_order._interface", lambda: 1)
+    for code in ("current", "snapshot"):
+        assert prepared(code, load_order="fixed") == (None, ())
+        assert prepared(code, load_order="not fixed: the library is not built") == (False, ())
+    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    warning = "the order of SUMO's links was fixed and is not fixed: the library is not built"
+    assert prepared("current", load_order="fixed") == (None, (warning,))
+    del environment["load_order"]  # as in a snapshot of an earlier version, whose own code does not know the key
+    assert prepared("snapshot") == (None, ())
+    assert prepared("current") == (False, ())
+    same = crash.crashhunt("replay", "h", "--code", "current", "--json").json
+    assert (same["verdict"], same["warnings"]) == ("reproduced", [])
+
+
+def test_a_case_keeps_the_order_of_links_that_it_was_recorded_with(crash_on_sumo, monkeypatch):
+    crash = crash_on_sumo
+    crash.crashhunt("corpus", "add", "h", "--to", "cases")
+    (path,) = (crash.folder / "cases").iterdir()
+    (snapshot,) = (path / "snapshots").iterdir()
+    environment = json.loads((snapshot / "environment.json").read_text())
+    asked = []
+    submitted = SimpleNamespace(submit=lambda _: None, close=lambda: None)
+    monkeypatch.setattr(
+        "crashhunt.corpus._run.FreshProcessExecutor", lambda settings: asked.append(settings) or submitted
+    )
+    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    missing = "the order of SUMO's links was fixed and is not fixed: the library is not built, which may be why"
+    for recorded, kept, warnings in (({}, False, ()), ({"load_order": "fixed"}, None, (missing,))):
+        environment.pop("load_order", None)
+        rewritten(snapshot, "environment.json", json.dumps({**environment, **recorded}))
+        with ExitStack() as stack:
+            running = _begin(path, stack)
+        assert asked.pop().scenario.table(SumoSetup).fix_link_order is kept
+        assert running._warnings == warnings
+
+
+def test_a_fixed_order_of_links_that_is_missing_is_the_first_suspect(crash_on_sumo, monkeypatch):
+    rerun = prepare(find_bundle(crash_on_sumo.folder / "h"), ReplayOptions())
+    environment = {**rerun.snapshot.environment(), "load_order": "fixed"}
+    monkeypatch.setattr(type(rerun.snapshot), "environment", lambda _: environment)
+    result = rerun.bundle.result
+    other = replace(result, outcome=Outcome.SURVIVED)
+    monkeypatch.setattr("crashhunt.native._link_order._installed", lambda: None)
+    report = judged(rerun, rerun.recorded, rerun.recorded, other)
+    assert (report.verdict, report.reason) == (
+        "not_comparable",
+        "the simulator differs: the order of SUMO's links was fixed and is not fixed: the library is not built",
+    )
+    assert judged(rerun, rerun.recorded, rerun.recorded, result).verdict == "reproduced"
 
 
 def test_a_snapshot_of_a_crashhunt_that_runs_trials_in_another_way_says_so(crash):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import importlib.util
 import io
 import os
 import re
@@ -11,12 +12,14 @@ import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors.ray import RayExecutor
 from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
 from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
@@ -178,9 +181,32 @@ def test_a_node_says_what_differs(monkeypatch):
     assert Site().differs(here, code_digest()) == ""
     said = Site().differs({**here, "python": "3.0.0", "gone": "2"}, code_digest())
     assert re.fullmatch(r"python is [\d.]+ there and 3.0.0 here, gone is not installed there and 2 here", said)
+    lacks = {**here, "_crashhunt_link_order": "installed"}
+    find = importlib.util.find_spec
+    for name, said in (
+        ("os", ""),
+        ("no_such_module", "_crashhunt_link_order is not installed there and installed here"),
+    ):
+        with monkeypatch.context() as context:
+            context.setattr(
+                "crashhunt.executors.ray._site.importlib.util.find_spec",
+                lambda asked, name=name: find(name if asked == "_crashhunt_link_order" else asked),
+            )
+            assert Site().differs(lacks, code_digest()) == said
     assert Site().differs(here, "other") == "crashhunt has the same version and other code there"
     monkeypatch.setattr("crashhunt.executors.ray._site.importlib.util.find_spec", lambda name: None)
     assert Site().differs(here, code_digest.__name__) == "crashhunt cannot be found there (no such package)"
+
+
+@pytest.mark.parametrize(
+    ("order", "wanted"),
+    [("fixed", {"_crashhunt_link_order": "installed"}), ("not fixed: the scenario says so", {}), (None, {})],
+)
+def test_a_node_needs_the_library_that_fixes_an_order(monkeypatch, order, wanted):
+    monkeypatch.setattr("crashhunt.executors.ray._executor.load_order_of", lambda _: order)
+    made = RayExecutor.__new__(RayExecutor)
+    made._settings = SimpleNamespace(scenario=None)
+    assert made._load_order() == wanted
 
 
 def test_of_a_black_box_only_what_is_in_it_travels(settings, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from crashhunt.native import why_not
+from crashhunt.native import why_no_link_order, why_not
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -19,5 +19,9 @@ def test_it_is_told(shell, native):
     assert shell.crashhunt("status", "h", "--json").json["hunts"][0]["core"] == told
     assert f"compiled core {told}" in shell.crashhunt("status", "h").out
     (environment,) = (shell.folder / "h/snapshots").glob("*/environment.json")
-    assert json.loads(environment.read_text())["core"] == told
+    recorded = json.loads(environment.read_text())
+    assert recorded["core"] == told
+    reason = why_no_link_order("1.28.0")  # which the core has no part in
+    assert recorded["load_order"] == (f"not fixed: {reason}" if reason else "fixed")
+    assert ("the order of SUMO's links is not fixed" in done.out) == bool(reason)
     assert ("native = false" in (shell.folder / "h/hunt.toml").read_text()) == (not native)

@@ -22,6 +22,7 @@ from crashhunt.executors.ray._address import cluster_of, require_ray, silent
 from crashhunt.executors.ray._folder import Folder
 from crashhunt.executors.ray._parcel import Parcel
 from crashhunt.executors.ray._site import code_digest
+from crashhunt.plans import FIXED, load_order_of
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.snapshots import versions
 from crashhunt.trial import TrialResult
@@ -146,6 +147,12 @@ class RayExecutor:
                 self._kept.process.wait(_CLOSE_S)
         self._end()
 
+    def _load_order(self) -> dict[str, str]:
+        """Return the library that a node must have too, because trials depend on the order that it fixes."""
+        if load_order_of(self._settings.scenario) != FIXED:
+            return {}
+        return {"_crashhunt_link_order": "installed"}
+
     def _start(self) -> None:
         """Start a bridge, and submit everything to it that has not come back."""
         number = next(_numbers)
@@ -159,7 +166,7 @@ class RayExecutor:
             "address": self._address,
             "cpus": self._parallel or len(os.sched_getaffinity(0)),
             "temporary": None if self._folder is None else str(self._folder.path),
-            "versions": {"machine": platform.machine(), **versions()},
+            "versions": {"machine": platform.machine(), **versions(), **self._load_order()},
             "code": code_digest(),
             "resumed": self._ever_up,
         }

@@ -14,6 +14,8 @@ from typing import Any
 
 __all__ = ["Site", "code_digest"]
 
+_LINK_ORDER = "_crashhunt_link_order"  # the library that fixes the order of SUMO's links; no part of a distribution
+
 
 class Site:
     """Runs trials on a node. Everything else is in ``_work.py``, of the crashhunt that is installed there."""
@@ -33,6 +35,8 @@ class Site:
             try:
                 if name in ("python", "machine"):
                     here = platform.python_version() if name == "python" else platform.machine()
+                elif name == _LINK_ORDER:
+                    here = "installed" if importlib.util.find_spec(name) else "not installed"
                 else:
                     here = importlib.metadata.version(name)
             except importlib.metadata.PackageNotFoundError:

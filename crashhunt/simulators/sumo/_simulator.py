@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import weakref
-from functools import cache
 from types import MethodType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -25,12 +24,12 @@ from crashhunt.simulators.sumo._disturbances import SumoDisturbances
 from crashhunt.simulators.sumo._driving import Driving
 from crashhunt.simulators.sumo._entering import enter, replaced_by, steps_counted
 from crashhunt.simulators.sumo._holding import held_back
+from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
 from crashhunt.simulators.sumo._sight import Sight
 from crashhunt.simulators.sumo._taking_part import TakingPart
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
 from crashhunt.simulators.sumo._usual import Present, UsualSteps
-from crashhunt.simulators.sumo._xml import keep_xml_ready
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
@@ -54,7 +53,6 @@ _DISTRUSTED = "the compiled core says something else than libsumo's own getters,
 P = ParamSpec("P")
 T = TypeVar("T")
 _TRACI_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
-_keep_xml_ready = cache(keep_xml_ready)  # once a process
 _current: weakref.ref[SumoSimulator] | None = None  # libsumo's own state is the process's; this says whose it is
 
 
@@ -83,8 +81,9 @@ class SumoSimulator:
         self._lateral = "lateral-resolution" in options or "lanechange.duration" in options
         self._driving = Driving(scenario.agents, scenario.step_length_s)
         self._disturbances = SumoDisturbances(scenario.agents.keys(), scenario.step_length_s, self._driving)
+        self._loading = Loading(fix_link_order=scenario.table(SumoSetup).fix_link_order is not False)
         native = scenario.table(SumoSetup).native is not False
-        core = core_for(libsumo.__version__, sumo.__file__) if native else None
+        core = core_for(VERSION, sumo.__file__) if native else None
         self._sight = Sight(
             tuple(scenario.agents),
             scenario.step_length_s,
@@ -109,7 +108,7 @@ class SumoSimulator:
 
     def ready_process(self) -> None:
         """Load the tables of SUMO's XML library."""
-        _keep_xml_ready()
+        ready_xml()
 
     def open_window(self) -> None:
         """Show the episodes in sumo-gui, which libsumo brings along."""
@@ -144,12 +143,10 @@ class SumoSimulator:
         self._begin(options.get("only"), options.get("script"), arguments)
         command = self._files.arguments(seed, arguments)
         try:
-            if libsumo.isLoaded():
-                libsumo.load(command)
-            else:
-                libsumo.start([*self._program, *command])
-                _keep_xml_ready()
+            notice = self._loading.load(self._program, command)
             _current = weakref.ref(self)
+            if notice and notice not in self.notices:
+                self.notices.append(notice)
             with steps_counted(self, self.step_length_s):
                 enter(self._scenario, self._setups, self._replaced, self._taking_part)
             if script := options.get("script"):

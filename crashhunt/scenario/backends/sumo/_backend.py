@@ -6,7 +6,7 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._backend import Backend, CompiledCore, Configuration
+from crashhunt.scenario._backend import Backend, CompiledCore, Configuration, LoadOrder
 from crashhunt.scenario._traffic_survey import TrafficSurvey
 from crashhunt.scenario.backends.sumo._options import INPUTS, canonical, writes
 from crashhunt.scenario.backends.sumo._table import SumoSetup
@@ -129,6 +129,18 @@ def _why_no_core(scenario: Scenario) -> str:
     return why_not(metadata.version("libsumo"))
 
 
+def _keep_link_order(scenario: Scenario) -> Scenario:
+    return scenario.with_table(replace(scenario.table(SumoSetup), fix_link_order=False))
+
+
+def _why_no_link_order(scenario: Scenario) -> str:
+    from crashhunt.native import why_no_link_order
+
+    if scenario.table(SumoSetup).fix_link_order is False:
+        return "the scenario says so"
+    return why_no_link_order(metadata.version("libsumo"))
+
+
 BACKEND = Backend(
     title="SUMO",
     table=SumoSetup,
@@ -149,6 +161,7 @@ BACKEND = Backend(
     plays_paths=True,
     forkable=True,
     core=CompiledCore(switched_off=_without_core, why_not=_why_no_core),
+    load_order=LoadOrder(what="SUMO's links", keep=_keep_link_order, why_not=_why_no_link_order),
     explained=_explained,
     side_effect=_side_effect,
     right_of_way=_right_of_way,

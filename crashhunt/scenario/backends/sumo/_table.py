@@ -19,6 +19,8 @@ class SumoSetup:
             ``time-to-teleport``, it is -1: nobody is taken away, and a jam stays one. What they would have SUMO write
             is not written.
         native: whether the compiled core may be used; it changes no bit.
+        fix_link_order: whether SUMO processes the links of the network in the order of their construction when it loads
+            it; otherwise in the order of their memory addresses, which differs between processes.
         literal: whether ``${NAME}`` in a route or additional file is left as it is, instead of being filled in.
     """
 
@@ -28,3 +30,4 @@ class SumoSetup:
     options: dict[str, bool | int | float | str] = field(default_factory=dict)
     literal: bool | None = None
     native: bool | None = None
+    fix_link_order: bool | None = None

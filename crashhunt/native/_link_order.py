@@ -1,0 +1,104 @@
+"""A fixed order of SUMO's links at load, by a library that replaces two functions of libsumo.
+
+libsumo processes conflicting links in the order of their memory addresses, on which the behaviour at junctions depends
+(see the guide's page on SUMO). With the library it processes them in the order of their construction. The library does
+not belong to the compiled core: results must not depend on whether the core is used.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+from functools import cache
+
+__all__ = ["LinkOrder", "link_order", "why_no_link_order"]
+
+# Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
+_LIBRARY = "_crashhunt_link_order"
+_INTERFACE = 1
+"""Raised whenever a function of the library changes; scripts/build_core.py reads it."""
+_CHECKED = ("1.23.0", "1.23.1", "1.24.0", "1.25.0", "1.26.0", "1.27.0", "1.27.1", "1.28.0")
+"""The versions of libsumo with which the library was checked."""
+_NOT_CALLED = "libsumo does not call the library"
+_UNKNOWN_LINKS = "libsumo constructs links in another way"
+
+
+class LinkOrder:
+    """The library, bound to libsumo.
+
+    Args:
+        library: the library, loaded.
+        reason: why the order is not fixed; empty where it is.
+    """
+
+    def __init__(self, library: ctypes.CDLL | None, reason: str) -> None:
+        self._library, self.reason = library, reason
+        self._loads = self._counted()
+
+    def use(self, use: bool) -> None:
+        """Order the links of the next loads; otherwise keep libsumo's own order."""
+        if self._library is not None:
+            self._library.crashhunt_link_order_use(use)
+
+    def check_load(self) -> str:
+        """Return why the links of the last load are not ordered; empty where they are. Call it once per load."""
+        ordered, unordered = self._counted()
+        before, self._loads = self._loads, (ordered, unordered)
+        if self.reason or ordered > before[0]:
+            return self.reason
+        return _UNKNOWN_LINKS if unordered > before[1] else _NOT_CALLED
+
+    def _counted(self) -> tuple[int, int]:
+        if self._library is None:
+            return 0, 0
+        return (
+            int(self._library.crashhunt_link_order_ordered_loads()),
+            int(self._library.crashhunt_link_order_unordered_loads()),
+        )
+
+
+def why_no_link_order(libsumo: str) -> str:
+    """Return why the order is not fixed with a version of libsumo; empty where it is."""
+    path = _installed()
+    if path is None:
+        return "the library is not built"
+    if libsumo not in _CHECKED:
+        return f"the library was checked with libsumo {', '.join(_CHECKED)}, and this is {libsumo}"
+    found = _interface()
+    if found != _INTERFACE:
+        return f"the library is of another version of crashhunt ({found} instead of {_INTERFACE})"
+    return ""
+
+
+@cache
+def link_order(libsumo: str, library: str) -> LinkOrder:
+    """Return the library, bound to libsumo, whose order then is fixed.
+
+    Args:
+        libsumo: its version.
+        library: the path of its library, which is loaded.
+    """
+    if reason := why_no_link_order(libsumo):
+        return LinkOrder(None, reason)
+    loaded = ctypes.CDLL(str(_installed()))
+    loaded.crashhunt_link_order_bind.restype = ctypes.c_char_p
+    for name in ("ordered", "unordered"):
+        getattr(loaded, f"crashhunt_link_order_{name}_loads").restype = ctypes.c_longlong
+    reason = loaded.crashhunt_link_order_bind(library.encode())
+    return LinkOrder(loaded, reason.decode() if reason is not None else "")
+
+
+@cache
+def _installed() -> str | None:
+    """Return the path of the library; None where there is none."""
+    found = importlib.util.find_spec(_LIBRARY)
+    return found.origin if found is not None else None
+
+
+@cache
+def _interface() -> int:
+    """Return the interface of the library that is installed; 0 where it has none."""
+    try:
+        return int(ctypes.CDLL(str(_installed())).crashhunt_link_order_interface())
+    except (OSError, AttributeError):  # a damaged file, or a library of somebody else
+        return 0

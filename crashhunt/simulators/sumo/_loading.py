@@ -1,0 +1,58 @@
+"""How a simulation is loaded: in the process's only simulator, with the links of its network in a fixed order."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import metadata
+from typing import TYPE_CHECKING
+
+import libsumo
+from libsumo import _libsumo as sumo
+
+from crashhunt.native import link_order, why_no_link_order
+from crashhunt.simulators.sumo._xml import keep_xml_ready
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["VERSION", "Loading", "ready_xml"]
+
+VERSION = metadata.version("libsumo")  # the module itself has had it since 1.26
+_UNORDERED = "the order of SUMO's links is not fixed, and trials may differ between processes"
+ready_xml = cache(keep_xml_ready)
+"""Keep SUMO's XML library ready, once a process."""
+
+
+class Loading:
+    """Loads simulations.
+
+    Args:
+        fix_link_order: whether the links of a network are processed in the order of their construction; otherwise in
+            the order of their addresses, as SUMO does by itself.
+    """
+
+    def __init__(self, *, fix_link_order: bool) -> None:
+        self._order = link_order(VERSION, sumo.__file__)
+        self._fix_link_order = fix_link_order
+
+    def load(self, program: Sequence[str], command: Sequence[str]) -> str:
+        """Load a simulation.
+
+        Args:
+            program: the program and its options, which count for the first simulation of a process only.
+            command: SUMO's options for the simulation.
+
+        Returns:
+            What to report where the order of links is not fixed, though its library is installed; otherwise empty.
+            A library that is not installed is reported when the hunt begins.
+        """
+        self._order.use(self._fix_link_order)
+        if libsumo.isLoaded():
+            libsumo.load(list(command))
+        else:
+            libsumo.start([*program, *command])
+            ready_xml()
+        reason = self._order.check_load()
+        if not reason or not self._fix_link_order or why_no_link_order(VERSION):
+            return ""
+        return f"{_UNORDERED}: {reason}"
