@@ -87,8 +87,7 @@ class Bundle:
         result: the crash.
         hunt_seed: of the hunt that found it.
         snapshot: the digest of the code that it ran.
-        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or the try did not come to
-            its end.
+        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or no try came to its end.
         divergence: where it did not.
         files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
         added: what a later version says of it, which is written back.
@@ -104,11 +103,6 @@ class Bundle:
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     added: Plain = field(default_factory=dict)
     why_unconfirmed: str = ""
-
-    @property
-    def is_fully_confirmed(self) -> bool:
-        """Whether it was replayed to the end, and so was the search for the last step at which braking helps."""
-        return self.confirmed is not None and not self.result.why_no_escape
 
     @property
     def id(self) -> str:
@@ -319,16 +313,9 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(
-        path,
-        result,
-        data.get("hunt_seed", 0),
-        data["snapshot"],
-        data.get("confirmed"),
-        data.get("divergence"),
-        files,
-        added=_added(data),
-        why_unconfirmed=data.get("why_unconfirmed", ""),
-    )
+        path, result, data.get("hunt_seed", 0), data["snapshot"], data.get("confirmed"), data.get("divergence"), files,
+        _added(data), data.get("why_unconfirmed", ""),
+    )  # fmt: skip
 
 
 def _added(data: CrashData) -> dict[str, object]:

@@ -87,7 +87,8 @@ class RunsAgain:
         """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
 
         def confirmed(bundle: Bundle) -> Bundle:
-            if not bundle.is_fully_confirmed and not len(self.stops):
+            unknown = bundle.confirmed is None or bundle.result.why_no_escape
+            if unknown and not len(self.stops):
                 found = confirm(bundle, lambda: bool(len(self.stops)), failed=self.failed)
                 if found is not None:
                     found.write()
