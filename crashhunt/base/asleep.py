@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base import forks
+from crashhunt.base.answers import NoAnswer, explain_silence, took_longer
 from crashhunt.base.processes import kill
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class Asleep:
 
     def __init__(self, work: Callable[[Plain], Plain], known: forks.Held | None = None) -> None:
         self.raised = ""
-        self.no_answer: forks.NoAnswer | None = None
+        self.no_answer: NoAnswer | None = None
         self.is_usable = True
         wakes, self._asks = os.pipe()
         self._says, says = os.pipe()
@@ -82,29 +83,29 @@ class Asleep:
             while text:
                 text = text[_write(self._asks, text) :]
         except BrokenPipeError:
-            self._lose(forks.explain_silence(self.pid))
+            self._lose(explain_silence(self.pid))
             return None
         while not received.endswith(b"\n"):
             ready, _, _ = select.select([self._says], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
-                self._lose(forks.NoAnswer(f"took longer than {timeout_s:g} s"))
+                self._lose(took_longer(timeout_s))
                 return None
             data = os.read(self._says, _RECEIVED)
             if not data:
-                self._lose(forks.explain_silence(self.pid))
+                self._lose(explain_silence(self.pid))
                 return None
             received += data
         answer: Plain | None
         try:
             answer, self.raised, why = _loads(received)
         except (ValueError, TypeError):
-            self._lose(forks.NoAnswer("sent data that are no answer"))
+            self._lose(NoAnswer("sent data that are no answer"))
             return None
         if answer is None:
-            self.no_answer = forks.NoAnswer(*why)
+            self.no_answer = NoAnswer(*why)
         return answer
 
-    def _lose(self, why: forks.NoAnswer) -> None:
+    def _lose(self, why: NoAnswer) -> None:
         self.no_answer, self.is_usable = why, False
 
     def end(self) -> None:
@@ -126,13 +127,13 @@ def _sleep(wakes: int, says: int, work: Callable[[Plain], Plain], known: forks.H
         for line in jobs:
             job, timeout_s = _loads(line)
             answer: Plain | None = None
-            raised, why = "", forks.NoAnswer("")
+            raised, why = "", NoAnswer("")
             try:
                 copy = forks.Copy(partial(work, job), known)
                 answer, raised, why = copy.answer(timeout_s), copy.raised, copy.no_answer or why
             except forks.CannotForkError as error:
                 raised = error.message
-                why = forks.NoAnswer(f"could not be made: {raised}", isinstance(error, forks.NoProcessError))
+                why = NoAnswer(f"could not be made: {raised}", isinstance(error, forks.NoProcessError))
             text = _dumps([answer, raised, [why.why, why.is_from_outside]]).encode() + b"\n"
             while text:
                 text = text[_write(says, text) :]

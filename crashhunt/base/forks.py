@@ -23,9 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from crashhunt.base.answers import NoAnswer, explain_silence, parse_answer, took_longer
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, has_child, kill
-from crashhunt.base.signals import describe_death, is_sent_from_outside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -38,7 +38,6 @@ __all__ = [
     "CannotForkError",
     "Copy",
     "Held",
-    "NoAnswer",
     "NoProcessError",
     "Watchdog",
     "children_now",
@@ -46,7 +45,6 @@ __all__ = [
     "end_orphans",
     "ended",
     "ends",
-    "explain_silence",
     "fork",
     "held",
     "shared_memory",
@@ -60,8 +58,6 @@ _FILE = "crashhunt-file"
 _HARMLESS = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/pts/")
 _LARGEST = 16 << 20  # bytes of a file that is written and read again
 _RECEIVED = 1 << 16
-_ENDS_S = 1.0  # wall time in which a process whose pipe is closed has ended
-_LOOK_EVERY_S = 0.002
 _copying = False
 ends: set[int] = set()
 """Descriptors by which copies of this process are talked to, and it to what it is a copy of; a copy has none."""
@@ -77,19 +73,6 @@ class CannotForkError(CrashhuntError):
 
 class NoProcessError(CannotForkError):
     """The system does not start another process now: too many, or too little memory. It may do so later."""
-
-
-@dataclass(frozen=True, slots=True)
-class NoAnswer:
-    """Why a copy did not answer.
-
-    Args:
-        why: a clause without a subject: "was killed by SIGKILL", "raised ValueError: …".
-        is_from_outside: whether another process or the system may be the cause, so that another copy may answer.
-    """
-
-    why: str
-    is_from_outside: bool = False
 
 
 class Watchdog:
@@ -209,9 +192,8 @@ class Copy:
     """
 
     def __init__(self, work: Callable[[], Plain], known: Held | None = None) -> None:
-        self.raised = ""
+        self.raised, self._children = "", children_now()
         self.no_answer: NoAnswer | None = None
-        self._children = children_now()
         self._end, theirs = os.pipe()
         ends.add(self._end)
 
@@ -243,33 +225,17 @@ class Copy:
         try:
             while not received.endswith(b"\n"):
                 ready, _, _ = select.select([self._end], [], [], max(0.0, deadline - time.monotonic()))
-                if not ready:
-                    self.no_answer = NoAnswer(f"took longer than {timeout_s:g} s")
-                    return None
-                data = os.read(self._end, _RECEIVED)
+                data = os.read(self._end, _RECEIVED) if ready else b""
                 if not data:
-                    self.no_answer = explain_silence(self.pid)
+                    self.no_answer = explain_silence(self.pid) if ready else took_longer(timeout_s)
                     return None
                 received += data
-            return self._understood(received)
+            answer, self.raised, self.no_answer = parse_answer(received)
+            return answer
         finally:
             self.end()
             if self.no_answer is not None:
                 end_orphans(self._children)
-
-    def _understood(self, received: bytes | bytearray) -> Plain | None:
-        """Return the answer in what was received; code of the agent may have written there, too."""
-        try:
-            said = json.loads(received)
-            self.raised = said.get("raised", "")
-            found: Plain | None = said.get("answer")
-        except (ValueError, AttributeError):
-            self.no_answer = NoAnswer("sent data that are no answer")
-            return None
-        if not isinstance(found, dict):
-            self.no_answer = NoAnswer(f"raised {self.raised}" if self.raised else "sent data that are no answer")
-            return None
-        return found
 
     def end(self) -> None:
         """End it, whatever it is doing; may be called twice."""
@@ -284,28 +250,8 @@ class Copy:
         self._end = -1
 
 
-def explain_silence(pid: int) -> NoAnswer:
-    """Return why a copy does not answer whose pipe is closed; its process is still to be ended."""
-    deadline = time.monotonic() + _ENDS_S
-    try:
-        while (end := os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)) is None:
-            if time.monotonic() > deadline:
-                return NoAnswer("closed its connection to the trial")
-            time.sleep(_LOOK_EVERY_S)
-    except ChildProcessError:
-        return NoAnswer("ended, and code of the agent has taken its exit code")
-    exit_code = end.si_status if end.si_code == os.CLD_EXITED else -end.si_status
-    return NoAnswer(describe_death(exit_code), is_sent_from_outside(exit_code))
-
-
 def end_orphans(children: frozenset[int]) -> None:
-    """End what a copy that was killed has left behind: programs of the agent, and copies of its own.
-
-    They are handed to this process, which cannot be copied with a child that it does not know.
-
-    Args:
-        children: of this process, from before the copy did anything; they stay.
-    """
+    """End what a killed copy has left to this process, which cannot be copied with it; older children stay."""
     end_descendants(children | _alive)
 
 

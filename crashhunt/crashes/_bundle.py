@@ -89,8 +89,7 @@ class Bundle:
         result: the crash.
         hunt_seed: of the hunt that found it.
         snapshot: the digest of the code that it ran.
-        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or the try did not come to
-            its end.
+        confirmed: whether a fresh process did the same to the bit; None where nobody tried, or no try came to its end.
         divergence: where it did not.
         files: size and digest of the files beside ``crash.json``, as they were written; earlier versions did not say.
         added: what a later version says of it, which is written back.
@@ -108,11 +107,6 @@ class Bundle:
     added: Plain = field(default_factory=dict)
     why_unconfirmed: str = ""
     authentication_code: str = ""
-
-    @property
-    def is_fully_confirmed(self) -> bool:
-        """Whether it was replayed to the end, and so was the search for the last step at which braking helps."""
-        return self.confirmed is not None and not self.result.why_no_escape
 
     @property
     def id(self) -> str:

@@ -17,9 +17,10 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, cast
 
+from crashhunt.base.answers import NoAnswer
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.faculties import offers
-from crashhunt.base.forks import NoAnswer, NoProcessError
+from crashhunt.base.forks import NoProcessError
 from crashhunt.base.memory import FREE, free_memory
 from crashhunt.base.plain import finite
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates

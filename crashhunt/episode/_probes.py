@@ -19,7 +19,7 @@ from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Outcome, Stress, steps
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.base.forks import NoAnswer
+    from crashhunt.base.answers import NoAnswer
     from crashhunt.base.plain import Plain
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult

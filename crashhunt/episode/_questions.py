@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.base.answers import NoAnswer
+from crashhunt.base.forks import CannotForkError, NoProcessError
 from crashhunt.base.text import encodable, one_line
 
 if TYPE_CHECKING:

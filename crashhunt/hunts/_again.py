@@ -107,7 +107,8 @@ class RunsAgain:
             bundle: the crash.
             stopped: asked now and then whether to give up.
         """
-        if bundle.is_fully_confirmed or len(self.stops) or stopped():
+        is_settled = bundle.confirmed is not None and not bundle.result.why_no_escape
+        if is_settled or len(self.stops) or stopped():
             return bundle
         try:
             found = confirm(

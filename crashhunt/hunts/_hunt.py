@@ -17,13 +17,13 @@ from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._again import RunsAgain
-from crashhunt.hunts._audit import Audit, AuditReport
+from crashhunt.hunts._audit import Audit
 from crashhunt.hunts._confirmation import Confirmation
 from crashhunt.hunts._copied_crashes import CopiedCrashes
 from crashhunt.hunts._copies import copies_to_come
 from crashhunt.hunts._directory import HuntDirectory
 from crashhunt.hunts._from_the_start import FromTheStart
-from crashhunt.hunts._late_audits import find_audits_left, finish_audits
+from crashhunt.hunts._late_audits import AuditsLeft
 from crashhunt.hunts._ledger import Ledger
 from crashhunt.hunts._look_at_copies import look_at_copies
 from crashhunt.hunts._near_misses import keep_near_misses
@@ -33,6 +33,7 @@ from crashhunt.hunts._progress import HuntStatus, Progress
 from crashhunt.hunts._report import HuntReport, StoppedBecause
 from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
 from crashhunt.hunts._surplus import give_up_surplus
+from crashhunt.hunts._unanswered import Unanswered
 from crashhunt.hunts._workers import settings_of_workers
 from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
@@ -89,9 +90,6 @@ class Hunt:
         self._seed_given = seed_given
         self._snapshot_options = snapshot
         self._stops: Sequence[int] = ()
-        self._audits_left: list[int] = []  # by earlier runs
-        self._unanswered: dict[int, TrialResult] = {}  # that are still to run again, as the ledger has them
-        self._open: set[int] = set()  # that the next run of the hunt runs again
 
     def run(self, watch: Callable[[HuntStatus], None] | None = None) -> HuntReport:
         """Hunt until a crash, the last trial or an interrupt.
@@ -147,15 +145,15 @@ class Hunt:
             spec = proposed.get(bundle.result.spec.number, bundle.result.spec)
             ledger.record(replace(bundle.result, spec=spec), snapshot=bundle.snapshot)
             finished.add(spec.number)
-        self._unanswered = {result.spec.number: result for result in ledger.unanswered()}
+        self._unanswered = Unanswered(ledger)
         progress.outcomes.update(ledger.outcomes())
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
-        again = [result.spec for result in self._unanswered.values()]
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
-        self._audits_left = find_audits_left(ledger, before, worker_settings)
+        self._audits_left = AuditsLeft(ledger, before, worker_settings)
+        again = self._unanswered.specs
         trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
         ledger.enter(
             "running",
@@ -171,7 +169,7 @@ class Hunt:
             core=core_of(self.scenario, settings.run),
             disturb=list(settings.disturb) or None,
             copies=copies_to_come(settings),
-            audits_left=self._audits_left or before.get("audits_left"),
+            audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         runs_again = RunsAgain(
@@ -204,9 +202,9 @@ class Hunt:
         give_up_surplus(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         progress.replace(runs_again.confirm(progress.crashes))
-        if self._audits_left:
+        if self._audits_left.numbers:
             watch(self._status(progress, "auditing"))
-            self._finish_audits(runs_again, progress)
+            self._audits_left.finish(runs_again, progress)
         near, (probes, branches) = keep_near_misses(runs_again), look_at_copies(copies)
         watch(self._status(progress, "done"))
         self._see_to(ledger, progress)
@@ -215,27 +213,14 @@ class Hunt:
         # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
         ledger.enter("interrupted" if self._stops else stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+        unanswered = 0 if stopped in ("crash", "distinct") else len(self._unanswered)
         return HuntReport(
-            self.directory,
-            settings,
-            stopped,
-            ledger.outcomes(),
-            ledger.trial_steps(),
-            ledger.steps_total(),
-            time.monotonic() - progress.began,
-            tuple(crashes),
-            reason,
-            tuple(progress.notes),
-            ledger.traffic_events(),
-            progress.audit,
-            progress.about_kinds()[0],
-            near,
-            probes,
-            progress.kinds.at_fault if progress.kinds is not None else None,
-            branches,
-            progress.ended_by_copy,
-            0 if stopped in ("crash", "distinct") else len(self._open | self._unanswered.keys()),
-        )
+            self.directory, settings, stopped, ledger.outcomes(), ledger.trial_steps(), ledger.steps_total(),
+            time.monotonic() - progress.began, tuple(crashes), reason, tuple(progress.notes), ledger.traffic_events(),
+            progress.audit, progress.about_kinds()[0], near, probes,
+            progress.kinds.at_fault if progress.kinds is not None else None, branches, progress.ended_by_copy,
+            unanswered,
+        )  # fmt: skip
 
     def _hunt(
         self,
@@ -310,7 +295,8 @@ class Hunt:
                 raise
             raise ScenarioError(error.message, fix=error.fix, where=error.where.replace(mine, theirs)) from error
         finally:
-            self._note_audits(audit, progress)
+            if run.audit > 0:
+                self._audits_left.note(audit, progress)
             executor.close()
             audit.close()
             confirmation.close(progress)
@@ -341,21 +327,8 @@ class Hunt:
         progress.look_at(executor)
         for difference in audit.look(wait_s):
             ledger.remark(f"audit: {difference}")
-        self._note_audits(audit, progress)
-
-    def _note_audits(self, audit: Audit, progress: Progress) -> None:
         if self.settings.run.audit > 0:
-            progress.audit = audit.report
-            progress.audits_left = sorted({*audit.left, *self._audits_left})
-
-    def _finish_audits(self, runs_again: RunsAgain, progress: Progress) -> None:
-        """Run the trials again that earlier runs of the hunt were to audit, and did not."""
-        left_now = set(progress.audits_left) - set(self._audits_left)
-        now, (late, left) = progress.audit or AuditReport(), finish_audits(runs_again, self._audits_left)
-        progress.audit = AuditReport(
-            now.trials + late.trials, now.differences + late.differences, now.not_finished + late.not_finished
-        )
-        progress.audits_left = sorted({*left_now, *left})
+            self._audits_left.note(audit, progress)
 
     def _see_to(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
@@ -376,18 +349,8 @@ class Hunt:
         if self._disturber is not None:
             result = replace(result, log_likelihood=self._disturber.log_likelihood_of(result))
         trials.ended(result)
-        if result.is_to_be_run_again:
-            self._open.add(result.spec.number)
-        before = self._unanswered.pop(result.spec.number, None)
-        if before is not None:
-            if result.was_killed_from_outside:
-                return  # the ledger has an answer that is as good, or better
-            progress.outcomes[str(before.outcome)] -= 1
-            if before.digest and before.digest != result.digest:
-                again = f"trial {result.spec.number} was run again for the answers of its copies"
-                note = f"{again}, and is another one: it is not determined by its specification"
-                ledger.remark(note)
-                progress.notes.append(note)
+        if not self._unanswered.account(result, progress):
+            return
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
         if crashed:

@@ -17,32 +17,52 @@ if TYPE_CHECKING:
 
     from crashhunt.episode import WorkerSettings
     from crashhunt.hunts._again import RunsAgain
+    from crashhunt.hunts._audit import Audit
     from crashhunt.hunts._data import Facts
     from crashhunt.hunts._ledger import Ledger
+    from crashhunt.hunts._progress import Progress
 
-__all__ = ["find_audits_left", "finish_audits"]
+__all__ = ["AuditsLeft"]
 
 _FOLDER = "audits"  # of the scratch folder
 
 
-def find_audits_left(ledger: Ledger, before: Facts, settings: WorkerSettings) -> list[int]:
-    """Return the numbers of the trials that earlier runs of a hunt were to run again, and did not.
+class AuditsLeft:
+    """The trials that earlier runs of a hunt were to run again, and did not.
 
     Args:
         ledger: of the hunt.
         before: its facts, as the earlier runs left them.
         settings: of the workers; they say which trials belong to the sample.
+
+    Attributes:
+        numbers: of these trials.
     """
-    if settings.audit <= 0.0:
-        return []
-    left = set(before.get("audits_left") or ())
-    if before.get("state") == "running":  # it was killed; what ended after its last heartbeat is not noted
-        since = before.get("heartbeat", 0.0)
-        left |= {result.spec.number for result in ledger.ended_since(since) if settings.is_audited(result)}
-    return sorted(left)
+
+    def __init__(self, ledger: Ledger, before: Facts, settings: WorkerSettings) -> None:
+        left = set(before.get("audits_left") or ()) if settings.audit > 0.0 else set()
+        if settings.audit > 0.0 and before.get("state") == "running":
+            # It was killed; what ended after its last heartbeat is not noted.
+            ended = ledger.results_where("ended_at >= ?", before.get("heartbeat", 0.0))
+            left |= {result.spec.number for result in ended if settings.is_audited(result)}
+        self.numbers = sorted(left)
+
+    def note(self, audit: Audit, progress: Progress) -> None:
+        """Have the progress of the hunt say what came of its audit, and what is left of all audits."""
+        progress.audit = audit.report
+        progress.audits_left = sorted({*audit.left, *self.numbers})
+
+    def finish(self, again: RunsAgain, progress: Progress) -> None:
+        """Run them again, and add what comes of it to the progress of the hunt."""
+        left_now = set(progress.audits_left) - set(self.numbers)
+        now, (late, left) = progress.audit or AuditReport(), _finish(again, self.numbers)
+        progress.audit = AuditReport(
+            now.trials + late.trials, now.differences + late.differences, now.not_finished + late.not_finished
+        )
+        progress.audits_left = sorted({*left_now, *left})
 
 
-def finish_audits(again: RunsAgain, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
+def _finish(again: RunsAgain, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
     """Run trials again that are to be audited; return what came of it, and the numbers that are still left.
 
     Args:

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base.answers import NoAnswer
 from crashhunt.base.faculties import members
-from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.base.forks import CannotForkError, NoProcessError
 from crashhunt.episode import BUDGET_BESIDE, Prober, _questions
 from crashhunt.simulators import Disturbs
 from crashhunt.trial import CRASHES, Disturbance, Outcome, Stress, TrialResult, TrialSpec

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
+from crashhunt.base.answers import NoAnswer
+from crashhunt.base.forks import CannotForkError, NoProcessError
 from crashhunt.episode import _questions
 from crashhunt.episode._questions import Questions
 

@@ -43,7 +43,7 @@ def run_and_kill(executor, spec, steps):
     raise AssertionError("the trial did not end")
 
 
-@pytest.mark.parametrize("kind", [PoolExecutor, FreshProcessExecutor])
+@pytest.mark.parametrize("kind", [PoolExecutor, pytest.param(FreshProcessExecutor, marks=pytest.mark.nightly)])
 def test_trial_killed_three_times_at_different_steps_is_invalid_and_no_crash(settings, kind):
     spec = TrialSpec(4, 7, {"ego": {"speed": 5.0}}, {"step_wall_s": 0.01}, max_steps=STEPS)
     executor = kind(settings, parallel=1)

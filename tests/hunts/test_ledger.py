@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Ledger, TrialRow, has_begun
 from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
+from crashhunt.hunts._unanswered import find_unanswered
 from crashhunt.trial import KILLED, Branches, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -250,9 +251,9 @@ def test_trials_that_run_again_are_those_with_a_cause_outside_of_them(tmp_path):
     ]
     for one in asked:
         ledger.record(one, snapshot="")
-    assert ledger.unanswered() == [asked[4]]  # of a hunt without copies, which is not read for them
+    assert find_unanswered(ledger) == [asked[4]]  # of a hunt without copies, which is not read for them
     ledger.note(copies=["probes", "branches"])
-    assert ledger.unanswered() == [asked[1], asked[3], asked[4]]
+    assert find_unanswered(ledger) == [asked[1], asked[3], asked[4]]
     assert [one.is_fully_asked for one in asked] == [True, False, False, False, True, True, True]
     assert [TrialRow(one.to_json()).is_fully_asked for one in asked] == [one.is_fully_asked for one in asked]
     facts = {"copies": ["probes", "branches"]}

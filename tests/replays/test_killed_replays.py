@@ -82,7 +82,7 @@ def test_unknown_escape_is_told_and_searched_again(bundle, toy):
     )
     replace(bundle, result=unknown).write()
     (read,) = list_bundles(toy.folder / "h")
-    assert not read.is_fully_confirmed
+    assert read.result.why_no_escape
     said = (
         "Until when braking would have helped is not known: the process that searched was killed by SIGKILL, 2 times."
     )
@@ -90,7 +90,7 @@ def test_unknown_escape_is_told_and_searched_again(bundle, toy):
     words = ("run", "h", "1", "1", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01")
     toy.crashhunt(*words, "--seed", "1")
     (read,) = list_bundles(toy.folder / "h")
-    assert read.is_fully_confirmed
+    assert not read.result.why_no_escape
     assert read.result.escape == bundle.result.escape
 
 
@@ -149,7 +149,7 @@ def test_search_for_the_escape_that_is_killed_is_done_again(bundle, monkeypatch,
     assert (count, found.confirmed) == (kills, True)
     if kills == 1:
         assert found.result.escape == bundle.result.escape
-        assert found.is_fully_confirmed
+        assert not found.result.why_no_escape
     else:
         assert found.result.escape is None
         assert found.result.why_no_escape == "the process that searched was killed by SIGKILL, 2 times"
