@@ -8,10 +8,12 @@ import traceback
 from pathlib import Path
 
 from crashhunt.base.errors import PluginError
+from crashhunt.base.exception_text import class_name, message_of
 from crashhunt.base.layout import PACKAGE
 
-__all__ = ["blamed", "in_words", "place_of", "shown_path"]
+__all__ = ["blamed", "in_words", "is_users", "place_of", "shown_path"]
 
+_MAX_LINE_CHARACTERS = 1_000
 _OURS = str(PACKAGE)
 _NOBODYS = ("<", importlib.__file__)  # of importing itself
 # Neither the standard library nor what is installed is where somebody looks for their own mistake.
@@ -19,8 +21,13 @@ _OTHERS = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "
 
 
 def in_words(error: BaseException) -> str:
-    """Return type and message of an exception in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """Return type and message of an exception in one line of at most 1,200 characters or so."""
+    return " ".join(f"{class_name(error)}: {message_of(error, _MAX_LINE_CHARACTERS)}".split())
+
+
+def is_users(filename: str) -> bool:
+    """Whether a source file belongs to a user: not to crashhunt, nor to what is installed, nor to Python itself."""
+    return not filename.startswith((_OURS, *_OTHERS, *_NOBODYS))
 
 
 def blamed(what: str, error: Exception, *, fix: str = "mend it") -> PluginError:

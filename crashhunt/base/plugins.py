@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.blame import place_of
+from crashhunt.base.blame import in_words, place_of
 from crashhunt.base.errors import PluginError
 from crashhunt.base.names import did_you_mean, one_of
 
@@ -31,6 +31,7 @@ __all__ = [
     "registered",
 ]
 
+_MAX_LINE_CHARACTERS = 1_000
 Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "samplers", "simulators"]
 
 
@@ -157,8 +158,9 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
 
 def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
     """Tell a module that is not there from one that is and fails."""
-    what = error.msg if isinstance(error, SyntaxError) else str(error)
-    said = " ".join(f"{type(error).__name__}: {what}".split())
+    said = in_words(error)
+    if isinstance(error, SyntaxError):  # whose message repeats the place
+        said = " ".join(f"{type(error).__name__}: {error.msg}"[:_MAX_LINE_CHARACTERS].split())
     missing = error.name or "" if isinstance(error, ModuleNotFoundError) else ""
     if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
         hint = did_you_mean(missing.rpartition(".")[2], _modules_beside(missing))

@@ -3,51 +3,61 @@
 from __future__ import annotations
 
 import sys
-import traceback
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.agents import Closes
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
+from crashhunt.base.exception_text import class_name, format_error, message_of
 from crashhunt.base.faculties import offers
 from crashhunt.trial import Failure
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from typing import Final
 
     from crashhunt.agents import Agent
 
 __all__ = ["close_agent", "failure_of", "is_emptied", "words_of"]
 
-# Whatever is longer nobody reads, and everybody would have to carry: from the worker to the hunt, into the ledger, into
-# every bundle and page. Fifty megabytes of it take longer than a trial may.
-_NAME: Final = 200
-_MESSAGE: Final = 10_000
-_TRACEBACK: Final = 100_000
-
-_KINDS: dict[type[BaseException], str] = {
-    ActionError: "bad action",
-    InvalidEpisodeError: "invalid",
-    SimulatorError: "simulator error",
-}
+_MIN_RECURSION_LIMIT: Final = 1000
+_KINDS: tuple[tuple[type[BaseException], str], ...] = (
+    (ActionError, "bad action"),
+    (InvalidEpisodeError, "invalid"),
+    (SimulatorError, "simulator error"),
+)
 
 
-def failure_of(error: BaseException, agent: str) -> Failure:
+def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
     """Return what a result says about an exception.
 
     Args:
         error: the exception. Message and traceback are cut where they are longer than anybody reads, and say so.
         agent: whose it is; empty for nobody's.
+        cause: why it was raised, where its message does not say so, as a clause; empty where it does.
     """
-    # A message of our own says everything; where in our code it was raised is nobody's business.
-    text = "" if isinstance(error, InvalidEpisodeError) else "".join(traceback.format_exception(error))
-    words = words_of(error)
-    if len(words) > _MESSAGE:
-        words = f"{words[:_MESSAGE]}… ({len(words) - _MESSAGE} more characters are left out)"
-    message = words if isinstance(error, EpisodeError) else " ".join(words.split())
-    if is_emptied():
-        message = f"somebody has emptied sys.modules, upon which this fails: {message}"
-    return Failure(_KINDS.get(type(error), type(error).__name__[:_NAME]), message, _shortened(text), agent)
+    with _deep_enough():
+        # A message of our own says everything; where in our code it was raised is nobody's business.
+        text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
+        words = words_of(error)
+        # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
+        kind = next((kind for one, kind in _KINDS if type(error) is one), None) or class_name(error)
+    message = words if issubclass(type(error), EpisodeError) else " ".join(words.split())
+    if not cause and is_emptied():
+        cause = "somebody has emptied sys.modules"
+    return Failure(kind, f"{cause}, upon which this fails: {message}" if cause else message, text, agent)
+
+
+@contextmanager
+def _deep_enough() -> Iterator[None]:
+    """Have Python recurse as deep as it does by default, whatever an agent has set."""
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(limit, _MIN_RECURSION_LIMIT))
+    try:
+        yield
+    finally:
+        with suppress(RecursionError):
+            sys.setrecursionlimit(limit)
 
 
 def is_emptied() -> bool:
@@ -59,19 +69,8 @@ def is_emptied() -> bool:
 
 
 def words_of(error: BaseException) -> str:
-    """Return the message of an exception, which may be of a class that cannot even say it."""
-    try:
-        return str(error)
-    except BaseException as other:  # in a ``__str__`` of somebody else's
-        return f"(its message cannot be had: {type(other).__name__})"
-
-
-def _shortened(text: str) -> str:
-    """A traceback of bounded length: its beginning says where, and its end what."""
-    if len(text) <= _TRACEBACK:
-        return text
-    half = _TRACEBACK // 2
-    return f"{text[:half]}\n… ({len(text) - 2 * half} characters are left out) …\n{text[-half:]}"
+    """Return the message of an exception, which may be of a class that cannot even say it; a long one is cut."""
+    return message_of(error)
 
 
 def close_agent(agent: Agent) -> None:
@@ -79,6 +78,6 @@ def close_agent(agent: Agent) -> None:
     try:
         if offers(agent, Closes):
             agent.close()
-    except BaseException:
+    except BaseException as error:
         with suppress(BaseException):
-            traceback.print_exc()
+            sys.stderr.write(format_error(error))
