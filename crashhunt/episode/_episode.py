@@ -11,10 +11,11 @@ from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import held, shared_memory
 from crashhunt.episode._ahead import goes_ahead
+from crashhunt.episode._attribution import Attribution
 from crashhunt.episode._copied import Copied
 from crashhunt.episode._disturbed import Disturbed
 from crashhunt.episode._ending import Ending
-from crashhunt.episode._failures import close_agent, is_emptied
+from crashhunt.episode._failures import close_agent
 from crashhunt.episode._whereabouts import Whereabouts
 from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
 from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
@@ -133,8 +134,6 @@ class Episode(Copied, Ending, Whereabouts):
         began = time.monotonic()
         try:
             self._set_up()
-        except RecorderError:
-            raise
         except BaseException as error:
             self._break(error)
         self.setup_s = time.monotonic() - began
@@ -214,10 +213,8 @@ class Episode(Copied, Ending, Whereabouts):
                 scene = simulator.scene()
                 scene.follow(self._scene)
                 self._scene = scene
-            except RecorderError:
-                raise
             except BaseException as error:  # an environment of a user's may exit as well as an agent
-                return self._fail(Outcome.AGENT_ERROR if is_emptied() else Outcome.SIMULATOR_ERROR, error)
+                return self._fail_in_simulator(error)
             self._rewards = rewards
             step, each = self.steps + 1, tuple(map(rewards.get, names, self._nothing))
             for show_scene in self._on_scene:
@@ -233,8 +230,6 @@ class Episode(Copied, Ending, Whereabouts):
             ):
                 return None
             return self._judge(finding, actions, truncations)
-        except RecorderError:
-            raise
         except BaseException as error:
             return self._break(error)
 
@@ -244,8 +239,6 @@ class Episode(Copied, Ending, Whereabouts):
         assert ahead is not None
         try:
             come, actions = ahead.go_on_from(come, self.agents)
-        except RecorderError:
-            raise
         except BaseException as error:
             return self._fail_at_once(error)
         if come not in (DONE, ASK):
@@ -266,8 +259,6 @@ class Episode(Copied, Ending, Whereabouts):
             if finding is None and self.steps < self._max_steps:
                 return None
             return self._judge(finding, self._rewards, {})
-        except RecorderError:
-            raise
         except BaseException as error:
             return self._break(error)
 
@@ -345,10 +336,12 @@ class Episode(Copied, Ending, Whereabouts):
             self._scene = scene = simulator.scene()
             for show in self._on_scene:
                 show(0, scene, self._nothing)
-        except RecorderError:
-            raise
         except BaseException as error:
-            return self._fail(Outcome.INVALID, error, agent)
+            found = None if agent else self._attribute(error)
+            if found is None and isinstance(error, RecorderError) and not agent:
+                raise
+            found = found or Attribution(agent)
+            return self._fail(Outcome.INVALID, error, found.agent, found.cause)
         for oracle in self._oracles:
             if isinstance(oracle, SeesMap):
                 oracle.see_map(simulator.lanes() if offers(simulator, HasMap) else ())

@@ -15,6 +15,8 @@ from crashhunt.base.faculties import offers
 from crashhunt.base.plugins import import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.shared_memory import record_shared_memory
+from crashhunt.episode._attribution import record_originals
+from crashhunt.episode._recursion import bound_recursion
 from crashhunt.episode._run import seed_everything
 from crashhunt.oracles import parse_oracle
 from crashhunt.simulators import FlattensObservations
@@ -75,6 +77,8 @@ class Parts:
                     importlib.import_module(library)
         # Of which every simulator's spaces are: here, so that workers that are forks of this process have it.
         importlib.import_module("gymnasium")
+        bound_recursion()
+        record_originals()
 
     def simulator(self) -> Simulator:
         """Make a simulator, with a folder for files of its own."""

@@ -82,11 +82,16 @@ def run_episode(
             reset=reset,
         ) as episode:
             result = episode.start()
-            while result is None:
-                result = episode.step()
-                for one in asking:
-                    if result is None and one.is_due(episode):
-                        one.ask(episode)
+            try:
+                while result is None:
+                    result = episode.step()
+                    for one in asking:
+                        if result is None and one.is_due(episode):
+                            one.ask(episode)
+            except BaseException as error:
+                result = episode.end_by_agent(error)
+                if result is None:
+                    raise
     finally:
         for one in watching:
             one.close()
