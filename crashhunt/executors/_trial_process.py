@@ -19,6 +19,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import copying, watchdog
+from crashhunt.base.shared_state import SharedState
 from crashhunt.episode import (
     BUDGET,
     BUDGET_BESIDE,
@@ -87,6 +88,7 @@ class TrialProcess:
         self._simulator: Simulator | None = None
         self._box: BlackBox | None = None
         self._pid = 0
+        self._shared: SharedState | None = None
         self._home = Path.cwd()
         self._notices: list[str] = []
         self._asking: tuple[tuple[Prober | Brancher, str], ...] = ()  # copies of the trial, and what people call them
@@ -116,6 +118,15 @@ class TrialProcess:
                 ready_recorder(self._simulator)
         return self._simulator
 
+    def record_shared_state(self) -> str:
+        """Record which files and memory the processes of trials need to have their own.
+
+        Returns:
+            What they have in common all the same, in words; empty for nothing.
+        """
+        self._shared = SharedState(known={0, 1, 2, self._stack.fileno()})
+        return self._shared.remaining
+
     def run(self, job: Job, reset: Reset | None = None) -> NoReturn:
         """Run a trial, leave its report in the black box, and end this process.
 
@@ -138,6 +149,8 @@ class TrialProcess:
         self._pid = os.getpid()
         os.setsid()  # what a trial sends to its whole process group is for itself
         os.chdir(self._home)
+        if self._shared is not None and reset is None:
+            self._shared.separate()
         self._redirect(folder)
         spec = TrialSpec.from_json(job["spec"])
         self._box = box = BlackBox(folder / layout.BLACK_BOX, begun=job["reserved"])
