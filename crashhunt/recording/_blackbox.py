@@ -54,6 +54,7 @@ __all__ = [
     "decode_header",
     "read_black_box",
     "read_header",
+    "readable_bytes",
 ]
 
 MAGIC = b"CRASHBB1"
@@ -404,8 +405,17 @@ def read_black_box(path: Path) -> Iterator[Record]:
         raise BundleError("no black box here", fix="the trial left no recording", where=str(path))
     with path.open("rb") as file:
         file.seek(FIRST)
-        data = file.read(max(0, header.committed - FIRST))
+        data = file.read(max(0, min(header.committed, readable_bytes(os.fstat(file.fileno()))) - FIRST))
     yield from decode_records(data)
+
+
+def readable_bytes(found: os.stat_result) -> int:
+    """Return how much of a black box is read at most, in bytes: the process of a trial may claim any size.
+
+    A file that was made longer without being written takes no space, and reading it would take all memory. A file
+    system that compresses may store records in a tenth of their size.
+    """
+    return min(found.st_size, 16 * (512 * found.st_blocks + (1 << 20)))
 
 
 def decode_records(data: bytes | memoryview) -> Iterator[Record]:

@@ -18,6 +18,7 @@ from crashhunt.recording._blackbox import (
     Phase,
     cannot_record,
     decode_header,
+    readable_bytes,
 )
 
 if TYPE_CHECKING:
@@ -84,6 +85,10 @@ class BlackBoxFile:
         """Return the header; None where it is damaged."""
         return decode_header(os.pread(self._file, HEADER.size, 0))
 
+    def has(self, header: BlackBoxHeader) -> bool:
+        """Whether the file can have as many records as its header claims."""
+        return FIRST <= header.committed <= readable_bytes(os.fstat(self._file))
+
     def read_records(self, header: BlackBoxHeader) -> bytes:
         """Return the bytes of all committed records, or fewer where the file ends before."""
         return self._read(FIRST, max(0, header.committed - FIRST))
@@ -112,7 +117,7 @@ class BlackBoxFile:
         os.close(self._file)
 
     def _read(self, offset: int, size: int) -> bytes:
-        found, end = bytearray(), min(offset + size, os.fstat(self._file).st_size)
+        found, end = bytearray(), min(offset + size, readable_bytes(os.fstat(self._file)))
         while offset < end and (data := os.pread(self._file, end - offset, offset)):
             found += data
             offset += len(data)
