@@ -83,6 +83,13 @@ def kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
+def resume(pid: int) -> None:
+    """Have a process go on that somebody has stopped, with SIGSTOP for example."""
+    with suppress(OSError, IndexError):
+        if Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0] == b"T":
+            os.kill(pid, signal.SIGCONT)
+
+
 def is_alive(pid: int) -> bool:
     """Whether there is such a process; one that has ended and was not reaped counts."""
     try:

@@ -22,10 +22,10 @@ import socket
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
+from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
 from crashhunt.episode import WorkerSettings, require_origin, seal
 from crashhunt.executors._supervisor import be_supervisor
 from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
@@ -100,11 +100,14 @@ class _Server:
                 return  # the keeper ends every process
             if self._orders.fileno() in ready:
                 data = self._orders.recv(_MESSAGE)
-                if not data:
-                    return
-                _send(self._control, _understood(data))
+                if data:
+                    _send(self._control, _understood(data))
+                else:
+                    self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
             if self._reap():
                 return
+            for pid in (self._template, *self._slots):
+                resume(pid)  # which an agent may have stopped
             # Other children were left behind by a template or a supervisor that died.
             end_descendants(frozenset(self._slots) | {self._template})
 
@@ -154,11 +157,15 @@ class _Server:
             if pid in self._slots:
                 _send(self._control, {"slot": self._slots.pop(pid), "pid": pid, "exit_code": code})
             elif pid == self._template:
-                if code < 0:  # leave as it was killed: who started this process decides what that means
-                    end_descendants()
-                    signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
-                    os.kill(os.getpid(), -code)
-                os._exit(code)
+                self._leave_as(code)
+
+    def _leave_as(self, code: int) -> NoReturn:
+        """End as the template did: who started this process decides what that means."""
+        if code < 0:
+            end_descendants()
+            signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
+            os.kill(os.getpid(), -code)
+        os._exit(code)
 
 
 def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool) -> None:

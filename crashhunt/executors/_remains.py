@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.recording import BlackBoxHeader, Phase, Recording, read_black_box, read_header
@@ -118,20 +117,21 @@ def result_of_death(attempt: Attempt, scratch: Path, exit_code: int) -> TrialRes
     )
 
 
-def damaged(spec: TrialSpec, scratch: Path, message: str, *, recorded: bool = True) -> TrialResult:
+def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", recorded: bool = True) -> TrialResult:
     """Return the result of a trial whose process damaged itself or its recording.
 
     Args:
         spec: the trial.
         scratch: the folder in which it recorded.
         message: what is damaged, as a sentence.
+        agent: identifier of the agent that did it, where the recording cannot be read; empty where that is not known.
         recorded: whether the recording can be read.
     """
     if recorded:
         header = where_it_is(scratch, spec.number)
-        return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None)
+        return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None, agent)
     output = read_tail(scratch_of(scratch, spec.number) / layout.RUN_LOG)
-    failure = Failure("damaged recording", message, last_output=output)
+    failure = Failure("damaged recording", message, agent=agent, last_output=output)
     return TrialResult(spec, Outcome.AGENT_ERROR, failure=failure, kept=True)
 
 
@@ -150,18 +150,19 @@ def _result(
     kind: str,
     message: str,
     exit_code: int | None,
+    agent: str = "",
 ) -> TrialResult:
     folder = scratch_of(scratch, spec.number)
     output = read_tail(folder / layout.RUN_LOG)
     stack = read_tail(folder / layout.STACK)
-    agent, steps, sim_time_s, digest, closest = "", 0, 0.0, "", ClosestApproach()
+    steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
     danger: float | None = None
     phase = header.phase if header is not None else Phase.SETUP
     try:
         recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
-    except BundleError:
-        recording = None
-    scenes = recording.scenes() if recording is not None else []
+        scenes = recording.scenes() if recording is not None else []
+    except Exception:  # of whatever kind: a process that ran foreign code may have written anything there
+        recording, scenes = None, []
     if phase == Phase.SETUP or (recording is not None and not scenes):
         outcome, message = Outcome.INVALID, f"{message} while the episode was being set up"
     elif recording is None:
@@ -177,6 +178,9 @@ def _result(
         elif header is not None and phase == Phase.ACT:
             agent = recording.agents[header.agent]
             message = f"{message} in {agent}'s act() of step {steps + 1}"
+        elif phase == Phase.DONE:  # where no code but that of agents runs, in close() or a finalizer
+            agent = recording.agents[0] if len(recording.agents) == 1 else ""
+            message = f"{message} after the last step"
         else:
             message = f"{message} in the simulator at step {steps + 1}"
     failure = Failure(kind, message, stack, agent, exit_code, output)

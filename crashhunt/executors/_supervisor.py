@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, remedy
 from crashhunt.base.files import whole_file
-from crashhunt.base.processes import die_with
+from crashhunt.base.processes import die_with, resume
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.executors._evidence import KEY_BYTES, Report, check_report
@@ -95,7 +95,7 @@ class Supervisor:
         self._settings = settings
         self._zygote = zygote
         self._received = bytearray()
-        self._ready = False
+        self._zygote_pid = 0  # once it is ready
         self.retires = False
         self._box: BlackBoxFile | None = None
         self._output = self._stack = -1
@@ -137,28 +137,38 @@ class Supervisor:
     def _judge(self, spec: TrialSpec, box: BlackBoxFile, key: bytes, said: FromZygote, *, was_killed: bool) -> Ended:
         """Decide what came of a trial whose process has ended."""
         scratch, code, pid = self._settings.scratch, said["ended"], said["pid"]
+        is_there = self._is_ours(scratch_of(scratch, spec.number))
         self._secure(spec)
         header = box.header()
         report = box.read_report(header) if header is not None else b""
         is_whole = box.is_reusable()
         if was_killed and not (code == 0 and report):
             return Ended(hung(spec, scratch, self._settings.timeout_s))
-        if not is_whole or header is None:
-            what = "its recording was truncated" if header is None or not is_whole else ""
-            return Ended(damaged(spec, scratch, what or "its recording was overwritten", recorded=False))
+        if not is_whole:
+            return Ended(self._damaged(spec, "its recording was truncated", recorded=False))
+        if header is None or header.trial != spec.number or not box.has(header):
+            return Ended(self._damaged(spec, "its recording was overwritten", recorded=False))
         if code == UNABLE_TO_RECORD and not report:
             box.require_room()
             raise LostTrialError(-signal.SIGKILL)  # there is room again
+        if not is_there and header.pid == os.getpid():  # another trial has deleted the folder before this one began
+            raise LostTrialError(-signal.SIGKILL)
         if report is None:
-            return Ended(damaged(spec, scratch, "the process could not report what came of it, as it is damaged"))
+            return Ended(self._damaged(spec, "the process could not report what came of it, as it is damaged"))
         if code != 0 or not report:
             if is_sent_from_outside(code):
                 raise LostTrialError(code)
             return Ended(died(spec, scratch, code))
         found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)
         if isinstance(found, str):
-            return Ended(damaged(spec, scratch, f"the process may not be believed: {found}"))
+            return Ended(self._damaged(spec, f"the process may not be believed: {found}"))
         return self._keep(*found)
+
+    def _damaged(self, spec: TrialSpec, message: str, *, recorded: bool = True) -> TrialResult:
+        """Return the result of a trial that damaged its process or its recording, which only agents do."""
+        agents = list(self._settings.scenario.agents)
+        agent = agents[0] if len(agents) == 1 else ""
+        return damaged(spec, self._settings.scratch, message, agent=agent, recorded=recorded)
 
     def _keep(self, result: TrialResult, report: Report) -> Ended:
         """Write down what a trial leaves for the hunt."""
@@ -195,6 +205,8 @@ class Supervisor:
             message = self._next(_LOOK_EVERY_S)
             if message is not None and "ended" in message:
                 return message, was_killed
+            if message is None:
+                resume(self._zygote_pid)  # which an agent may have stopped
             if not was_killed and self._has_hung(box, given_at):
                 was_killed = True
                 self._send({"kill": True})
@@ -213,14 +225,14 @@ class Supervisor:
 
     def _await_zygote(self) -> None:
         deadline = time.monotonic() + START_UP_S + self._settings.timeout_s
-        while not self._ready:
+        while not self._zygote_pid:
             message = self._next(_LOOK_EVERY_S)
             if message is not None and "error" in message:
                 raise CrashhuntError(**message["error"])
             if message is not None and message.get("unfit"):
                 raise UnfitZygoteError
-            self._ready = message is not None and "ready" in message
-            if not self._ready and time.monotonic() > deadline:
+            self._zygote_pid = message.get("ready", 0) if message is not None else 0
+            if not self._zygote_pid and time.monotonic() > deadline:
                 raise CrashhuntError(
                     f"the simulator cannot be made: it takes more than {START_UP_S + self._settings.timeout_s:g} s",
                     fix="see what it waits for, or give it more time with --timeout",
