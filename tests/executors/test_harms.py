@@ -1,0 +1,176 @@
+"""Agents that do harm, by kind and moment: each costs its own trial, which says what happened and by which agent."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from typing import TYPE_CHECKING
+
+import harms
+import pytest
+
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import CRASHES, TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from crashhunt.executors import Executor
+
+MAX_STEPS = 12
+INVALID, ERROR, DIED, HANG, SURVIVED = "invalid", "agent_error", "process_died", "hang", "survived"
+# By what becomes of a process in which an agent does harm: the outcome at each moment, and whether the agent is named.
+NAMED = True
+EXPECTED: dict[str, dict[str, tuple[str, bool]]] = {
+    "raises": {
+        "constructor": (INVALID, NAMED), "reset": (INVALID, NAMED),
+        "first act": (ERROR, NAMED), "fifth act": (ERROR, NAMED), "signal handler": (ERROR, NAMED),
+        # Nothing waits for what these raise.
+        "close": (SURVIVED, False), "finalizer": (SURVIVED, False), "thread": (SURVIVED, False),
+        "child": (SURVIVED, False), "exit": (SURVIVED, False),
+    },
+    "dies": {
+        "constructor": (INVALID, False), "reset": (INVALID, False),
+        "first act": (DIED, NAMED), "fifth act": (DIED, NAMED), "thread": (DIED, NAMED),
+        "close": (DIED, NAMED), "finalizer": (DIED, NAMED),
+        "signal handler": (DIED, False),  # while the simulator runs; nothing is left that says more
+        "child": (SURVIVED, False), "exit": (SURVIVED, False),
+    },
+    "lives": dict.fromkeys(harms.MOMENTS, (SURVIVED, False)),
+}  # fmt: skip
+EXPECTED["hangs"] = {
+    **{moment: (HANG if outcome == DIED else outcome, named) for moment, (outcome, named) in EXPECTED["dies"].items()},
+    "thread": (SURVIVED, False),
+}
+_DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cannot report what came of its trial
+EXCEPTIONS: dict[str, dict[str, tuple[str, bool]]] = {
+    "no_json": {**_DAMAGED, "constructor": (INVALID, False), "reset": (INVALID, False)},
+    "no_os": _DAMAGED,
+    "terminates_group": {"child": (DIED, NAMED)},  # to which its parent belongs
+    "sleeps_in_c": {"thread": (HANG, NAMED)},  # it holds the interpreter
+    "stops_itself": {"thread": (HANG, NAMED)},  # with all its threads
+}
+ATTACKS = [name for name in harms.HARMS if "_to_" in name]
+DEADLY = [one for one in ATTACKS if "KILL" in one or one in ("SIGTERM_to_zygote", "SIGTERM_to_supervisor")]
+TABLE = {
+    (name, moment): EXCEPTIONS.get(name, {}).get(moment, EXPECTED[nature][moment])
+    for name, (nature, _) in harms.HARMS.items()
+    for moment in harms.MOMENTS
+    if name not in ATTACKS
+}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch) -> Callable[..., dict[int, TrialResult]]:
+    shutil.copy(harms.__file__, tmp_path)
+    monkeypatch.chdir(tmp_path)
+
+    def run_trials(
+        trials: Iterable[tuple[str, str]], make: Callable[..., Executor] = PoolExecutor, timeout_s: float = 3.0
+    ) -> dict[int, TrialResult]:
+        """Run trials that do harm at a moment, each between two that do none."""
+        scratch = tmp_path / f"scratch-{time.monotonic_ns()}"
+        scratch.mkdir()
+        scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="harms:Agent")})
+        settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=timeout_s)
+        asked = [one for pair in trials for one in (("", ""), pair)] + [("", "")]
+        found: dict[int, TrialResult] = {}
+        executor = make(settings, parallel=2)
+        try:
+            for number, (what, when) in enumerate(asked):
+                slow = {"step_wall_s": 0.004} if when == "signal handler" else {}  # so that the simulator is what runs
+                executor.submit(TrialSpec(number, 7, {"ego": {"what": what, "when": when}}, slow, MAX_STEPS))
+            deadline = time.monotonic() + 380
+            while len(found) < len(asked):
+                assert time.monotonic() < deadline, f"missing: {[asked[n] for n in set(range(len(asked))) - {*found}]}"
+                found |= {result.spec.number: result for result in executor.completed(0.2)}
+        finally:
+            executor.close()
+        clean = {(str(found[number].outcome), found[number].digest) for number in range(0, len(asked), 2)}
+        assert len(clean) == 1, {
+            (asked[number - 1] if number else None): str(result.outcome)
+            for number, result in found.items()
+            if number % 2 == 0 and str(result.outcome) != SURVIVED
+        }
+        assert {outcome for outcome, _ in clean} == {SURVIVED}
+        for result in found.values():
+            assert TrialResult.from_json(result.to_json()) == result
+            str(result.to_json()).encode()  # can be written anywhere
+        return {number // 2: found[number] for number in range(1, len(asked), 2)}
+
+    return run_trials
+
+
+def check(trials, found):
+    """Each trial has the outcome, and names the agent, as the table says."""
+    got = {
+        pair: (str(result.outcome), result.failure is not None and result.failure.agent == "ego")
+        for pair, result in zip(trials, (found[number] for number in range(len(trials))), strict=True)
+    }
+    expected = {pair: TABLE[pair] for pair in trials}
+    wrong = {
+        pair: (got[pair], expected[pair], found[number].failure and found[number].failure.message[:200])
+        for number, pair in enumerate(trials)
+        if got[pair] != expected[pair]
+    }
+    assert wrong == {}
+
+
+def sample(start, *, natures=("raises", "dies", "lives"), every=17):
+    """Some kinds of harm, each at moments of its own."""
+    chosen = [pair for pair in TABLE if harms.HARMS[pair[0]][0] in natures and pair[0] != "raises_long_message"]
+    return chosen[start::every]
+
+
+def test_there_are_more_than_300_kinds():
+    assert len(TABLE) + len(ATTACKS) > 300
+
+
+def test_harm_costs_its_own_trial_and_is_named(run):
+    trials = [*sample(3), ("raises_long_message", "fifth act"), ("stops_itself", "fifth act"), ("sleeps", "close")]
+    check(trials, run(trials, timeout_s=2.0))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("part", range(8))
+def test_every_harm_at_every_moment_costs_its_own_trial_and_is_named(run, part):
+    trials = list(TABLE)[part::8]
+    check(trials, run(trials))
+
+
+@pytest.mark.nightly
+def test_fresh_processes_say_the_same(run):
+    trials = sample(5, natures=("raises", "dies", "lives", "hangs"), every=29)
+    check(trials, run(trials, FreshProcessExecutor))
+
+
+@pytest.mark.parametrize(
+    "attack", [one if one == "SIGSTOP_to_zygote" else pytest.param(one, marks=pytest.mark.nightly) for one in ATTACKS]
+)
+def test_attack_on_the_processes_above_costs_no_other_trial(run, attack):
+    result = run([(attack, "fifth act")])[0]
+    # Killed from outside, it is run again, alone; killed at the same place again, it did that itself.
+    assert str(result.outcome) == (DIED if attack in DEADLY else SURVIVED)
+    assert result.failure is None or result.failure.agent == "ego"
+
+
+MESSAGES = {
+    ("exits_with_79", "fifth act"): "the process exited with 79 in ego's act() of step 5",
+    ("exits_with_success", "first act"): "the process exited with 0 in ego's act() of step 1",
+    ("segfaults", "close"): "the process died of SIGSEGV after the last step",
+    ("overflows_stack", "fifth act"): "the process died of SIGSEGV in ego's act() of step 5",
+    ("recurses", "fifth act"): "maximum recursion depth exceeded",
+    ("raises_error", "signal handler"): "harm",
+    ("feigns_full_disk", "signal handler"): "the disk is full; buy one",
+    ("kills_itself", "fifth act"): "the process died of SIGKILL in ego's act() of step 5",
+    ("deletes_folder", "fifth act"): None,
+}
+
+
+def test_trial_says_what_happened(run):
+    found = run(MESSAGES)
+    said = {pair: found[number].failure and found[number].failure.message for number, pair in enumerate(MESSAGES)}
+    assert said == MESSAGES
+    assert all(result.digest for result in found.values())
