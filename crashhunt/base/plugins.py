@@ -152,7 +152,9 @@ def import_module(name: str, *, shown: str = "") -> types.ModuleType:
         sys.path.insert(0, os.getcwd())  # noqa: PTH109
     try:
         return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # such as SystemExit, and whatever a module derives from BaseException
         raise _not_imported(name, shown or name, error) from error
 
 

@@ -63,6 +63,7 @@ class Parts:
             CrashhuntError: something cannot be imported.
         """
         record_shared_memory(self._settings.scratch)
+        bound_recursion()  # before a module is imported that recurses
         # Whatever modules draw when they are imported is the same in every process.
         seed_everything(0)
         scenario = self._settings.scenario
@@ -77,7 +78,6 @@ class Parts:
                     importlib.import_module(library)
         # Of which every simulator's spaces are: here, so that workers that are forks of this process have it.
         importlib.import_module("gymnasium")
-        bound_recursion()
         record_originals()
 
     def simulator(self) -> Simulator:

@@ -123,6 +123,13 @@ def test_what_leads_nowhere_says_why(tmp_path, monkeypatch, content, name, says)
         ("import json\n\njson.loads('x')", "broken:Agent", "broken.py, line 3", "JSONDecodeError"),
         ("def f():\n  return (", "broken:Agent", "broken.py, line 2", "SyntaxError"),
         ("import sys\nsys.exit(3)", "broken:Agent", "broken.py, line 2", "SystemExit: 3"),
+        ("class Own(BaseException): ...\nraise Own('x')", "broken:Agent", "broken.py, line 2", "Own: x"),
+        (
+            "raise ValueError('x' * 10**7)",
+            "broken:Agent",
+            "broken.py, line 1",
+            "(9999000 more characters",
+        ),
         ("from json import nothing", "broken:Agent", "broken.py, line 1", "cannot import name 'nothing'"),
         ("", "brokn:Agent", "", "No module named 'brokn'; did you mean 'broken'?"),
         ("", "broken.inner:Agent", "", "No module named 'broken.inner'"),
