@@ -63,7 +63,7 @@ def raises_error():
 
 @harm("raises")
 def raises_bare():
-    raise BareError
+    raise BareError("harm")
 
 
 @harm("raises")

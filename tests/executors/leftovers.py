@@ -648,12 +648,10 @@ def pickling_table():
     copyreg.pickle(Plain, lambda one: (Plain, ()))
 
 
-@left_as(lambda: locale.setlocale(locale.LC_ALL))
+@left_where(lambda: locale.setlocale(locale.LC_TIME) != locale.setlocale(locale.LC_MONETARY))
 def locale_setting():
-    for name in ("C.UTF-8", "C", "POSIX"):
-        locale.setlocale(locale.LC_ALL, name)
-        if locale.setlocale(locale.LC_ALL) != KINDS["locale_setting"]:
-            return
+    now = locale.setlocale(locale.LC_TIME)  # which SUMO sets for all categories at once
+    locale.setlocale(locale.LC_TIME, "C" if now != "C" else "C.UTF-8")
 
 
 def _cached_patterns():
