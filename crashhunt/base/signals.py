@@ -11,12 +11,21 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["describe_death", "ended_by_signals", "is_sent_from_outside", "stop_requests"]
+__all__ = [
+    "block_signals",
+    "blocked_signals",
+    "describe_death",
+    "ended_by_signals",
+    "is_sent_from_outside",
+    "stop_requests",
+]
 
 _SENT_FROM_OUTSIDE: Final = frozenset(
     {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
 )
 """What an administrator, a batch system, or the kernel where memory runs out, ends a process by."""
+# Bound here, before an agent is imported that could replace them.
+_set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
@@ -54,6 +63,29 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
         if asked:
             os.kill(os.getpid(), asked[0])
+
+
+def block_signals() -> None:
+    """Have no signal handler of Python run in this thread from now on.
+
+    A handler whose signal has come before may run once more meanwhile, and what it raises is dropped.
+    """
+    for _ in range(2):
+        try:
+            _set_mask(signal.SIG_BLOCK, _ALL)
+        except BaseException:
+            continue
+
+
+@contextmanager
+def blocked_signals() -> Iterator[None]:
+    """Have no signal handler of Python run in this thread meanwhile; signals that come are handled afterwards."""
+    before = _set_mask(signal.SIG_BLOCK, ())
+    try:
+        block_signals()
+        yield
+    finally:
+        _set_mask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

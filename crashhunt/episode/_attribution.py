@@ -15,6 +15,7 @@ from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING
 
 from crashhunt.base.blame import is_users
+from crashhunt.base.signals import blocked_signals
 from crashhunt.episode._failures import is_emptied
 from crashhunt.scenario import Scenario
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Attribution", "attribute_error", "record_originals"]
 
+_TRIES: Final = 3
 _MAX_FRAMES: Final = 2_000  # of a traceback, from its outer end; the rest repeats
 _MAX_CAUSES: Final = 8
 _MAX_MODULES: Final = 2_000  # of a user's, that refer to each other
@@ -106,10 +108,13 @@ def attribute_error(
         simulator: the simulator.
         observing: oracles and observers of the episode.
     """
-    try:
-        return _attribute(error, agents, simulator, observing)
-    except BaseException:  # an agent may have damaged what this uses
-        return None
+    for _ in range(_TRIES):
+        try:
+            with blocked_signals():
+                return _attribute(error, agents, simulator, observing)
+        except BaseException:  # an agent may have damaged what this uses, and its signal handlers may raise here too
+            continue
+    return None
 
 
 def _attribute(

@@ -10,6 +10,7 @@ from crashhunt.agents import Closes
 from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
 from crashhunt.base.exception_text import class_name, format_error, message_of
 from crashhunt.base.faculties import offers
+from crashhunt.base.signals import blocked_signals
 from crashhunt.trial import Failure
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
         agent: whose it is; empty for nobody's.
         cause: why it was raised, where its message does not say so, as a clause; empty where it does.
     """
-    with _deep_enough():
+    with blocked_signals(), _deep_enough():
         # A message of our own says everything; where in our code it was raised is nobody's business.
         text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
         words = words_of(error)

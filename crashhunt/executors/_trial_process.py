@@ -20,6 +20,7 @@ from crashhunt.base.errors import RecorderError
 from crashhunt.base.faculties import offers
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
+from crashhunt.base.signals import block_signals
 from crashhunt.episode import (
     BUDGET,
     BUDGET_BESIDE,
@@ -138,6 +139,7 @@ class TrialProcess:
         try:
             code = self._run(job, reset)
         except BaseException:  # something that this process needs is damaged
+            block_signals()
             code = 0
             if self._box is not None:
                 self._box.announce_damage()
@@ -181,6 +183,7 @@ class TrialProcess:
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to its end
                 _leave(0)
+        block_signals()  # whose handlers are those of agents, and the episode is over
         for asks, what in self._asking:
             if asks.why_not:
                 self._notices.append(f"{what}{_FROM_HERE_ON}{asks.why_not}")

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from crashhunt.base import signals
-from crashhunt.base.signals import stop_requests
+from crashhunt.base.signals import block_signals, blocked_signals, stop_requests
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -53,3 +53,33 @@ def test_whoever_ignores_hang_ups_goes_on_ignoring_them_and_threads_are_left_alo
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
+
+
+def test_no_handler_runs_while_signals_are_blocked():
+    heard = []
+    before = signal.signal(signal.SIGUSR2, lambda *_: heard.append(1))
+    try:
+        with blocked_signals():
+            os.kill(os.getpid(), signal.SIGUSR2)
+            assert heard == []
+        assert heard == [1]
+        with blocked_signals(), blocked_signals():
+            os.kill(os.getpid(), signal.SIGUSR2)
+        assert heard == [1, 1]
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == set()
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+
+
+def test_blocking_drops_what_a_handler_raises(monkeypatch):
+    calls = []
+
+    def set_mask(*given):
+        calls.append(given)
+        if len(calls) == 1:
+            raise ValueError("of a handler that runs meanwhile")
+
+    monkeypatch.setattr(signals, "_set_mask", set_mask)
+    block_signals()
+    assert len(calls) == 2
+    assert signal.SIGALRM in calls[1][1]
