@@ -140,6 +140,15 @@ def feigns_invalid():
 
 
 @harm("raises")
+def raises_forever():
+    def handle(*_):
+        raise ValueError("again")
+
+    signal.signal(signal.SIGALRM, handle)
+    signal.setitimer(signal.ITIMER_REAL, 0.0005, 0.0005)
+
+
+@harm("raises")
 def runs_out_of_memory():
     limit = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -48,7 +48,7 @@ EXPECTED["hangs"] = {
 }
 _DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cannot report what came of its trial
 EXCEPTIONS: dict[str, dict[str, tuple[str, bool]]] = {
-    "no_json": {**_DAMAGED, "constructor": (INVALID, False), "reset": (INVALID, False)},
+    "no_json": {**_DAMAGED, "constructor": (INVALID, NAMED), "reset": (INVALID, NAMED)},
     "no_os": _DAMAGED,
     "terminates_group": {"child": (DIED, NAMED)},  # to which its parent belongs
     "sleeps_in_c": {"thread": (HANG, NAMED)},  # it holds the interpreter
@@ -60,7 +60,7 @@ TABLE = {
     (name, moment): EXCEPTIONS.get(name, {}).get(moment, EXPECTED[nature][moment])
     for name, (nature, _) in harms.HARMS.items()
     for moment in harms.MOMENTS
-    if name not in ATTACKS
+    if name not in (*ATTACKS, "raises_forever")
 }
 
 
@@ -206,6 +206,12 @@ def test_attack_on_the_processes_above_costs_no_other_trial(run, attack):
     # Killed from outside, it is run again, alone; killed at the same place again, it did that itself.
     assert str(result.outcome) == (DIED if attack in DEADLY else SURVIVED)
     assert result.failure is None or result.failure.agent == "ego"
+
+
+def test_handler_that_raises_again_and_again_is_the_agents(run):
+    """Also while crashhunt finds out whose exception it is, and what it says."""
+    found = run([("raises_forever", "fifth act")] * 6)
+    assert {(str(result.outcome), result.failure.agent) for result in found.values()} == {(ERROR, "ego")}
 
 
 MESSAGES = {
