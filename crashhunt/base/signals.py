@@ -24,6 +24,8 @@ _SENT_FROM_OUTSIDE: Final = frozenset(
     {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGKILL, signal.SIGXCPU}
 )
 """What an administrator, a batch system, or the kernel where memory runs out, ends a process by."""
+# Bound here, before an agent is imported that could replace them.
+_set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
 # Bound here, before an agent is imported that could replace them.
 _set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
