@@ -15,7 +15,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill"]
+__all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill", "resume"]
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
 _libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, and not in every copy of this process

@@ -32,8 +32,7 @@ _MAX_CAUSES: Final = 8
 _MAX_MODULES: Final = 2_000  # of a user's, that refer to each other
 _MAX_HELD: Final = 200  # objects that a simulator or an agent consists of
 _DEPTH_OF_HELD: Final = 3
-_WATCHED: Final = ("builtins", "gymnasium", "libsumo", "math", "numpy", "random", "time")
-_WATCHED_PACKAGES: Final = ("crashhunt.", "gymnasium.spaces", "highway_env.", "numpy.")
+_WATCHED: Final = frozenset({"builtins", "math", "random", "time"})  # of Python's own modules
 _LIMITS: Final = {
     "RLIMIT_AS": resource.RLIMIT_AS,
     "RLIMIT_DATA": resource.RLIMIT_DATA,
@@ -59,6 +58,7 @@ class Attribution:
 class _Originals:
     """What code of the process was like before a trial ran."""
 
+    packages: frozenset[str]
     functions: dict[str, dict[str, object]]
     classes: dict[type, dict[str, object]]
     recursion_limit: int
@@ -74,12 +74,11 @@ def record_originals() -> None:
     What an agent replaces later is found by comparison, when something fails. Call it once all code is imported and
     before a trial runs.
     """
+    packages = _packages_of_simulators()
     functions: dict[str, dict[str, object]] = {}
     classes: dict[type, dict[str, object]] = {}
     for name, module in list(sys.modules.items()):
-        if name not in _WATCHED and not name.startswith(_WATCHED_PACKAGES):
-            continue
-        if not isinstance(module, ModuleType):
+        if not isinstance(module, ModuleType) or (name not in _WATCHED and name.partition(".")[0] not in packages):
             continue
         held = {key: value for key, value in vars(module).items() if callable(value)}
         functions[name] = held
@@ -87,7 +86,16 @@ def record_originals() -> None:
             if isinstance(value, type) and value.__module__ == name and value not in classes:
                 classes[value] = {key: one for key, one in vars(value).items() if callable(one)}
     limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
-    _originals[:] = [_Originals(functions, classes, sys.getrecursionlimit(), limits)]
+    _originals[:] = [_Originals(packages, functions, classes, sys.getrecursionlimit(), limits)]
+
+
+def _packages_of_simulators() -> frozenset[str]:
+    """Return crashhunt and the installed packages that its simulators use, among them NumPy."""
+    found = {"crashhunt"}
+    for name, module in list(sys.modules.items()):
+        if name.startswith("crashhunt.simulators"):
+            found |= {_module_of_value(value).partition(".")[0] for value in vars(module).values()}
+    return frozenset(found - sys.stdlib_module_names - {""})
 
 
 def attribute_error(
@@ -245,7 +253,8 @@ def _module_of_value(value: object) -> str:
         return str(value.__module__ or "")
     if type(value) is type:
         return str(vars(value).get("__module__", ""))
-    return str(vars(type(value)).get("__module__", ""))
+    found = vars(type(value)).get("__module__")  # of types in C it is a descriptor
+    return found if isinstance(found, str) else ""
 
 
 def _is_users_module(name: str) -> bool:
@@ -264,7 +273,7 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
 
     def is_foreign(value: object, original: object) -> bool:
         module = "" if value is None else _module_of_value(value)
-        known = module in others or module in _WATCHED or module.startswith(_WATCHED_PACKAGES)
+        known = module in others or module in _WATCHED or module.partition(".")[0] in _originals[0].packages
         return value is not original and (not known or module == "builtins")
 
     for module_name, held in _originals[0].functions.items():

@@ -163,8 +163,8 @@ def test_scenes_are_taken_once_as_columns(box):
 def test_more_than_is_reserved_is_reserved_in_time(tmp_path, monkeypatch):
     """Records of every size that just fit, just do not, and begin a new mapping."""
     chunk = 1 << 12
-    monkeypatch.setattr("crashhunt.recording._blackbox._CHUNK", chunk)
-    monkeypatch.setattr("crashhunt.recording._blackbox._MAPPED", 64 * chunk)
+    monkeypatch.setattr("crashhunt.recording._blackbox.CHUNK", chunk)
+    monkeypatch.setattr("crashhunt.recording._blackbox.MAPPED", 64 * chunk)
     box = BlackBox(tmp_path / "box")
     box.begin(pid=1, trial=1, started=0.0)
     box.prologue(b"", 0)
