@@ -71,7 +71,8 @@ def ended_by_signals() -> Iterator[None]:
 def block_signals() -> None:
     """Have no signal handler of Python run in this thread from now on.
 
-    A handler whose signal has come before may run once more meanwhile, and what it raises is dropped.
+    Where there are other threads, the kernel may hand a signal for the process to one of them; then a handler runs. A
+    handler whose signal has come before may run once more meanwhile, and what it raises is dropped.
     """
     for _ in range(2):
         try:

@@ -269,25 +269,24 @@ def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
     """
     if not _originals:
         return ""
-    names = {name for frame in frames for name in frame.f_code.co_names}
+    used = {name for frame in frames for name in frame.f_code.co_names}
 
     def is_foreign(value: object, original: object) -> bool:
         module = "" if value is None else _module_of_value(value)
         known = module in others or module in _WATCHED or module.partition(".")[0] in _originals[0].packages
         return value is not original and (not known or module == "builtins")
 
+    replaced: dict[str, str] = {}
     for module_name, held in _originals[0].functions.items():
-        module = sys.modules.get(module_name)
-        if module is None:
-            continue
-        now = vars(module)
-        for name in names & held.keys():
-            if is_foreign(now.get(name), held[name]):
-                return f"{module_name}.{name} has been replaced"
+        now = vars(sys.modules[module_name]) if module_name in sys.modules else {}
+        replaced |= {one: f"{module_name}.{one}" for one in used & held.keys() if is_foreign(now.get(one), held[one])}
     for kind, held in _originals[0].classes.items():
-        for name in names & held.keys():
-            if is_foreign(vars(kind).get(name), held[name]):
-                return f"{kind.__module__}.{kind.__qualname__}.{name} has been replaced"
+        place, present = f"{kind.__module__}.{kind.__qualname__}", vars(kind)
+        replaced |= {one: f"{place}.{one}" for one in used & held.keys() if is_foreign(present.get(one), held[one])}
+    for frame in frames:  # the innermost function that refers to one is the one that failed
+        for name in frame.f_code.co_names:
+            if name in replaced:
+                return f"{replaced[name]} has been replaced"
     return ""
 
 

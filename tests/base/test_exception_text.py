@@ -135,16 +135,46 @@ def test_ordinary_exception_is_formatted_as_python_does(make):
         (lambda: exec(compile("\n1/0", "/dev/zero", "exec")), ['File "/dev/zero", line 2', "ZeroDivisionError"]),
     ],
 )  # fmt: skip
-def test_large_or_odd_exception_is_cut_before_it_is_formatted(make, shown):
+def test_large_or_odd_exception_is_cut_before_it_is_formatted(make, shown, monkeypatch):
     error = raised(make)
+    asked = []
+    real = traceback.format_exception
+    monkeypatch.setattr(traceback, "format_exception", lambda one: asked.append(one) or real(one))
     began = time.process_time()
     text = format_error(error)
     assert time.process_time() - began < 2.0  # of which Python itself needs much more, or does not end at all
     assert len(text) < MAX_TRACEBACK_CHARACTERS + 100
     for part in shown:
         assert part in text
+    is_small = type(error) is ZeroDivisionError
+    assert len(asked) == is_small  # the others, Python would take too long for
     assert len(message_of(error)) < 10_100
     assert len(in_words(error)) < 1_300
+
+
+@pytest.mark.parametrize(("count", "left_out"), [(51, 35), (60, 44)])
+def test_long_chain_shows_both_ends_in_order(count, left_out):
+    text = format_error(raised(lambda: chained(count, how="__context__")))
+    numbers = [int(line.removeprefix("ValueError: ")) for line in text.splitlines() if line.startswith("ValueError")]
+    assert numbers == [*range(8), *range(count - 8, count)]
+    assert f"… ({left_out} exceptions in between are left out) …" in text
+    assert text.count("During handling of the above exception") == 15
+
+
+def test_chain_follows_the_cause_and_respects_from_none():
+    newest = ValueError("newest")
+    newest.__context__ = KeyError("hidden")
+    newest.__cause__ = TypeError("the cause " + "x" * 20_000)
+    text = format_error(newest)
+    assert "hidden" not in text
+    assert text.index("TypeError: the cause") < text.index("direct cause of") < text.index("ValueError: newest")
+    newest.__cause__ = None
+    newest.__context__ = KeyError("x" * 20_000)
+    newest.__suppress_context__ = True
+    assert "KeyError" not in format_error(newest)
+    newest.__suppress_context__ = False
+    newest.__context__.__context__ = newest  # a circle
+    assert format_error(newest).count("ValueError: newest") == 1
 
 
 def test_long_traceback_shows_both_ends():
