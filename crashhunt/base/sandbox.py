@@ -31,7 +31,7 @@ _OTHERS = {6: 0b11}  # abstract sockets and signals
 
 # What a Python process reads besides what is installed: libraries and their list, the clock, random numbers, itself.
 _SYSTEM = """
-/usr /lib /lib64 /bin /opt /etc/ld.so.cache /etc/localtime /etc/fonts /dev/urandom /dev/null /proc/self /proc/cpuinfo
+/usr /lib /lib64 /bin /opt /etc/ld.so.cache /etc/localtime /etc/fonts /dev/urandom /dev/null /proc
 /proc/meminfo /proc/stat /sys/devices/system /sys/fs/cgroup
 """
 

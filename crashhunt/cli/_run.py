@@ -89,7 +89,8 @@ def _tell_of_the_survey(options: argparse.Namespace) -> threading.Timer:
     """Return a timer that explains a long wait; the caller cancels it."""
 
     def tell() -> None:
-        if str(options.scenario).endswith((".sumocfg", ".sumo.cfg")):
+        scenario = Path(str(options.scenario))
+        if scenario.is_file() and scenario.suffix != ".toml":  # only a simulator's own configuration is surveyed
             print(
                 "simulating the plain traffic, to find vehicles that enter (60 s at most)", file=sys.stderr, flush=True
             )

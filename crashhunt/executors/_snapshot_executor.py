@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 from contextlib import closing
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
+from crashhunt.episode import scratch_of
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._pool import PoolExecutor
 
@@ -70,10 +72,10 @@ class SharedExecutors:
     def run(
         self, settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
     ) -> tuple[TrialResult, Path] | None:
-        """Run a trial; no two of the same number at a time.
+        """Run a trial.
 
         Returns:
-            What came of it, and the scratch folder in which it was recorded; None where it was stopped.
+            What came of it, and the folder in which it was recorded; None where it was stopped.
 
         Raises:
             CrashhuntError: it cannot be run.
@@ -86,8 +88,7 @@ class SharedExecutors:
                 scratch.mkdir(parents=True)
                 executor = snapshot_executor(replace(settings, scratch=scratch), parallel=self._parallel)
                 shared = self._shared[key] = _Shared(executor, scratch)
-        result = shared.run(spec, stopped)
-        return None if result is None else (result, shared.scratch)
+        return shared.run(spec, stopped)
 
     def close(self) -> None:
         """End every process."""
@@ -96,21 +97,27 @@ class SharedExecutors:
 
 
 class _Shared:
-    """An executor of which each thread waits for its own trial."""
+    """An executor of which each thread waits for its own trial.
+
+    A trial that was stopped may still be running when the same one is asked for again, so that each run gets a number
+    of its own, by which its folder is called.
+    """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:
-        self.executor, self.scratch = executor, scratch
+        self.executor, self._scratch = executor, scratch
         self._lock = threading.Lock()
         self._ended: dict[int, TrialResult] = {}
+        self._numbers = itertools.count()
 
-    def run(self, spec: TrialSpec, stopped: Callable[[], bool]) -> TrialResult | None:
+    def run(self, spec: TrialSpec, stopped: Callable[[], bool]) -> tuple[TrialResult, Path] | None:
         with self._lock:
-            self.executor.submit(spec)
-        while spec.number not in self._ended:
+            number = next(self._numbers)
+            self.executor.submit(replace(spec, number=number))
+        while number not in self._ended:
             if stopped():
                 return None
             with self._lock:
-                if spec.number not in self._ended:
+                if number not in self._ended:
                     for result in self.executor.completed(_LOOK_EVERY_S):
                         self._ended[result.spec.number] = result
-        return self._ended.pop(spec.number)
+        return replace(self._ended.pop(number), spec=spec), scratch_of(self._scratch, number)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NoReturn
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, remedy
 from crashhunt.base.files import whole_file
+from crashhunt.base.limits import limit_behind
 from crashhunt.base.processes import die_with, resume
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
@@ -372,9 +373,11 @@ def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -
     except FileNotFoundError:  # another trial has removed the scratch folder meanwhile
         return {"lost": -signal.SIGKILL}
     except OSError as error:
+        limit = limit_behind(error)
         return RecorderError(
-            f"the trial cannot be kept: {error.strerror}", fix=remedy(error), where=str(error.filename or "")
-        ).to_json()
+            f"the trial cannot be kept: {limit or error.strerror}", fix="" if limit else remedy(error),
+            where=str(error.filename or ""),
+        ).to_json()  # fmt: skip
     from crashhunt.executors._escapes import with_escape
 
     result = with_escape(supervisor, settings, ended)

@@ -110,15 +110,15 @@ def _run(
     rerun: Rerun, stopped: Callable[[], bool] = lambda: False, executors: SharedExecutors | None = None
 ) -> ReplayReport:
     with temporary_folder("replay") as scratch:
-        if executors is None:
-            result = run_alone(replace(rerun.worker, scratch=scratch), rerun.spec, stopped)
-        else:
+        found = None
+        if executors is not None:
             found = executors.run(rerun.worker, rerun.spec, stopped)
-            result, scratch = found if found is not None else (None, scratch)
-        if result is None:
+        elif alone := run_alone(replace(rerun.worker, scratch=scratch), rerun.spec, stopped):
+            found = alone, scratch_of(scratch, rerun.spec.number)
+        if found is None:
             raise _StoppedError
+        result, recorded_in = found
         message = result.failure.message if result.failure else "it left no recording"
-        recorded_in = scratch_of(scratch, rerun.spec.number)
         if result.was_killed_from_outside:
             raise CrashhuntError(
                 f"the replay was {message}",

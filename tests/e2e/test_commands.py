@@ -28,9 +28,10 @@ class Agent(Raises):
             if inspect.isfunction(function) and function.__module__ == name
         }
         said = ours["crashhunt.world"].__doc__
-        pathlib.Path(f"{sys.argv[0]}.json").write_text(json.dumps([files, code, said]))
+        again = "-again" * ("/snapshots/" in ours["crashhunt"].__file__)
+        pathlib.Path(f"{sys.argv[0]}{again}.json").write_text(json.dumps([files, code, said]))
 """
-TEMPLATE, FRESH = "crashhunt.executors._fork_server", "crashhunt.executors._fresh"
+FORK_SERVER, FRESH = "crashhunt.executors._fork_server", "crashhunt.executors._fresh"
 
 
 def told(shell, hunt: str, run) -> tuple:
@@ -43,7 +44,9 @@ def told(shell, hunt: str, run) -> tuple:
     (crash,) = done.json["crashes"]
     err = re.sub(r"\d+:\d\d \(", "M:SS (", done.err.replace(hunt, "h"))  # how long it took
     err = re.sub(r"^hunting: .*\n", "", err, flags=re.MULTILINE)  # how far it was when somebody looked
-    imported = [imported_by(shell, process, hunt) for process in (TEMPLATE, FRESH)]
+    run("replay", hunt)
+    processes = (FORK_SERVER, f"{FORK_SERVER}-again", f"{FRESH}-again")
+    imported = [imported_by(shell, process, hunt) for process in processes]
     return manifest["files"], manifest["paths"], environment, crash | {"path": ""}, err, imported
 
 

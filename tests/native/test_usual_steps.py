@@ -188,7 +188,7 @@ def test_what_is_recorded_can_be_read_after_each_step(street):
 
 
 def test_where_there_is_no_room_python_makes_some(street, monkeypatch, tmp_path):
-    monkeypatch.setattr("crashhunt.recording._blackbox._CHUNK", 4096)
+    monkeypatch.setattr("crashhunt.recording._blackbox.CHUNK", 4096)
     street.box.close()
     street.box = BlackBox(tmp_path / "small")
     street.both(ANSWERS["steady"])
