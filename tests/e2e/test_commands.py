@@ -64,7 +64,7 @@ def test_its_snapshot_output_and_digests_are_the_same(toy):
     (file,) = (toy.folder / "forked" / "snapshots").glob("*/code/crashhunt/world/__init__.py")
     file.write_text(file.read_text(encoding="utf-8").replace('"""', '"""Not here. ', 1), encoding="utf-8")
     toy.crashhunt("replay", "forked", "--force", "--trust", expect=None)
-    *_, said = imported_by(toy, FRESH, "forked")
+    *_, said = imported_by(toy, f"{FRESH}-again", "forked")
     assert said.startswith("Not here. ")
 
 

@@ -197,7 +197,7 @@ def test_rerun_to_that_was_killed_before_it_ran_goes_on(damaged, monkeypatch):
     monkeypatch.setattr(_rerun, "run_all", lambda folders, *_, **__: ran.extend(folders))
 
     def again(**options):
-        return _rerun.rerun([hunt], to=to, **{"changes": {"seed": "5"}, **options})
+        return _rerun.rerun([hunt], to=to, trusted=True, **{"changes": {"seed": "5"}, **options})
 
     killed(again, NEVER)
     request = json.loads((to / "request.json").read_text())
@@ -232,7 +232,7 @@ def test_rerun_to_that_was_killed_before_it_ran_goes_on(damaged, monkeypatch):
     assert ran == [to]
     (damaged.folder / "file").touch()
     with pytest.raises(HuntDirectoryError, match="there already"):
-        _rerun.rerun([hunt], to=damaged.folder / "file")
+        _rerun.rerun([hunt], to=damaged.folder / "file", trusted=True)
 
 
 @pytest.mark.parametrize("exchanges", [True, False])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from saying import Says
 
 from crashhunt.base.errors import RecorderError
 from crashhunt.episode import Episode, Nearness, Observer, Recorder
@@ -32,21 +33,6 @@ TRAFFIC = (
     '<vehicle id="far" type="car" depart="1.3" departPos="0"><route edges="south north"/></vehicle>'
     '<vehicle id="late" type="car" depart="2.5" departPos="20"><route edges="west north"/></vehicle>'
 )
-
-
-class Says:
-    """An agent that answers what a function of the step and of what it is shown says."""
-
-    def __init__(self, answer):
-        self._answer, self._step = answer, 0
-
-    def reset(self, seed):
-        self._step = 0
-
-    def act(self, observation):
-        assert not observation.flags.writeable
-        self._step += 1
-        return self._answer(self._step, observation)
 
 
 class Street:
