@@ -59,7 +59,6 @@ def main() -> None:
     except CrashhuntError as error:
         _send(control, error.to_json())
         return
-    gc.collect()
     gc.freeze()
     orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     server, template = os.getpid(), os.fork()
@@ -229,7 +228,6 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
         late: whether each trial imports its agents itself.
     """
     ours, theirs = socket.socketpair()
-    gc.collect()
     gc.freeze()
     parent, pid = os.getpid(), os.fork()
     if pid == 0:

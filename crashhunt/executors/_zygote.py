@@ -148,7 +148,6 @@ class _Zygote:
         self._staged = self._changed_at()
         if remaining := self._trial.record_shared_state():
             self._notices.append(f"trials are not wholly apart: a module shares {remaining} with every one of them")
-        gc.collect()
         gc.freeze()  # a collection in a fork would copy the page of every object
         self._say({"ready": os.getpid()})
         while (message := self._next()) is not None:
