@@ -135,6 +135,7 @@ def test_python_refuses_as_well(theirs):
     assert crashhunt.load("h").agent(0, trust=True).speed == 20.0
 
 
+@pytest.mark.nightly
 def test_one_command_trusts_a_folder_for_all_others(theirs):
     theirs.crashhunt("trust", "h", "corpus")
     assert not ran(theirs)

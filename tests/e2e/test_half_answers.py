@@ -102,6 +102,7 @@ def hunt_and_kill(shell, words, number=0):
     return json.loads(out), err
 
 
+@pytest.mark.nightly
 @pytest.mark.long
 @pytest.mark.parametrize("gap_m", GAPS_M)
 def test_margin_of_a_trial_whose_copies_are_killed_is_open_until_they_are_asked_again(shell, folder, gap_m):

@@ -400,6 +400,7 @@ class Leaves(KeepLaneWithSpeed):
 """
 
 
+@pytest.mark.nightly
 def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(toy, temporary_files):
     (toy.folder / "leaves.py").write_text(LEAVES_MEMORY)
     toy.environment["TMPDIR"] = str(temporary_files)
@@ -454,6 +455,7 @@ def test_what_no_link_leads_to_goes_where_it_lies(toy, made_once, monkeypatch):
     assert [path for path in stay if not path.exists()] == []
 
 
+@pytest.mark.nightly
 def test_a_hunt_that_is_stopped_while_it_confirms_is_resumed_by_a_rerun(toy, monkeypatch):
     monkeypatch.chdir(toy.folder)
     scenario, settings = plan(Request(scenario="toy", trials=3, max_steps=60, arguments={"speed": "20"}))

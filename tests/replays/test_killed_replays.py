@@ -76,6 +76,7 @@ def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, t
     assert (read.confirmed, read.why_unconfirmed) == (True, "")
 
 
+@pytest.mark.nightly
 def test_unknown_escape_is_told_and_searched_again(bundle, toy):
     unknown = replace(
         bundle.result, escape=None, why_no_escape="the process that searched was killed by SIGKILL, 2 times"
