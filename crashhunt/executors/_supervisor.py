@@ -26,7 +26,6 @@ from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import scratch_of
 from crashhunt.executors._evidence import KEY_BYTES, Report, check_report
 from crashhunt.executors._remains import damaged, died, hung, read_tail
-from crashhunt.executors._trial_process import UNABLE_TO_RECORD
 from crashhunt.recording import BlackBoxFile
 from crashhunt.trial import TrialSpec
 
@@ -149,7 +148,7 @@ class Supervisor:
             return Ended(self._damaged(spec, "its recording was truncated", recorded=False))
         if header is None or header.trial != spec.number or not box.has(header):
             return Ended(self._damaged(spec, "its recording was overwritten", recorded=False))
-        if code == UNABLE_TO_RECORD and not report:
+        if code == 0 and box.had_no_room:
             box.require_room()
             raise LostTrialError(-signal.SIGKILL)  # there is room again
         if not is_there and header.pid == os.getpid():  # another trial has deleted the folder before this one began

@@ -46,13 +46,11 @@ if TYPE_CHECKING:
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Overruled, SpecData, TrialResult, Value
 
-__all__ = ["LEFT_OUT", "UNABLE_TO_RECORD", "Job", "TrialProcess", "loaded"]
+__all__ = ["LEFT_OUT", "Job", "TrialProcess", "loaded"]
 
 LEFT_OUT = " are left out: "
 """Stands in a notice between probes or branches, and why there are none of them."""
 _FROM_HERE_ON = " are left out from here on: "
-UNABLE_TO_RECORD = 78
-"""The exit code of the process of a trial for whose recording the disk has no room. The supervisor checks that."""
 
 # Bound here, before any agent is imported that could replace them.
 _dumps, _leave, _open, _dup2, _close = json.dumps, os._exit, os.open, os.dup2, os.close
@@ -179,7 +177,8 @@ class TrialProcess:
                 first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and (prober or brancher) else None,
             )
         except RecorderError:
-            return UNABLE_TO_RECORD
+            box.announce_no_room()
+            return 0
         finally:
             if os.getpid() != self._pid:  # an agent has forked, and this is the copy, which has come to its end
                 _leave(0)

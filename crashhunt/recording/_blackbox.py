@@ -43,6 +43,7 @@ __all__ = [
     "HEADER",
     "MAGIC",
     "MAPPED",
+    "NO_ROOM",
     "REPORT",
     "REPORT_OFFSET",
     "UNREPORTABLE",
@@ -64,6 +65,7 @@ _WHERE_OFFSET = HEADER.size - _WHERE.size
 _SETUP, _SETUP_OFFSET = struct.Struct("<I"), 12
 REPORT, REPORT_OFFSET = struct.Struct("<Q"), HEADER.size  # length of the report in bytes; 0 for none
 UNREPORTABLE = 2**64 - 1  # in place of that length: the process is damaged and cannot report
+NO_ROOM = 2**64 - 2  # the same: the disk had no room for the recording
 FIRST = 64  # where records begin; the header has room to grow
 _DAMAGE_ANNOUNCED = REPORT.pack(UNREPORTABLE)
 _HEAD = struct.Struct("<BxHI")
@@ -193,6 +195,10 @@ class BlackBox:
             self._reserve(end)
         self._map[self._offset : end] = report
         REPORT.pack_into(self._map, REPORT_OFFSET, len(report))
+
+    def announce_no_room(self) -> None:
+        """Say that the disk has no room for the recording, which the supervisor checks."""
+        REPORT.pack_into(self._map, REPORT_OFFSET, NO_ROOM)
 
     def announce_damage(self) -> None:
         """Say that this process cannot report; needs nothing of Python that an agent may have damaged."""

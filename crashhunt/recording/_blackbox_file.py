@@ -12,6 +12,7 @@ from crashhunt.recording._blackbox import (
     HEADER,
     MAGIC,
     MAPPED,
+    NO_ROOM,
     REPORT,
     REPORT_OFFSET,
     UNREPORTABLE,
@@ -95,10 +96,20 @@ class BlackBoxFile:
 
     def read_report(self, header: BlackBoxHeader) -> bytes | None:
         """Return the report; empty where there is none, None where the process announced that it cannot report."""
-        size = REPORT.unpack(os.pread(self._file, REPORT.size, REPORT_OFFSET).ljust(REPORT.size, b"\0"))[0]
+        size = self._announced()
         if size == UNREPORTABLE:
             return None
-        return self._read(header.committed, size)
+        return b"" if size == NO_ROOM else self._read(header.committed, size)
+
+    @property
+    def had_no_room(self) -> bool:
+        """Whether the process announced that the disk had no room for the recording."""
+        return self._announced() == NO_ROOM
+
+    def _announced(self) -> int:
+        found = os.pread(self._file, REPORT.size, REPORT_OFFSET).ljust(REPORT.size, b"\0")
+        size: int = REPORT.unpack(found)[0]
+        return size
 
     def copy_to(self, path: Path) -> None:
         """Write the content to another file, up to the end of the records and the report."""

@@ -216,6 +216,7 @@ def test_handler_that_raises_again_and_again_is_the_agents(run):
 
 MESSAGES = {
     ("exits_with_79", "fifth act"): "the process exited with 79 in ego's act() of step 5",
+    ("exits_with_78", "fifth act"): "the process exited with 78 in ego's act() of step 5",
     ("exits_with_success", "first act"): "the process exited with 0 in ego's act() of step 1",
     ("segfaults", "close"): "the process died of SIGSEGV after the last step",
     ("overflows_stack", "fifth act"): "the process died of SIGSEGV in ego's act() of step 5",
