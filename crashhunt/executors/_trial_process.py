@@ -137,10 +137,15 @@ class TrialProcess:
         try:
             code = self._run(job, reset)
         except BaseException:  # something that this process needs is damaged
-            block_signals()
-            code = 0
-            if self._box is not None:
-                self._box.announce_damage()
+            for _ in (1, 2, 3):  # a signal handler of the agent may raise here as well, whenever a function is called
+                try:
+                    block_signals()
+                    if self._box is not None:
+                        self._box.announce_damage()
+                    code = 0
+                    break
+                except BaseException:
+                    continue
         finally:
             _leave(code)
 
