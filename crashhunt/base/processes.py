@@ -84,7 +84,7 @@ def kill(pid: int) -> None:
 
 
 def resume(pid: int) -> None:
-    """Have a process go on that somebody has stopped, with SIGSTOP for example."""
+    """Resume a process that was stopped, as by SIGSTOP; nothing happens where it runs."""
     with suppress(OSError, IndexError):
         if Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0] == b"T":
             os.kill(pid, signal.SIGCONT)

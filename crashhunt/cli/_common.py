@@ -214,7 +214,7 @@ def run_trusted(
         path: what the user named; ``directory`` by default.
 
     Raises:
-        UntrustedError: the code is not trusted, and nobody is there to ask, or the user says no.
+        UntrustedError: the code is not trusted, and no terminal is there to ask at, or the user says no.
     """
     from crashhunt.crashes import refuse_untrusted, snapshot_of, trust_snapshot
 
@@ -243,7 +243,7 @@ def check_trust(bundle: Bundle, trusted: bool | None) -> None:
 
 
 def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
-    """Whether the user trusts code from now on; no where nobody is at the terminal."""
+    """Whether the user trusts code from now on; False without a terminal."""
     if as_json or not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
         return False
     print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)

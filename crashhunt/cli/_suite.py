@@ -143,7 +143,7 @@ def _asking(run: Callable[[bool], T], options: argparse.Namespace) -> T:
     """Run hunts; ask at the terminal for each that is not trusted, before the first one runs.
 
     Raises:
-        UntrustedError: a hunt is not trusted, and nobody is there to ask, or the user says no.
+        UntrustedError: a hunt is not trusted, and no terminal is there to ask at, or the user says no.
     """
     from crashhunt.suites import trust_hunt
 
