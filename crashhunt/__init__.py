@@ -1,7 +1,19 @@
 """A parallel crash-hunting fuzzer for traffic agents.
 
-``crashhunt.run``, ``prepare``, ``replay``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the command line does;
-``accelerate`` speeds highway-env up in a process of your own.
+``crashhunt.run``, ``prepare``, ``replay``, ``what_if``, ``load``, ``compare``, ``Hunt`` and ``Suite`` do what the
+command line does; ``accelerate`` speeds highway-env up in a process of your own.
+
+>>> import crashhunt
+>>> report = crashhunt.run(
+...     "merge", parallel=2, trials=100, max_steps=400,
+...     scenario="merge", seed=1, arguments={"delay_s": 1.0, "max_brake": 3.0},
+... )
+>>> report.stopped_because
+'crash'
+>>> [crash.result.outcome.value for crash in crashhunt.load("merge").crashes]
+['collision']
+>>> crashhunt.replay("merge").verdict
+'reproduced'
 """
 
 import importlib
@@ -9,20 +21,20 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from crashhunt.api import prepare, replay, run
+    from crashhunt.accelerator import accelerate
+    from crashhunt.api import prepare, replay, run, what_if
     from crashhunt.estimation import compare
     from crashhunt.hunts import Hunt, load
-    from crashhunt.simulators.accelerator import accelerate
     from crashhunt.suites import Suite
 
 from crashhunt.base.version import __version__
 
-__all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run"]
+__all__ = ["Hunt", "Suite", "__version__", "accelerate", "compare", "load", "prepare", "replay", "run", "what_if"]
 
 _HOMES = {
     "Hunt": "crashhunt.hunts",
     "Suite": "crashhunt.suites",
-    "accelerate": "crashhunt.simulators.accelerator",
+    "accelerate": "crashhunt.accelerator",
     "compare": "crashhunt.estimation",
     "load": "crashhunt.hunts",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,8 +19,9 @@ if TYPE_CHECKING:
     from crashhunt.replays import Code, ReplayReport
     from crashhunt.scenario import Scenario
     from crashhunt.snapshots import SnapshotOptions
+    from crashhunt.whatif import Counts, Intervention
 
-__all__ = ["HuntCall", "RunCall", "prepare", "replay", "run"]
+__all__ = ["HuntCall", "RunCall", "prepare", "replay", "run", "what_if"]
 
 
 @dataclass(frozen=True)
@@ -156,3 +158,67 @@ def replay(
         trusted=True if trust else None,
     )  # fmt: skip
     return replayed(bundle, options)
+
+
+@clear_calls()
+def what_if(
+    crash: Bundle | Path | str,
+    crash_id: str = "",
+    *,
+    changes: Mapping[str, Spec] | None = None,
+    from_step: int | None = None,
+    before_s: float | None = None,
+    agent: str = "",
+    arguments: Mapping[str, Spec] | None = None,
+    futures: bool = False,
+    overrule: str = "",
+    leave_out: Sequence[str] = (),
+    interventions: Sequence[Intervention] = (),
+    code: Code | None = None,
+    times: int = 0,
+    parallel: int = 0,
+    time_s: float | None = None,
+    trust: bool = False,
+) -> Counts:
+    """Run a saved crash again with changes and count the outcomes, as ``crashhunt whatif`` does.
+
+    Args:
+        crash: the directory of a hunt or of one crash, or a crash of what `load` has returned.
+        crash_id: which of a hunt; the one with the fewest steps by default.
+        changes: ``NAME`` or ``AGENT.NAME`` of an argument to another value; with a step, of the agent from then on.
+        from_step: how many steps stay as they were recorded.
+        before_s: the same, in s of simulation time before the crash.
+        agent: ``module:Name`` of an agent that takes over after that step.
+        arguments: of that agent.
+        futures: give the simulator's random generators another seed after that step, a different one in each run.
+        overrule: ``brake``, ``left``, ``right``, ``keep_lane`` or ``keep_speed``, after that step.
+        leave_out: ids of actors that do not take part.
+        interventions: further ones, of `crashhunt.whatif`.
+        code: who drives: the code of the ``snapshot``, or the ``current`` code, which is the default with ``agent``.
+        times: how many runs; 0 for 50 with ``futures``, else 1.
+        parallel: how many at a time; 0 for one per core.
+        time_s: the most wall time for all of them, in s.
+        trust: run its code even if it is neither made here nor trusted.
+
+    Returns:
+        The counts, with each run.
+
+    Raises:
+        UntrustedError: its code would run, and it is neither made here nor trusted.
+        CrashhuntError: it cannot be run, or the simulator cannot do that.
+    """
+    from crashhunt.crashes import Bundle, find_bundle
+    from crashhunt.plans import spec_words
+    from crashhunt.whatif import WhatIfOptions, interventions_of, what_if as counted
+
+    bundle = crash if isinstance(crash, Bundle) else find_bundle(Path(crash), crash_id)
+    asked = interventions_of(
+        bundle, changes=spec_words(changes), from_step=from_step, before_s=before_s, agent=agent,
+        arguments=spec_words(arguments), futures=futures, overrule=overrule, leave_out=tuple(leave_out), code=code,
+        more=tuple(interventions),
+    )  # fmt: skip
+    options = WhatIfOptions(
+        code=code or ("current" if agent else "snapshot"), times=times, time_s=time_s,
+        parallel=parallel or len(os.sched_getaffinity(0)), trusted=True if trust else None,
+    )  # fmt: skip
+    return counted(bundle, asked, options)

@@ -331,7 +331,7 @@ def bench_parallel() -> Iterator[Figure]:
 
 def bench_orchestration() -> Iterator[Figure]:
     """What a trial costs besides its steps, with few and with many trials in the ledger."""
-    from crashhunt.hunts import Ledger
+    from crashhunt.ledger import Ledger
     from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
     costs = {}
@@ -637,7 +637,7 @@ class Agent:
 def child_replay(directory: str) -> dict[str, float]:
     """Steps a second of a hunt and of the replays of its crash."""
     from crashhunt.crashes import find_bundle
-    from crashhunt.hunts import Ledger
+    from crashhunt.ledger import Ledger
     from crashhunt.replays import replay
 
     bundle = find_bundle(Path(directory))
@@ -719,7 +719,7 @@ def bench_ceiling() -> Iterator[Figure]:
 
 def _large_ledger(directory: Path, trials: int) -> None:
     """Grow a hunt to so many trials, by copying those that it has."""
-    from crashhunt.hunts import Ledger
+    from crashhunt.ledger import Ledger
 
     with closing(Ledger(directory / "ledger.sqlite", writable=True)) as ledger:
         rows = [row for _, row in ledger.intact_rows(range(trials)) if row is not None]
@@ -813,7 +813,7 @@ def child_accelerator(name: str, vehicles: str, rounds: str, how: str = "") -> d
     import highway_env
     from highway_env.road.road import Road
 
-    from crashhunt.simulators.accelerator import switch_off, switch_on
+    from crashhunt.accelerator import switch_off, switch_on
 
     warnings.simplefilter("ignore")
     assert highway_env

@@ -209,7 +209,7 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
     rng = np.random.default_rng(seed)
     measures = (*MEASURES, "probes") if probes else MEASURES
     found: dict[str, list[float]] = {name: [] for name in (*measures, "rate", "same")}
-    ran = crashed = near_ones = unmoved = 0
+    ran = crashed = relevant_actors = unmoved = 0
     with tempfile.TemporaryDirectory(prefix="crashhunt-danger-") as folder:
         place = Place(problem, Path(folder))
         while len(found["rate"]) < neighbourhoods:
@@ -224,7 +224,7 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
             for number in range(neighbours):
                 moved = place.move(values, rng)
                 near = place.run(moved, own if number % 2 == 0 else int(rng.integers(2**31)))
-                near_ones += number % 2 == 0
+                relevant_actors += number % 2 == 0
                 unmoved += number % 2 == 0 and near.digest == result.digest
                 if near.outcome is not Outcome.INVALID:
                     hits[number % 2].append(near.outcome.is_traffic_crash)
@@ -240,7 +240,7 @@ def measure(problem: str, neighbourhoods: int, neighbours: int, seed: int, *, pr
             found["rate"].append(float(np.mean([*hits[0], *hits[1]])))
             found["same"].append(float(np.mean(hits[0])))
     return {"problem": problem, "neighbourhoods": neighbourhoods, "neighbours": neighbours, "crash_rate": crashed / ran,
-            "neighbour_rate": float(np.mean(found["rate"])), "unmoved": unmoved / near_ones,
+            "neighbour_rate": float(np.mean(found["rate"])), "unmoved": unmoved / relevant_actors,
             "cpu_s": round(time.process_time(), 1),
             "correlations": {name: correlation(found[name], found["rate"]) for name in measures},
             "with_the_same_seed": {name: correlation(found[name], found["same"]) for name in measures}}  # fmt: skip

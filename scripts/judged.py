@@ -27,11 +27,10 @@ from typing import TYPE_CHECKING, Any
 
 from towns import TOWNS, make_town
 
-from crashhunt.crashes import ending_of, list_bundles, overruled_trial
+from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
 from crashhunt.replays import ReplayOptions, Rerun, prepare
-from crashhunt.replays._warm import Reruns
-from crashhunt.replays._why import _Search
-from crashhunt.triage import fault_of
+from crashhunt.replays._causes import _Search
+from crashhunt.replays._prepare import Reruns
 from crashhunt.trial import KINDS, Disturbance, Outcome
 
 if TYPE_CHECKING:

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
-DEFAULT = ("oracles", "world", "crashes", "recording", "episode", "hunts.ledger")
 ENOUGH = 0.2  # the share of survivors that is tolerated
+EQUIVALENT = ROOT / "scripts" / "equivalent_slips.json"
+_SURVEY_S = 900  # of the processor, for all nearest tests of a package; tracing makes them several times slower
 
 
 @dataclass(slots=True)
@@ -79,12 +80,45 @@ class Verdict:
         slip: which.
         noticed: ``failed`` or ``timeout``; empty where no test noticed it.
         reached: whether any of the tests runs its line.
+        reason: why no test can notice it, where `EQUIVALENT` lists it; empty else.
     """
 
     target: Target
     slip: Slip
     noticed: str
     reached: bool = True
+    reason: str = ""
+
+
+def all_packages() -> list[str]:
+    """Return the packages of crashhunt, and its modules that are in none."""
+    folder = ROOT / "crashhunt"
+    packages = [path.parent.name for path in folder.glob("*/__init__.py")]
+    modules = [path.stem for path in folder.glob("*.py") if not path.stem.startswith("__")]
+    return sorted(packages) + sorted(modules)
+
+
+def equivalents() -> dict[tuple[str, str], str]:
+    """Return the slips that change nothing that a test could see: module and diff to the reason.
+
+    A person has looked at each. The diff names the slip, as the report prints it: line numbers change too often.
+    """
+    listed = json.loads(EQUIVALENT.read_text(encoding="utf-8"))
+    return {(one["module"], "\n".join(one["diff"])): one["reason"] for one in listed}
+
+
+def without_equivalents(
+    slips: list[tuple[Target, Slip]], listed: dict[tuple[str, str], str]
+) -> tuple[list[tuple[Target, Slip]], list[Verdict]]:
+    """Divide slips into those that are tried and those that are listed, which no test could notice."""
+    tried, known = [], []
+    for target, slip in slips:
+        reason = listed.get((str(target.file), slip.diff(target.source)), "")
+        if reason:
+            known.append(Verdict(target, slip, "", reason=reason))
+        else:
+            tried.append((target, slip))
+    return tried, known
 
 
 def modules_of(name: str) -> list[Path]:
@@ -102,16 +136,19 @@ def nearest_tests(file: Path) -> tuple[Path, ...]:
     """Return the test files that lie as a module does: of its name, or of its folder, or of the folder above that."""
     words = file.stem.strip("_").split("_")
     inner = ROOT / "tests" / file.parent.relative_to("crashhunt")
+    end_to_end = ROOT / "tests" / "e2e"
     for folder in (inner, *inner.parents):
         if folder == ROOT / "tests":
             break
+        if not folder.is_dir():
+            continue
         for count in range(len(words), 0, -1):  # of `_ledger_file`, those of `ledger` are better than none
             found = sorted(folder.glob(f"test_{'_'.join(words[:count])}*.py"))
             if found:
                 return tuple(path.relative_to(ROOT) for path in found)
-        if folder.is_dir():
-            return tuple(sorted(path.relative_to(ROOT) for path in folder.glob("test_*.py")))
-    return ()
+        return tuple(sorted(path.relative_to(ROOT) for path in folder.glob("test_*.py")))
+    # Commands, and what is in no package, have tests that run the command line.
+    return tuple(path.relative_to(ROOT) for path in (end_to_end / f"test_{'_'.join(words)}.py",) if path.is_file())
 
 
 def targets_of(name: str, tests: Sequence[Path] | None = None) -> list[Target]:
@@ -128,19 +165,19 @@ def say(line: str) -> None:
         print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
 
 
-def survey(slot: Slot, targets: list[Target]) -> None:
+def survey(slot: Slot, targets: list[Target]) -> str:
     """Run the tests of some modules without a slip, and note what they reach.
 
-    Raises:
-        SystemExit: they fail.
+    Returns:
+        What pytest prints, where they fail; else empty.
     """
     files = sorted({str(path) for target in targets for path in target.tests})
     if not files:
-        return
+        return ""
     watcher = Watcher([str(slot.tree / target.file) for target in targets])
-    slot.start(files, seconds=300, watcher=watcher)
+    slot.start(files, seconds=_SURVEY_S, watcher=watcher)
     if slot.wait() != "passed":
-        raise SystemExit(f"the tests fail without any slip:\n{slot.said()}")
+        return slot.said() or "it took too long"
     facts = json.loads((slot.tree / ".facts").read_text(encoding="utf-8"))
     for target in targets:
         mine = {test for test in facts["seconds"] if test.partition("::")[0] in map(str, target.tests)}
@@ -151,6 +188,7 @@ def survey(slot: Slot, targets: list[Target]) -> None:
     for name in facts["modules"]:  # so that the forks have them
         with contextlib.suppress(Exception):
             importlib.import_module(name)
+    return ""
 
 
 def judge(slots: list[Slot], name: str, chosen: list[tuple[Target, Slip]]) -> list[Verdict]:
@@ -183,11 +221,14 @@ def judge(slots: list[Slot], name: str, chosen: list[tuple[Target, Slip]]) -> li
 
 
 def counted(name: str, verdicts: list[Verdict]) -> dict[str, Any]:
-    """Return the figures of a package or a module."""
+    """Return the figures of a package or a module; slips that are equivalent are counted apart."""
+    tried = [verdict for verdict in verdicts if not verdict.reason]
+    equivalent, verdicts = len(verdicts) - len(tried), tried
     survived = sum(not verdict.noticed for verdict in verdicts)
     return {
         "name": name,
         "slips": len(verdicts),
+        "equivalent": equivalent,
         "survived": survived,
         "unreached": sum(not verdict.reached for verdict in verdicts),
         "timeouts": sum(verdict.noticed == "timeout" for verdict in verdicts),
@@ -209,10 +250,13 @@ def shown(facts: dict[str, Any]) -> str:
     for slip in facts["survivors"]:
         reached = "" if slip["reached"] else " (no test reaches it)"
         lines += [f"{slip['where']}: {slip['what']}{reached}", slip["diff"], ""]
-    lines.append(f"{'not noticed by the nearest tests':<44}{'slips':>7}{'not':>7}{'share':>8}")
+    lines += [f"{slip['where']}: {slip['what']}: equivalent: {slip['reason']}" for slip in facts["equivalent"]]
+    lines += [f"{EQUIVALENT.name} lists a slip of {module} that is none any more" for module in facts["stale"]]
+    lines.append(f"{'not noticed by the nearest tests':<44}{'slips':>7}{'not':>7}{'share':>8}{'equivalent':>12}")
     for kind in ("modules", "packages"):
         for row in facts[kind]:
-            lines.append(f"{row['name']:<44}{row['slips']:>7}{row['survived']:>7}{row['share']:>8.0%}")
+            figures = f"{row['slips']:>7}{row['survived']:>7}{row['share']:>8.0%}{row['equivalent']:>12}"
+            lines.append(f"{row['name']:<44}{figures}")
         lines.append("")
     return "\n".join(lines)
 
@@ -220,7 +264,10 @@ def shown(facts: dict[str, Any]) -> str:
 def parsed() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(prog="scripts/mutate", description=__doc__.splitlines()[0])
-    parser.add_argument("--module", action="append", help="a package or module of crashhunt; may be given again")
+    parser.add_argument("--module", action="append", help="a package or module; may be given again (default: all)")
+    parser.add_argument(
+        "--part", type=_part, default=(1, 1), metavar="I/N", help="the I-th of N shares of all packages"
+    )
     parser.add_argument("--tests", action="append", type=Path, metavar="FILE", help="these, instead of the nearest")
     parser.add_argument("--sample", type=int, metavar="N", help="so many slips of each package, instead of all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default: 0)")
@@ -230,21 +277,39 @@ def parsed() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def _part(text: str) -> tuple[int, int]:
+    part, parts = map(int, text.split("/"))
+    if not 1 <= part <= parts:
+        raise ValueError
+    return part, parts
+
+
 def main() -> int:
     """Run, and return 1 where too many slips of a package survive."""
     options = parsed()
     for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell has started it in the background
         signal.signal(number, signal.default_int_handler)
     verdicts: list[Verdict] = []
-    asked = options.module or DEFAULT
+    part, parts = options.part
+    asked = options.module or all_packages()[part - 1 :: parts]
+    failed: list[str] = []
+    listed = equivalents()
+    seen: set[tuple[str, str]] = set()
     everything = {name: targets_of(name, options.tests) for name in asked}
     with tempfile.TemporaryDirectory(prefix="crashhunt-mutate-") as folder:
         slots = [Slot(Path(folder) / str(number)) for number in range(options.parallel)]
         try:
             for name, targets in everything.items():
                 say(f"{name}: the tests without any slip")
-                survey(slots[0], targets)
+                failure = survey(slots[0], targets)
+                if failure:  # the other packages can still be measured
+                    failed.append(name)
+                    print(f"{name}: the tests fail without any slip:\n{failure}", file=sys.stderr)
+                    continue
                 slips = [(target, slip) for target in targets for slip in find_slips(target.source)]
+                seen.update((str(target.file), slip.diff(target.source)) for target, slip in slips)
+                slips, known = without_equivalents(slips, listed)
+                verdicts += known
                 if options.sample is not None and options.sample < len(slips):
                     slips = random.Random(f"{options.seed} {name}").sample(slips, options.sample)
                 slips.sort(key=lambda found: (found[0].file, found[1].start))
@@ -257,13 +322,20 @@ def main() -> int:
             say("")
     verdicts.sort(key=lambda verdict: (verdict.target.file, verdict.slip.start))
     files = dict.fromkeys(verdict.target.file for verdict in verdicts)
-    facts = {
+    facts: dict[str, Any] = {
         "modules": [counted(str(file), [each for each in verdicts if each.target.file == file]) for file in files],
-        "packages": [counted(name, [each for each in verdicts if each.target.package == name]) for name in asked],
-        "survivors": [described(verdict) for verdict in verdicts if not verdict.noticed],
+        "packages": [
+            counted(name, [each for each in verdicts if each.target.package == name])
+            for name in asked
+            if name not in failed
+        ],
+        "failed": failed,
+        "survivors": [described(verdict) for verdict in verdicts if not verdict.noticed and not verdict.reason],
+        "equivalent": [described(verdict) | {"reason": verdict.reason} for verdict in verdicts if verdict.reason],
+        "stale": sorted(module for module, diff in listed if module in map(str, files) and (module, diff) not in seen),
     }
     print(json.dumps(facts, indent=1) if options.json else shown(facts))
-    return int(any(row["share"] > options.at_most for row in facts["packages"]))
+    return int(bool(failed or facts["stale"]) or any(row["share"] > options.at_most for row in facts["packages"]))
 
 
 if __name__ == "__main__":

@@ -14,10 +14,9 @@ from peers import PEERS
 from problems import REAL
 from search_pool import trials_on
 
-from crashhunt.crashes import write_bundle
+from crashhunt.crashes import signature_of, write_bundle
 from crashhunt.hunts import spec_of
 from crashhunt.plans import Request, plan, sampler_of
-from crashhunt.triage import signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -32,8 +32,11 @@ _TWINS = {
     "min": "max", "minimum": "maximum", "any": "all", "sin": "cos", "ceil": "floor", "startswith": "endswith",
 }  # fmt: skip
 _TWINS |= {twin: name for name, twin in _TWINS.items()}
-_ORDER_DOES_NOT_MATTER = {"min", "max", "minimum", "maximum", "hypot", "isinstance", "startswith", "endswith"}
+_ORDER_DOES_NOT_MATTER = {
+    "min", "max", "minimum", "maximum", "hypot", "isinstance", "startswith", "endswith", "suppress",
+}  # fmt: skip
 _TYPES = {"bool", "int", "float", "str", "bytes", "dict", "list", "tuple", "set", "type"}
+_TYPES |= {"Callable", "Literal", "Mapping", "Optional", "Sequence", "Union"}  # of aliases; nothing runs by their order
 _TINY = 1e-3  # a tolerance; twice as much of it is no slip, a thousand times is
 
 

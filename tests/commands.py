@@ -31,7 +31,7 @@ CRASHHUNT = Path(sys.executable).parent / "crashhunt"
 IMPORTED = ("cli", "api", "crashes", "executors", "hunts", "plans", "recording", "replays", "report", "snapshots")
 # What these import while they run, and whoever writes, reads and packs hunts; and what one command does that is rare.
 _WHILE_RUNNING = (
-    "crashhunt.agents._forms", "crashhunt.scenario.backends.sumo._check", "crashhunt.scenario.backends.sumo._xml",
+    "crashhunt.agents._protocol", "crashhunt.scenario.backends.sumo._check", "crashhunt.scenario.backends.sumo._files",
     "encodings.cp437", "gzip", "numpy.ma", "rich._emoji_codes", "rich.progress", "tomli_w", "urllib.request",
     "xml.etree.ElementTree", "xml.sax",
 )  # fmt: skip
@@ -252,8 +252,9 @@ class Hunt:
 
 
 if __name__ == "__main__":
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())  # as in warm.py
     sys.path[0] = str(CRASHHUNT.parent)  # where the script lies, and not these tests
-    import crashhunt.base.keeper
+    import crashhunt.base.processes
     import crashhunt.suites._processes
 
     for package in IMPORTED:
@@ -263,7 +264,7 @@ if __name__ == "__main__":
     for name in _WHILE_RUNNING:
         importlib.import_module(name)
     del sys.modules["warm"]  # else a snapshot would have it, as whatever has been imported and is not installed
-    crashhunt.base.keeper.subprocess = Warm(socket.socket(fileno=int(sys.argv[2])), json.loads(sys.argv[3])).subprocess
+    crashhunt.base.reaper.subprocess = Warm(socket.socket(fileno=int(sys.argv[2])), json.loads(sys.argv[3])).subprocess
     crashhunt.suites._processes.subprocess = types.SimpleNamespace(Popen=Hunt, DEVNULL=subprocess.DEVNULL)
     PARSER = crashhunt.cli.make_parser()
     crashhunt.cli.make_parser = lambda: PARSER  # which every command would make again, and is the same in all of them

@@ -215,7 +215,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def plain_highway_env() -> Iterator[None]:
     """highway-env without the accelerator and with its own classes, before a test and after it, whatever it does."""
-    from crashhunt.simulators.accelerator import switch_off
+    from crashhunt.accelerator import switch_off
     from crashhunt.simulators.highway import restore_classes
 
     switch_off()
@@ -238,10 +238,10 @@ def _modules_of_its_own() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _warm(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test itself replays, end to end, starts as little as what its commands do."""
-    if request.path.parent.name in ("e2e", "contracts"):
+    """What a test itself hunts and replays starts as little as what its commands do."""
+    if request.path.parent.name != "base":
         monkeypatch.setattr(
-            "crashhunt.base.keeper.subprocess",
+            "crashhunt.base.reaper.subprocess",
             SimpleNamespace(
                 Popen=lambda *words, **options: _commands().warm.popen(*words, **options),
                 TimeoutExpired=subprocess.TimeoutExpired,

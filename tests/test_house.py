@@ -54,7 +54,7 @@ def test_nothing_private_is_imported_from_outside_its_package():
 
 
 # What other libraries have in one version and not in another, or in one of their classes.
-_OTHERS = ("recording/_schemas.py", "simulators/accelerator/", "simulators/highway/")
+_OTHERS = ("recording/_mcap.py", "accelerator/", "simulators/highway/")
 
 
 def asked_by_name(file: Path) -> list[str]:
@@ -70,7 +70,7 @@ def asked_by_name(file: Path) -> list[str]:
 
 
 def test_optional_faculties_are_protocols():
-    """Of simulators and agents see their ``_protocol.py``, and `crashhunt.base.faculties`."""
+    """Of simulators and agents see their ``_protocol.py``, and `crashhunt.base.capabilities`."""
     files = [file for file in ROOT.rglob("*.py") if not str(file.relative_to(ROOT)).startswith(_OTHERS)]
     assert [line for file in files for line in asked_by_name(file)] == []
 
@@ -80,7 +80,7 @@ HOMES = (
     "scenario/backends/",
     "simulators/sumo/",
     "simulators/highway/",
-    "simulators/accelerator/",
+    "accelerator/",
     "simulators/gym.py",
 )
 NAMED_ALL_THE_SAME = {

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # What Python and its libraries look at when they start.
 _AT_START = ("PYTHON", "LC_", "LANG", "LD_", "COVERAGE", "OMP_", "OPENBLAS_")
-_SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
+_SET_LATER = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX")
 _OF_SIMULATORS = {"gym": "gymnasium", "highway": "crashhunt.simulators.highway._lean", "sumo": "libsumo"}
 _MESSAGE = 1 << 20
 _FREE = 500  # where a process has no files of its own
@@ -118,7 +118,7 @@ class Warm:
 
     @property
     def subprocess(self) -> types.SimpleNamespace:
-        """What `crashhunt.base.keeper` uses of the module."""
+        """What `crashhunt.base.processes` uses of the module."""
         return types.SimpleNamespace(Popen=self.popen, TimeoutExpired=subprocess.TimeoutExpired)
 
     def popen(self, words: Sequence[str], **options: Any) -> Forked | subprocess.Popen[bytes]:
@@ -366,6 +366,7 @@ def _be_keeper(request: dict[str, Any], descriptors: Sequence[int]) -> NoReturn:
     os.environ.update(request["environment"])
     os.chdir(request["folder"])
     sys.dont_write_bytecode = bool(os.environ.get("PYTHONDONTWRITEBYTECODE"))
+    sys.pycache_prefix = os.environ.get("PYTHONPYCACHEPREFIX") or None
     sys.path[:0] = map(os.path.abspath, path_of(os.environ))
     script, *_ = sys.argv = request["words"]
     if "numpy" in sys.modules:
@@ -410,6 +411,8 @@ def _put_back(begins_with: str) -> None:
 
 
 if __name__ == "__main__":
+    # A process that starts a reaper blocks signals meanwhile, and may be the first that needs this one.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
     _remember()
     _compile()
     _import_ours()

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from crashhunt.agents._forms import meta_actions, wanted_meta_action
+from crashhunt.agents._protocol import meta_actions, wanted_meta_action
 from crashhunt.trial import Argument, Range
 
 if TYPE_CHECKING:
@@ -73,8 +73,8 @@ def off_path(row: Sequence[float], *, lateral: float, curvature: float) -> float
     """Return how far an actor is from a path, in m; 0 where it may well be on it.
 
     A bend begins or ends somewhere between here and there, and an observation does not say where. The path of
-    constant curvature is one extreme, the arc that ends in the actor's own heading is the other; an actor in between
-    is taken to be on the path, which errs on the safe side.
+    constant curvature is one extreme, the arc that ends in the actor's own heading is the other. An actor in between
+    counts as on the path, because braking for it is safe.
 
     Args:
         row: of the actor.
@@ -94,7 +94,7 @@ def find_leader(
 ) -> Leader | None:
     """Return the nearest vehicle ahead whose centre is within ``half_width`` of a path.
 
-    Oncoming traffic is nobody's leader: it keeps to its own side.
+    Oncoming traffic is never a leader: it keeps to its own side.
 
     Args:
         observation: in the default layout.
@@ -155,7 +155,7 @@ def idm_acceleration(
 
     Args:
         speed: own, in m/s.
-        leader: whom to follow; None on a free road.
+        leader: the vehicle ahead; None on a free road.
         desired_speed: on a free road, in m/s.
         headway_s: time gap, in s.
         standstill_gap: in m; leaves room for the half of a truck that is longer than that of a car.

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from crashhunt.base.capabilities import supports
+from crashhunt.simulators import HasMeanings
 
-__all__ = ["Agent", "Closes", "DrawsPanels", "NeedsLibraries"]
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from gymnasium import Space
+
+
+__all__ = ["Agent", "Closes", "DrawsPanels", "NeedsLibraries", "meta_actions", "wanted_meta_action"]
 
 
 @runtime_checkable
@@ -15,9 +21,11 @@ class Agent(Protocol):
     """Drives one vehicle.
 
     An agent is written as ``package.module:attribute`` and called with its arguments as keywords, once per trial and
-    vehicle; a parameter named ``observation_space`` or ``action_space`` receives the Gymnasium space, and one named
-    ``step_length_s`` the time from one step to the next, in s. What not every agent can do is a protocol of its own:
-    `DrawsPanels` and `Closes`; and `NeedsLibraries` of what makes it. Whoever has the method or attribute offers it.
+    vehicle. A parameter named ``observation_space`` or ``action_space`` receives the Gymnasium space. A parameter named
+    ``step_length_s`` receives the time from one step to the next, in s.
+
+    Optional capabilities are separate protocols: `DrawsPanels` and `Closes`, and `NeedsLibraries` for the factory of an
+    agent. An object has a capability if it has the methods or attributes of the protocol.
     """
 
     def reset(self, seed: int) -> None:
@@ -37,7 +45,7 @@ class DrawsPanels(Protocol):
     def panels(self) -> object:
         """Return panels in a nest of mappings and sequences, whose keys are their labels.
 
-        Called after `Agent.act`, and only when somebody renders: it must not change what the agent does next.
+        Called after `Agent.act`, and only during rendering: it must not change what the agent does next.
         """
 
 
@@ -54,3 +62,43 @@ class NeedsLibraries(Protocol):
     @property
     def libraries(self) -> Sequence[str]:
         """Modules to import before any trial's time runs; one that is missing is left for the agent to tell."""
+
+
+# How agents that think in speeds and lanes say so in discrete meta-actions.
+
+_ALL = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
+_FASTER, _SLOWER = 0.5, -0.75  # m/s²
+
+
+def meta_actions(space: Space[object] | None) -> Mapping[str, int] | None:
+    """Return the numbers of the meta-actions; None where actions are (target speed, lane change).
+
+    What a space does not have, such as a lane change where only the speed is controlled, is IDLE.
+
+    Args:
+        space: of the vehicle; the meanings of its numbers are its ``meanings``, or those of highway-env where there
+            are five.
+
+    Raises:
+        ValueError: its actions are neither.
+    """
+    if space is None:
+        return None
+    from gymnasium.spaces import Dict, Discrete, Tuple
+
+    if isinstance(space, Tuple | Dict):
+        return None
+    meanings: Sequence[str] = ()
+    if isinstance(space, Discrete):
+        meanings = space.meanings if supports(space, HasMeanings) else _ALL if space.n == len(_ALL) else ()
+    numbers = {name: number for number, name in enumerate(meanings)}
+    if "IDLE" not in numbers:
+        raise ValueError(f"drives by (target speed, lane change) or meta-actions, not by {space}")
+    return {name: numbers.get(name, numbers["IDLE"]) for name in _ALL}
+
+
+def wanted_meta_action(acceleration: float, change: int = 0) -> str:
+    """Return the name of the meta-action nearest to an acceleration, in m/s², and a lane change (1 is to the left)."""
+    if change:
+        return "LANE_LEFT" if change > 0 else "LANE_RIGHT"
+    return "FASTER" if acceleration > _FASTER else "SLOWER" if acceleration < _SLOWER else "IDLE"

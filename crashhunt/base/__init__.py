@@ -1,7 +1,6 @@
-"""What everything else stands on: errors, names of plugins, files, processes, text. It knows nothing of traffic.
+"""Foundations of every other package: errors, plugin names, files, processes and text. It knows nothing of traffic.
 
-Its modules have nothing to do with each other, so each is imported by its own name; every other package is entered by
-its door, the names that its ``__init__`` offers.
+Its modules are independent, so import each by its own name. Every other package offers its names in its ``__init__``.
 """
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""Calls from Python that cannot be meant: the same clear line as on the command line, not a bare TypeError."""
+"""Calls from Python with wrong arguments: raise the same clear line as the command line, not a bare TypeError."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar
 
 from crashhunt.base.errors import CallError
-from crashhunt.base.names import one_of
+from crashhunt.base.text import one_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def clear_calls() -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a public function: a keyword that it does not have is a `CallError` that names the likely one."""
+    """Return a decorator for public functions: an unknown keyword raises a `CallError` that proposes the likely one."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(function)
@@ -37,7 +37,7 @@ def clear_calls() -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def clear_constructor(kind: type[T]) -> type[T]:
-    """Decorate a public class in the same way: its constructor refuses keywords that it does not have."""
+    """Return a public class whose constructor raises a `CallError` for unknown keywords, as with `clear_calls`."""
     made: Any = kind
     constructor = made.__init__
     known = inspect.signature(kind)
@@ -52,7 +52,7 @@ def clear_constructor(kind: type[T]) -> type[T]:
 
 
 class Documented(Protocol):
-    """An argument that says itself what it means."""
+    """An argument that describes itself."""
 
     @property
     def line(self) -> str:
@@ -62,9 +62,9 @@ class Documented(Protocol):
 def called_with(
     shape: Callable[P, T], *, documents: Iterable[Documented] = ()
 ) -> Callable[[Callable[[T], R]], Callable[P, R]]:
-    """Decorate a public function that receives one dataclass: it is called as the dataclass is constructed.
+    """Return a decorator for a public function of one dataclass, which is then called with the fields of the dataclass.
 
-    So the fields of the dataclass are its arguments, for type checkers and editors too, and keywords that it does not
+    Type checkers and editors see the fields as its arguments. Unknown keywords are refused as by `clear_calls`.
     have are refused as by `clear_calls`.
 
     Args:
@@ -89,7 +89,7 @@ def called_with(
 
 
 def _signature_of(shape: Any) -> inspect.Signature:
-    """The signature of a dataclass's constructor, with what is made anew for every call, not with a ``<factory>``."""
+    """Return the signature of a dataclass's constructor, with default values in place of ``<factory>``."""
     known = inspect.signature(shape)
     made = {item.name: item.default_factory() for item in fields(shape) if item.default_factory is not MISSING}
     return known.replace(
@@ -101,7 +101,7 @@ def _signature_of(shape: Any) -> inspect.Signature:
 
 
 def _with_arguments(doc: str, of_shape: str, documents: Iterable[Documented]) -> str:
-    """A docstring with the arguments of a dataclass, as `help` shows them."""
+    """Return a docstring with the arguments of a dataclass added, as `help` shows them."""
     _, _, arguments = inspect.cleandoc(of_shape).partition("Args:\n")
     lines = [*arguments.rstrip().splitlines(), *(f"    {known.line}" for known in documents)]
     purpose, parts, rest = inspect.cleandoc(doc).partition("\n\nRaises:")
@@ -126,7 +126,7 @@ def _keywords(signature: inspect.Signature) -> dict[str, None]:
 
 
 def _shown(signature: inspect.Signature) -> str:
-    """What has to be given, such as ``(directory, parallel, trials, max_steps, …)``."""
+    """Return the required arguments, such as ``(directory, parallel, trials, max_steps, …)``."""
     needed = [
         f"*{name}" if parameter.kind is parameter.VAR_POSITIONAL else name
         for name, parameter in signature.parameters.items()

@@ -1,4 +1,4 @@
-"""Draws from weights."""
+"""Random draws with weights."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ T = TypeVar("T")
 
 
 def one_of(weights: Mapping[T, float], rng: np.random.Generator) -> T:
-    """Draw one of some values, each as likely as its share of all weights, which are positive."""
+    """Return one of some values, drawn with probability proportional to its weight; weights are positive."""
     place = rng.random() * sum(weights.values())
     for value, weight in weights.items():
         place -= weight
         if place < 0:
             return value
-    return list(weights)[-1]  # where rounding has left nothing over
+    return list(weights)[-1]  # rounding may leave a remainder after the last weight

@@ -2,10 +2,10 @@
 
 ::
 
-    CrashhuntError                 exit code 2 unless said otherwise
-    ├── UsageError                 a command line, call or setting that cannot be meant
+    CrashhuntError                 exit code 2 unless stated otherwise
+    ├── UsageError                 a command line, call or setting that is not valid
     │   ├── ArgumentError          an argument specification or value
-    │   ├── CallError              a call from Python with arguments that there are not; a TypeError as well
+    │   ├── CallError              a call from Python with unknown or missing arguments; a TypeError as well
     │   └── UntrustedError         code that this user has neither made on this machine nor trusted
     ├── ScenarioError              a scenario file: which file, which key, which value
     │   └── NoValidTrialError      no trial in it can be set up; exit code 3
@@ -18,7 +18,7 @@
     └── EpisodeError               raised inside an episode; becomes the trial's outcome
         ├── InvalidEpisodeError    the episode could not be set up
         ├── ActionError            the agent returned something outside its action space
-        └── SimulatorError         the simulator gave up
+        └── SimulatorError         the simulator failed
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import errno
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import ErrorData
+    from crashhunt.base.json_types import ErrorData
 
 __all__ = [
     "DISK",
@@ -53,10 +53,10 @@ __all__ = [
 ]
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""What an `OSError` says where a disk, or somebody's share of it, is full."""
+"""Error numbers of an `OSError` where a disk, or the user's quota on it, is full."""
 
 DISK = FULL | {errno.EIO, errno.EROFS}
-"""What an `OSError` says where the disk is to blame, and not whoever closed or leaked files."""
+"""Error numbers of an `OSError` that a disk causes, in contrast to code that closes or leaks file descriptors."""
 
 
 class CrashhuntError(Exception):
@@ -91,7 +91,7 @@ class CrashhuntError(Exception):
 
     @classmethod
     def from_json(cls, data: ErrorData) -> CrashhuntError:
-        """Rebuild what `to_json` returned, of any version."""
+        """Rebuild the error that `to_json` of any version returned."""
         said = data["error"]
         return cls(str(said.get("message", "")), fix=str(said.get("fix", "")), where=str(said.get("where", "")))
 
@@ -101,7 +101,7 @@ def _rebuild(kind: type[CrashhuntError], message: str, fix: str, where: str) -> 
 
 
 class UsageError(CrashhuntError):
-    """A command line, call or setting that cannot be meant."""
+    """A command line, call or setting that is not valid."""
 
 
 class ArgumentError(UsageError):
@@ -109,7 +109,7 @@ class ArgumentError(UsageError):
 
 
 class CallError(UsageError, TypeError):
-    """A call from Python with arguments that there are not, or without some that there must be."""
+    """A call from Python with an unknown argument, or without a required one."""
 
 
 class UntrustedError(UsageError):
@@ -127,7 +127,7 @@ class NoValidTrialError(ScenarioError):
 
 
 class PluginError(CrashhuntError):
-    """A name or ``module:attribute`` that leads nowhere."""
+    """A plugin name or ``module:attribute`` that cannot be found or imported."""
 
 
 class HuntDirectoryError(CrashhuntError):
@@ -163,7 +163,7 @@ class ActionError(EpisodeError):
 
 
 class SimulatorError(EpisodeError):
-    """The simulator gave up."""
+    """The simulator failed."""
 
 
 def remedy(error: OSError) -> str:

@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, also after the power went."""
+"""Files that are complete or absent, even after a power failure."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 
 __all__ = ["cannot_write", "exchange", "is_empty_folder", "put_in_place", "sync_folder", "sync_tree", "whole_file"]
 
-_AT_ONCE = 8  # more are not faster
-_HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD of <fcntl.h>, and of <linux/fs.h>
+_THREADS = 8  # fsync calls that overlap; more threads are not faster
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # of <fcntl.h> and <linux/fs.h>
 
 
 @contextmanager
 def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Iterator[Path]:
-    """Yield a name beside a file to write to, which becomes the file in the end, and is gone after an error.
+    """Yield a temporary name in the folder of a file; the result replaces the file at the end, or is removed on error.
 
     Args:
         path: of the file.
-        lasting: whether it is on the disk, its name too, before this returns. What nobody needs after the process that
-            reads it has ended, or after the power went, does without.
-        noted: whether the next command removes what is left of it if this process is killed. A file inside of a folder
-            that is temporary itself does without.
+        lasting: whether content and name are synced to the disk before this returns. Set it to False for files that
+            are useless after a crash of the process or a power failure.
+        noted: whether the next command removes the temporary file if this process is killed. Set it to False inside
+            a folder that is itself temporary.
 
     Raises:
         HuntDirectoryError: it cannot be written.
@@ -50,7 +50,7 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
 
 
 def put_in_place(made: Path, final: Path) -> None:
-    """Rename a folder to where it is to stay; one that is there already gets the name of the new one.
+    """Rename a folder to its final name; a folder that has this name already is replaced.
 
     Both are renamed at once where the system can do that. Elsewhere the old folder is removed first.
 
@@ -63,18 +63,18 @@ def put_in_place(made: Path, final: Path) -> None:
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Let two files or folders have each other's name, at once; return whether the system can."""
+    """Exchange the names of two files or folders atomically; return whether the system supports that."""
     import ctypes  # which no other command needs
 
     try:
         exchange = ctypes.CDLL(None).renameat2
     except (AttributeError, OSError, TypeError):  # an old or another C library
         return False
-    return bool(exchange(_HERE, os.fsencode(first), _HERE, os.fsencode(second), _RENAME_EXCHANGE) == 0)
+    return bool(exchange(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), _RENAME_EXCHANGE) == 0)
 
 
 def sync_tree(folder: Path) -> None:
-    """Have a folder with everything in it on the disk before its name says that it is whole.
+    """Sync a folder and everything in it to the disk, so that its final name implies complete content.
 
     Raises:
         OSError: the disk is full, or broken.
@@ -83,10 +83,10 @@ def sync_tree(folder: Path) -> None:
     for parent, _, names in os.walk(folder):
         folders.append(parent)
         files += [path for name in names if os.path.isfile(path := os.path.join(parent, name))]  # noqa: PTH113, PTH118
-    # Several take a disk as long as one: a file system with a journal writes it once for all of them.
-    with ThreadPoolExecutor(_AT_ONCE) as threads:
-        for _ in threads.map(_sync_all, [files[share::_AT_ONCE] for share in range(_AT_ONCE)]):
-            pass  # which raises what it has raised
+    # A file system with a journal commits once for several concurrent syncs.
+    with ThreadPoolExecutor(_THREADS) as threads:
+        for _ in threads.map(_sync_all, [files[share::_THREADS] for share in range(_THREADS)]):
+            pass  # iterating raises the errors of the threads
         for _ in threads.map(sync_folder, folders):
             pass
 
@@ -101,7 +101,7 @@ def is_empty_folder(path: Path) -> bool:
 
 
 def sync_folder(*folders: str | Path) -> None:
-    """Have the names in folders on the disk, where the file system can do that."""
+    """Sync the directory entries of folders to the disk, where the file system supports that."""
     with suppress(OSError):  # some network file systems cannot
         for folder in folders:
             _sync(folder)

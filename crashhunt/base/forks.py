@@ -1,8 +1,21 @@
-"""Copies of this process, made by fork: each goes on exactly where it is, writes to nothing of it, and ends with it.
+"""Forks of this process that continue at its current step, cannot change its files, and end with it.
 
-A file that is being read has its place in common with whoever else has it open: SUMO reads a long file of routes bit by
-bit. So a copy opens it anew, at the same place. What is written to is replaced by something of the copy's own. What a
-copy cannot have is refused: threads, devices, connections to other processes, memory that is shared with them.
+A fork gets a copy of the memory for free. This module separates everything else that fork(2) leaves shared.
+
+Invariant: a fork changes no file or pipe through a descriptor that it has inherited, and does not outlive its parent.
+Every open descriptor is therefore handled in one of four ways before the work begins (`_replacement`):
+
+- A file that is read is opened again at the same position. Parent and fork otherwise share one position, and SUMO
+  reads long route files in parts.
+- A file that is written is replaced by ``/dev/null``, and one that is also read by a private copy in memory.
+- A descriptor of crashhunt itself is closed.
+- Threads, devices, connections and shared memory cannot be copied, so the fork is refused (`CannotForkError`).
+
+Why fork, and not a saved state of the simulator: SUMO's `loadState` does not continue as the original run did, even
+with saved random generators. A fork copies the whole memory, including that of libraries and of the agent.
+
+Cost: the kernel copies page tables, and later every page that parent or fork writes; ``gc.freeze`` keeps Python's
+garbage collector from touching the rest. Sources: fork(2), prctl(2), proc(5).
 """
 
 from __future__ import annotations
@@ -20,50 +33,111 @@ import sys
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from crashhunt.base.answers import NoAnswer, explain_silence, parse_answer, took_longer
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, has_child, kill
+from crashhunt.base.signals import describe_death, is_sent_from_outside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
     from typing import TextIO
 
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.json_types import Plain
+
 
 __all__ = [
     "MEMORY",
     "CannotForkError",
     "Copy",
     "Held",
+    "NoAnswer",
     "NoProcessError",
+    "SuspendedFork",
     "Watchdog",
     "children_now",
     "copying",
     "end_orphans",
     "ended",
     "ends",
+    "explain_silence",
     "fork",
     "held",
+    "parse_answer",
     "shared_memory",
     "threads",
+    "took_longer",
     "watchdog",
 ]
 
+
+# Answers of forks of this process, and reasons why an answer is missing.
+
+_ENDS_S = 1.0  # wall time within which a process with a closed pipe ends
+_LOOK_EVERY_S = 0.002  # between two checks of whether a process has ended
+
+
+@dataclass(frozen=True, slots=True)
+class NoAnswer:
+    """Why a copy did not answer.
+
+    Args:
+        why: a clause without a subject: "was killed by SIGKILL", "raised ValueError: …".
+        is_from_outside: whether another process or the system may be the cause, so that another copy may answer.
+    """
+
+    why: str
+    is_from_outside: bool = False
+
+
+def parse_answer(received: bytes | bytearray) -> tuple[Plain | None, str, NoAnswer | None]:
+    """Parse what a fork has sent: return its answer, the text of its exception, and the reason for a missing answer.
+
+    Code of the agent may have written to the same pipe, so the data may be anything.
+    """
+    try:
+        said = json.loads(received)
+        found, raised = said.get("answer"), str(said.get("raised", ""))
+    except (ValueError, AttributeError):
+        return None, "", NoAnswer("sent data that are no answer")
+    if not isinstance(found, dict):
+        return None, raised, NoAnswer(f"raised {raised}" if raised else "sent data that are no answer")
+    return found, raised, None
+
+
+def took_longer(timeout_s: float) -> NoAnswer:
+    """Return the reason for a missing answer after a time limit, in s of wall time."""
+    return NoAnswer(f"took longer than {timeout_s:g} s")
+
+
+def explain_silence(pid: int) -> NoAnswer:
+    """Return why a fork with a closed pipe has not answered; the caller still has to end its process."""
+    deadline = time.monotonic() + _ENDS_S
+    try:
+        while (end := os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)) is None:
+            if time.monotonic() > deadline:
+                return NoAnswer("closed its connection to the trial")
+            time.sleep(_LOOK_EVERY_S)
+    except ChildProcessError:
+        return NoAnswer("ended, and code of the agent has taken its exit code")
+    exit_code = end.si_status if end.si_code == os.CLD_EXITED else -end.si_status
+    return NoAnswer(describe_death(exit_code), is_sent_from_outside(exit_code))
+
+
 MEMORY = "crashhunt-copy"
-"""What memory is called that is a copy's own, and that a copy of it gets anew from whoever knows what it is."""
+"""Prefix of the names of memory files that belong to one fork. A fork of a fork replaces such a file explicitly."""
 _FILE = "crashhunt-file"
 _HARMLESS = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/pts/")
-_LARGEST = 16 << 20  # bytes of a file that is written and read again
-_RECEIVED = 1 << 16
+_LARGEST = 16 << 20  # bytes: a larger file that is both written and read is not copied, because copying takes too long
+_RECEIVED = 1 << 16  # bytes per read: the capacity of a pipe on Linux
 _copying = False
 ends: set[int] = set()
-"""Descriptors by which copies of this process are talked to, and it to what it is a copy of; a copy has none."""
+"""Descriptors of pipes to the forks of this process and, inside a fork, to its parent. Forks do not inherit them."""
 _alive: set[int] = set()  # copies of this process
 
-# Kept apart from what an agent may put in their place.
+# Keep references: an agent may replace these functions.
 _fork, _leave, _dumps = os.fork, os._exit, json.dumps
 
 
@@ -76,11 +150,11 @@ class NoProcessError(CannotForkError):
 
 
 class Watchdog:
-    """Writes down where a process is at a time limit; its thread stands back while the process is copied.
+    """Writes the traceback of a process at a time limit; its thread is paused while the process is forked.
 
     Attributes:
-        file: where to; None where nobody counts.
-        threads: its own.
+        file: that receives the traceback; None while the watchdog is not armed.
+        threads: ids of its own threads.
     """
 
     def __init__(self) -> None:
@@ -89,20 +163,20 @@ class Watchdog:
         self._until = 0.0
 
     def arm(self, limit_s: float, file: TextIO) -> None:
-        """Begin to count, in s of wall time."""
+        """Start the time limit, in s of wall time."""
         self.file, self._until = file, time.monotonic() + limit_s
         before = threads()
         faulthandler.dump_traceback_later(limit_s, file=file)
-        # The kernel may show it for a while after it was told to end.
+        # The kernel may list the previous thread for a while after its cancellation.
         self.threads = (self.threads & before) | (threads() - before)
 
     def cancel(self) -> None:
-        """Let it be."""
+        """Stop the time limit."""
         self.file = None
         faulthandler.cancel_dump_traceback_later()
 
     def extend(self, wall_s: float) -> None:
-        """Count so much longer, in s."""
+        """Extend the time limit by a number of seconds of wall time."""
         if self.file is not None:
             left, file = self._until - time.monotonic() + wall_s, self.file
             self.cancel()
@@ -110,7 +184,7 @@ class Watchdog:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Count no further; whoever comes out of it goes on counting: this process alone, and no copy."""
+        """Pause the time limit inside the context; it resumes in this process only, not in a fork."""
         if self.file is None:
             yield
             return
@@ -124,7 +198,7 @@ class Watchdog:
 
 
 def threads() -> frozenset[str]:
-    """Return the ids of the threads of this process; none elsewhere than on Linux."""
+    """Return the ids of the threads of this process; an empty set on systems other than Linux."""
     try:
         return frozenset(os.listdir("/proc/self/task"))  # noqa: PTH208 - names are enough
     except OSError:
@@ -132,17 +206,17 @@ def threads() -> frozenset[str]:
 
 
 watchdog = Watchdog()
-"""That of this process: there is one."""
+"""The only watchdog of this process."""
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What this process has open before somebody's code runs in it: that is nobody's business in a copy.
+    """Resources that this process held before user code ran in it; forks need no copy of them.
 
     Args:
-        files: descriptor to what it is.
-        children: processes.
-        shared: names of memory that is shared with others; None where that is not looked at, which takes milliseconds.
+        files: descriptor to its target.
+        children: process ids.
+        shared: names of memory that is shared with other processes; None to skip this check, which takes milliseconds.
     """
 
     files: Mapping[int, str] = field(default_factory=dict)
@@ -151,10 +225,10 @@ class Held:
 
 
 def held(shared: frozenset[str] | None = None) -> Held:
-    """Return what this process has open now.
+    """Return the resources that this process holds now.
 
     Args:
-        shared: as `Held` has it, where somebody knows already.
+        shared: names of shared memory, if the caller knows them already; see `Held`.
     """
     if sys.platform != "linux":
         return Held()
@@ -162,7 +236,7 @@ def held(shared: frozenset[str] | None = None) -> Held:
 
 
 def shared_memory() -> frozenset[str]:
-    """Return the names of the memory that this process shares with whoever else has it, and writes to."""
+    """Return the names of writable memory that this process shares with other processes."""
     if sys.platform != "linux":
         return frozenset()
     with Path("/proc/self/maps").open("rb") as lines:
@@ -171,23 +245,23 @@ def shared_memory() -> frozenset[str]:
 
 
 def copying() -> bool:
-    """Whether the fork that takes place is one of these; for handlers that look after forks of an agent's."""
+    """Return whether this module is forking now; fork handlers use that to ignore forks other than an agent's."""
     return _copying
 
 
 class Copy:
-    """A copy that does something, and says what came of it.
+    """A fork that does one piece of work and returns its answer.
 
     Args:
-        work: what the copy does; what it returns is expressible as JSON.
-        known: what was open before somebody's code ran.
+        work: the work; its return value must be expressible as JSON.
+        known: resources that were open before user code ran.
 
     Raises:
         CannotForkError: this process cannot be copied.
 
     Attributes:
-        pid: its process.
-        raised: the exception that has ended it, in words; empty where there was none.
+        pid: process id of the fork.
+        raised: text of the exception that ended the work; empty if there was none.
         no_answer: why `answer` has returned None.
     """
 
@@ -216,10 +290,10 @@ class Copy:
             os.close(theirs)
 
     def answer(self, timeout_s: float) -> Plain | None:
-        """Wait for what came of it, and end it; None where it raised something, died, or took longer.
+        """Wait for the answer, then end the fork; return None where the work raised, died or exceeded the time limit.
 
         Args:
-            timeout_s: wall time that it has, in s.
+            timeout_s: time limit in s of wall time.
         """
         received, deadline = bytearray(), time.monotonic() + timeout_s
         try:
@@ -238,7 +312,7 @@ class Copy:
                 end_orphans(self._children)
 
     def end(self) -> None:
-        """End it, whatever it is doing; may be called twice."""
+        """Kill the fork; may be called twice."""
         if self._end >= 0:
             kill(self.pid)
             ended(self.pid)
@@ -251,12 +325,15 @@ class Copy:
 
 
 def end_orphans(children: frozenset[int]) -> None:
-    """End what a killed copy has left to this process, which cannot be copied with it; older children stay."""
+    """End the processes that a killed fork has left to this process.
+
+    They would prevent further forks. Older children stay.
+    """
     end_descendants(children | _alive)
 
 
 def ended(pid: int) -> int:
-    """Wait for the end of a copy; return its exit code, negative for a signal."""
+    """Wait for the end of a fork; return its exit code, negative for a signal."""
     _alive.discard(pid)
     with suppress(ChildProcessError):
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -264,15 +341,15 @@ def ended(pid: int) -> int:
 
 
 def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collection[int] = ()) -> int:
-    """Copy this process; the copy does something, and is over.
+    """Fork this process; the fork does its work and exits.
 
     Args:
-        work: what the copy does. It has no output, and what it raises is lost.
-        known: what was open before somebody's code ran; None where nobody knows, and then it may be anybody's.
-        keeps: descriptors that it needs, such as an end of a pipe.
+        work: the work. Its output is discarded, and so are its exceptions.
+        known: resources that were open before user code ran; None if unknown: then every resource may be the user's.
+        keeps: descriptors that the work needs, such as an end of a pipe.
 
     Returns:
-        The process, which whoever called has to wait for.
+        The process id of the fork; the caller has to wait for it.
 
     Raises:
         CannotForkError: this process cannot be copied.
@@ -291,7 +368,7 @@ def fork(work: Callable[[], object], known: Held | None = None, *, keeps: Collec
         finally:
             _copying = False
         if pid == 0:
-            random.setstate(drawn)  # Python seeds it anew in whatever is forked
+            random.setstate(drawn)  # Python reseeds its generator after every fork
             _be_copy(parent, work, replaced, keeps)
     _alive.add(pid)
     return pid
@@ -304,7 +381,7 @@ def _be_copy(
     try:
         die_with(parent)
         adopt_orphans()
-        gc.freeze()  # walking what was there before would make pages of the copy's own of it
+        gc.freeze()  # a garbage collection would write to all inherited pages, and so copy them
         watchdog.file = None
         faulthandler.disable()
         faulthandler.unregister(signal.SIGUSR1)
@@ -318,14 +395,14 @@ def _be_copy(
         _leave(code)
 
 
-_CLOSE, _NOTHING, _READ, _OWN = range(4)  # what becomes of a descriptor in a copy
+_CLOSE, _NOTHING, _READ, _OWN = range(4)  # what a fork does with a descriptor: close, /dev/null, reopen, private copy
 
 
 def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, int]]:
-    """What is to become of each descriptor in a copy, and where in it this process is.
+    """Return for each descriptor what a fork does with it, and the position of this process in it.
 
     Raises:
-        CannotForkError: one of them, or something else, has no copy.
+        CannotForkError: a descriptor, a thread, a child or shared memory cannot be copied.
     """
     others = len(threads() - watchdog.threads) - 1
     if others > 0:
@@ -395,6 +472,126 @@ def children_now() -> frozenset[int]:
 def _open() -> dict[int, str]:
     found = {}
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are enough
-        with suppress(OSError):  # the one that was listed by
+        with suppress(OSError):  # the descriptor of this listing is closed already
             found[int(name)] = os.readlink(f"/proc/self/fd/{name}")  # noqa: PTH115
     return found
+
+
+# A suspended fork of this process, which answers each job from the same state.
+
+_MORE_S = 1.0  # beyond the time limit of a job, for the suspended fork to report that there is no answer
+
+# Keep references: an agent may replace these functions.
+_loads, _write = json.loads, os.write
+
+
+class SuspendedFork:
+    """A suspended fork; it runs each job in a fork of its own, so its state never changes.
+
+    Args:
+        work: computes the answer to a job; both must be expressible as JSON.
+        known: resources that were open before user code ran.
+
+    Raises:
+        CannotForkError: this process cannot be copied.
+
+    Attributes:
+        pid: process id of the suspended fork.
+        raised: text of the exception that ended the last job; empty if there was none.
+        no_answer: why `ask` has returned None.
+        is_usable: whether it accepts another job.
+    """
+
+    def __init__(self, work: Callable[[Plain], Plain], known: Held | None = None) -> None:
+        self.raised = ""
+        self.no_answer: NoAnswer | None = None
+        self.is_usable = True
+        jobs, self._jobs = os.pipe()
+        self._answers, answers = os.pipe()
+        ends.update((self._jobs, self._answers))
+        try:
+            self.pid = fork(lambda: _serve_jobs(jobs, answers, work, known), known, keeps=(jobs, answers))
+        except BaseException:
+            self._close()
+            raise
+        finally:
+            os.close(jobs)
+            os.close(answers)
+
+    def ask(self, job: Plain, timeout_s: float) -> Plain | None:
+        """Return the answer to a job; None where the work raised, died or exceeded the time limit (see `no_answer`).
+
+        Args:
+            job: the input of the work.
+            timeout_s: time limit in s of wall time.
+        """
+        if not self.is_usable:
+            return None
+        children = children_now()
+        try:
+            return self._ask(job, timeout_s)
+        finally:
+            if not self.is_usable:
+                end_orphans(children)
+
+    def _ask(self, job: Plain, timeout_s: float) -> Plain | None:
+        text, received = _dumps([job, timeout_s]).encode() + b"\n", bytearray()
+        deadline = time.monotonic() + timeout_s + _MORE_S
+        try:
+            while text:
+                text = text[_write(self._jobs, text) :]
+        except BrokenPipeError:
+            self._lose(explain_silence(self.pid))
+            return None
+        while not received.endswith(b"\n"):
+            ready, _, _ = select.select([self._answers], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                self._lose(took_longer(timeout_s))
+                return None
+            data = os.read(self._answers, _RECEIVED)
+            if not data:
+                self._lose(explain_silence(self.pid))
+                return None
+            received += data
+        answer: Plain | None
+        try:
+            answer, self.raised, why = _loads(received)
+        except (ValueError, TypeError):
+            self._lose(NoAnswer("sent data that are no answer"))
+            return None
+        if answer is None:
+            self.no_answer = NoAnswer(*why)
+        return answer
+
+    def _lose(self, why: NoAnswer) -> None:
+        self.no_answer, self.is_usable = why, False
+
+    def end(self) -> None:
+        """Kill the suspended fork and the forks that it has made; may be called twice."""
+        if self._jobs >= 0:
+            kill(self.pid)
+            ended(self.pid)
+            self._close()
+
+    def _close(self) -> None:
+        ends.difference_update((self._jobs, self._answers))
+        os.close(self._jobs)
+        os.close(self._answers)
+        self._jobs = self._answers = -1
+
+
+def _serve_jobs(requests: int, answers: int, work: Callable[[Plain], Plain], known: Held | None) -> None:
+    with os.fdopen(requests, "rb", closefd=False) as lines:
+        for line in lines:
+            job, timeout_s = _loads(line)
+            answer: Plain | None = None
+            raised, why = "", NoAnswer("")
+            try:
+                copy = Copy(partial(work, job), known)
+                answer, raised, why = copy.answer(timeout_s), copy.raised, copy.no_answer or why
+            except CannotForkError as error:
+                raised = error.message
+                why = NoAnswer(f"could not be made: {raised}", isinstance(error, NoProcessError))
+            text = _dumps([answer, raised, [why.why, why.is_from_outside]]).encode() + b"\n"
+            while text:
+                text = text[_write(answers, text) :]

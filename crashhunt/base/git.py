@@ -1,4 +1,4 @@
-"""Git: the environment in which it looks at a folder, and not at the repository whose hook this runs in; its files."""
+"""Git queries about a folder, independent of the repository whose hook may run this process."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ __all__ = ["environment_of_git", "tracked_files", "work_tree"]
 
 _TIMEOUT_S = 60
 
-# Those of `git rev-parse --local-env-vars` that name a repository, or parts of it. Git sets them for its hooks and for
-# `rebase --exec`, and they go before the folder that it is told to be in.
+# Git sets these variables for its hooks and for `rebase --exec`, and they take precedence over `-C FOLDER`. They are
+# the ones of `git rev-parse --local-env-vars` that name a repository or parts of it.
 _OF_A_REPOSITORY = frozenset({
     "GIT_ALTERNATE_OBJECT_DIRECTORIES", "GIT_COMMON_DIR", "GIT_DIR", "GIT_GRAFT_FILE", "GIT_IMPLICIT_WORK_TREE",
     "GIT_INDEX_FILE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX", "GIT_SHALLOW_FILE", "GIT_WORK_TREE",
@@ -20,14 +20,14 @@ _OF_A_REPOSITORY = frozenset({
 
 
 def environment_of_git() -> dict[str, str]:
-    """Return the variables of this process without those that name a repository."""
+    """Return the environment variables of this process without those that name a repository."""
     return {name: value for name, value in os.environ.items() if name not in _OF_A_REPOSITORY}
 
 
 def work_tree(folder: Path) -> Path | None:
     """Return the top of the git work tree of a folder, without symbolic links; None where there is none.
 
-    Git refuses a work tree that belongs to another user, and then there is none either.
+    Git refuses a work tree that belongs to another user; the result is None for it too.
     """
     found = _run_git(folder, "rev-parse", "--show-toplevel")
     return Path(os.path.realpath(os.fsdecode(found.rstrip(b"\n")))) if found else None

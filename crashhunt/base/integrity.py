@@ -1,42 +1,55 @@
-"""Digests by which whoever reads something sees that it is what was written.
+"""Digests that detect corruption and accidental edits of files and rows.
 
-They keep nobody out, for there is no key: they find accidents and edits, whichever program made them.
+They do not detect deliberate tampering, because they have no key.
 """
 
 from __future__ import annotations
 
 import hashlib
+import hmac
 import json
 import os
 import re
+import secrets
 import stat
+import tempfile
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, cast, get_args, get_origin
 
-if TYPE_CHECKING:
-    from pathlib import Path
+from crashhunt.base import layout
 
-    from crashhunt.base.plain import Plain
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from crashhunt.base.json_types import Plain
+
 
 __all__ = [
     "FILES",
     "FileEntry",
+    "authentication_code",
     "changed_file",
     "describe_files",
     "digest_of_content",
     "digest_of_data",
     "digest_of_file",
     "digest_of_row",
+    "is_authentic",
     "parse_object",
     "read_object",
+    "state_folders",
     "typed",
+    "user_key",
 ]
+
 
 T = TypeVar("T")
 _SMALL = 1 << 20  # bytes
 
 
 class FileEntry(TypedDict):
-    """What is written down of a file.
+    """The recorded size and digest of a file.
 
     Args:
         size: in bytes.
@@ -48,20 +61,20 @@ class FileEntry(TypedDict):
 
 
 def digest_of_row(values: tuple[object, ...]) -> int:
-    """Return the digest of a row of a table: 64 bits, with a sign, as SQLite keeps them in the least space."""
+    """Return the digest of a row of a table: 64 bits with a sign, the most compact form in SQLite."""
     text = "\0".join(map(str, values))  # a trial's cost is counted in microseconds, and JSON would take twice as long
     digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return int.from_bytes(digest, "little", signed=True)
 
 
 def digest_of_data(data: Plain) -> str:
-    """Return the digest of a JSON object, in hexadecimal, however it is laid out and ordered."""
+    """Return the digest of a JSON object, in hexadecimal, independent of layout and order of keys."""
     text = json.dumps(data, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def digest_of_content(content: bytes) -> str:
-    """Return the digest of what is in a file, in hexadecimal."""
+    """Return the digest of the content of a file, in hexadecimal."""
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
@@ -78,7 +91,7 @@ def digest_of_file(path: Path) -> str:
 
 
 def describe_files(folder: Path) -> dict[str, FileEntry]:
-    """Return size and digest of every file of a folder, by its name.
+    """Return the size and digest of every file in a folder, by file name.
 
     Raises:
         OSError: one cannot be read.
@@ -91,7 +104,7 @@ def describe_files(folder: Path) -> dict[str, FileEntry]:
 
 
 def changed_file(path: Path, entry: FileEntry) -> str:
-    """Say what has become of a file of which size and digest were written down; empty where it is as it was."""
+    """Return how a file differs from its recorded size and digest; an empty string if it is unchanged."""
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode):
@@ -109,24 +122,24 @@ def read_object(path: Path, shape: type[T]) -> T:
 
     Args:
         path: of the file.
-        shape: the `TypedDict` that it should be; whoever reads it sees with `typed` to what it takes for granted.
+        shape: the `TypedDict` that the caller expects; the caller checks the keys it needs with `typed`.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is not one, with the reason in one line.
+        ValueError: it holds no JSON object; the reason is in one line.
     """
     return parse_object(path.read_bytes(), shape)
 
 
 def parse_object(text: bytes, shape: type[T]) -> T:  # noqa: ARG001 - for the type checker
-    """Return the JSON object that a text is.
+    """Parse a text as a JSON object.
 
     Args:
         text: in UTF-8.
         shape: as for `read_object`.
 
     Raises:
-        ValueError: it is not one, with the reason in one line.
+        ValueError: it is no JSON object; the reason is in one line.
     """
     try:
         found = json.loads(text)
@@ -142,14 +155,14 @@ FILES = dict[str, dict[str, int | str]]
 
 
 def typed(data: Plain, types: Plain) -> None:
-    """See that an object has some keys, and of which types their values are.
+    """Check that an object has some keys, and that their values have the given types.
 
     Args:
         data: the object.
         types: key to type: a class, a union of classes, ``list[...]`` or ``dict[str, ...]``. An int is a float too.
 
     Raises:
-        ValueError: with the key, its value and the type.
+        ValueError: a key is missing or has a value of another type; the message names key, value and type.
     """
     for key, kind in types.items():
         if key not in data:
@@ -181,3 +194,91 @@ def _words(kind: object) -> str:
 def _short(value: object) -> str:
     text = repr(value) if not isinstance(value, int) or abs(value) < 2**64 else "a number that is too large"
     return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+# Message authentication codes with the secret key of this user: they prove that this user wrote something here.
+#
+# The codes are HMAC-SHA256 (RFC 2104). Each has a purpose, so that a code for one thing is none for another thing.
+
+_KEY_BYTES = 32
+_KEY_OF_THIS_PROCESS = secrets.token_bytes(_KEY_BYTES)
+
+
+def authentication_code(purpose: str, statement: Mapping[str, object]) -> str:
+    """Return the code of a statement, in hexadecimal.
+
+    Args:
+        purpose: what the code is for, such as ``crash bundle``.
+        statement: plain data; their order makes no difference.
+    """
+    text = json.dumps(statement, sort_keys=True, separators=(",", ":"))
+    return hmac.new(user_key(), f"crashhunt {purpose}\0{text}".encode(), "sha256").hexdigest()
+
+
+def is_authentic(purpose: str, statement: Mapping[str, object], code: object) -> bool:
+    """Return whether a code is that of this user for a statement; without a code, it is not."""
+    if not isinstance(code, str) or not code.isascii():
+        return False
+    return hmac.compare_digest(code, authentication_code(purpose, statement))
+
+
+def user_key() -> bytes:
+    """Return the secret key of this user on this machine; the first call creates it.
+
+    Where no folder can keep it, each process has a key of its own, so that nothing counts as made here later.
+    """
+    for folder in state_folders():
+        key = _kept_key(folder / layout.ARCHIVE_KEY)
+        if key is not None:
+            return key
+    return _KEY_OF_THIS_PROCESS
+
+
+def state_folders() -> Iterator[Path]:
+    """Yield the folders in which the state of this user may be kept, the usual one first; not all can be written.
+
+    ``$XDG_STATE_HOME/crashhunt`` or ``~/.local/state/crashhunt``. A container may run a user without a writable home,
+    so a private folder among the temporary files comes last.
+    """
+    home = os.environ.get("XDG_STATE_HOME", "")
+    if not Path(home).is_absolute():  # which the XDG specification says to ignore
+        try:
+            home = str(Path.home() / ".local" / "state")
+        except RuntimeError:  # a user without an entry in the system's list
+            home = ""
+    if home:
+        yield Path(home) / "crashhunt"
+    private = Path(tempfile.gettempdir()) / f"crashhunt-{os.geteuid()}"
+    with suppress(OSError):
+        private.mkdir(mode=0o700, exist_ok=True)
+        found = private.lstat()
+        # Every user can create this name first, so use only a folder that belongs to this user alone.
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
+            yield private
+
+
+def _kept_key(file: Path) -> bytes | None:
+    """Return the key of a file, which is created where it is missing; None where neither is possible."""
+    with suppress(OSError):
+        key = file.read_bytes()
+        # Everybody can compute codes with a key that is cut off: replace the file.
+        if len(key) >= _KEY_BYTES:
+            return key
+        file.unlink()
+    try:
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        temporary = file.with_name(f".{file.name}.{os.getpid()}.{secrets.token_hex(4)}")
+        try:
+            with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+                opened.write(secrets.token_bytes(_KEY_BYTES))
+                opened.flush()
+                os.fsync(opened.fileno())
+            with suppress(FileExistsError):
+                os.link(temporary, file)  # of two processes at once, the first one wins
+        finally:
+            with suppress(OSError):
+                temporary.unlink()
+        key = file.read_bytes()
+    except OSError:
+        return None
+    return key if len(key) >= _KEY_BYTES else None

@@ -93,7 +93,7 @@ ARCHIVE_KEY: Final = "archive-key"
 
 # Of the scratch folder of a trial that runs; of the whole hunt's, the last one.
 BLACK_BOX: Final = "blackbox.bin"
-ENTERED: Final = "entered.json"  # of a trial in which somebody may be left out
+ENTERED: Final = "entered.json"  # of a trial that can exclude other vehicles
 STACK: Final = "stack.txt"
 MAP: Final = "map.json"
 NOTICES: Final = "notices.txt"
@@ -118,6 +118,6 @@ def crash_folder(number: int, outcome: str) -> str:
 
 
 def numbered(number: int, name: str) -> str:
-    """Return the name of a file of one trial beside those of others, such as ``job-000012.json``."""
+    """Return the file name of one trial among those of other trials, such as ``job-000012.json``."""
     stem, dot, ending = name.partition(".")
     return f"{stem}-{number:06d}{dot}{ending}"

@@ -12,9 +12,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.blame import in_words, place_of
 from crashhunt.base.errors import PluginError
-from crashhunt.base.names import did_you_mean, one_of
+from crashhunt.base.exceptions import in_words, place_of
+from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:
     import types
@@ -79,7 +79,7 @@ def _changed_at(place: str) -> int:
 
 
 def locate(group: Group, name: str) -> Any:
-    """Return what a registered name or a ``module:attribute`` stands for.
+    """Return the object that a registered name or a ``module:attribute`` names.
 
     Modules are looked for in the current directory as well, as with ``python -m``.
 
@@ -96,7 +96,7 @@ def locate(group: Group, name: str) -> Any:
 
 
 def load_object(target: str, *, shown: str = "") -> Any:
-    """Import the class or function that a ``module:attribute`` stands for.
+    """Import the class or function that a ``module:attribute`` names.
 
     Args:
         target: the module and what in it can be called.
@@ -114,7 +114,7 @@ def load_object(target: str, *, shown: str = "") -> Any:
 
 
 def load_attribute(target: str, *, shown: str = "") -> Any:
-    """Import what a ``module:attribute`` stands for, whatever it is.
+    """Import the object of any kind that a ``module:attribute`` names.
 
     Args:
         target: the module and the attribute.
@@ -165,15 +165,15 @@ def _not_imported(name: str, shown: str, error: BaseException) -> PluginError:
         said = " ".join(f"{type(error).__name__}: {error.msg}"[:_MAX_LINE_CHARACTERS].split())
     missing = error.name or "" if isinstance(error, ModuleNotFoundError) else ""
     if missing and f"{name}.".startswith(f"{missing}."):  # the module itself, or a package that it is said to be in
-        hint = did_you_mean(missing.rpartition(".")[2], _modules_beside(missing))
+        hint = did_you_mean(missing.rpartition(".")[2], _sibling_modules(missing))
         fix = f"{hint} run from the folder that holds the module, install it, or mend the name".lstrip()
         return PluginError(f"{shown!r} cannot be imported: No module named {missing!r}", fix=fix)
     fix = f"install {missing.partition('.')[0]!r}, or mend the import" if missing else "mend it"
     return PluginError(f"{said}, which keeps {shown!r} from being imported", fix=fix, where=place_of(error))
 
 
-def _modules_beside(name: str) -> list[str]:
-    """The modules of the same package, or of the current directory."""
+def _sibling_modules(name: str) -> list[str]:
+    """Return the names of the modules in the same package, or in the current directory."""
     package, _, _ = name.rpartition(".")
     places = getattr(sys.modules.get(package), "__path__", None) if package else [os.getcwd()]  # noqa: PTH109
     return [module.name for module in pkgutil.iter_modules(places)] if places else []

@@ -1,8 +1,8 @@
-"""Trees of processes: that none outlives whoever asked for it, whatever becomes of either.
+"""Process trees that never outlive their owner.
 
-An agent may start programs, and these may leave their session, their group and their parent. On Linux, a process can
-be made the one to whom every orphan below it is handed (a *subreaper*): so the whole tree can be found and ended.
-Elsewhere, what an agent has started stays.
+An agent may start programs, and these may leave their session, their group and their parent. On Linux, orphans below a
+process can be made its children (*subreaper*, prctl(2)), so `end_descendants` finds and ends the whole tree. On
+other systems, processes that an agent has started may remain.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from pathlib import Path
 __all__ = ["adopt_orphans", "children_of", "die_with", "end_descendants", "has_child", "is_alive", "kill", "resume"]
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # of <sys/prctl.h>
-_libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, and not in every copy of this process
-_PATIENCE_S = 2.0  # for processes that do not die at once; those of another user never do
+_libc = ctypes.CDLL(None) if sys.platform == "linux" else None  # looked up once, not in every fork
+_PATIENCE_S = 2.0  # for processes that do not die at once; processes of another user never do
 
 
 def adopt_orphans() -> None:
-    """Have every process below this one whose parent ends handed to this one, as its child."""
+    """Make this process the new parent of every process below it whose own parent ends."""
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def die_with(parent: int) -> None:
-    """Have the kernel end this process when its parent does, whatever it is doing; ends it where that has happened.
+    """Have the kernel kill this process when its parent ends; exit at once if the parent has ended already.
 
-    What counts is the *thread* that started this process, so that has to be one that stays.
+    The kernel watches the *thread* that started this process, so that thread must stay alive.
     """
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before the kernel had been told
+    if os.getppid() != parent:  # it died before the prctl call
         os._exit(1)
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the children of a process; none where nobody can say."""
+    """Return the process ids of the children of a process; an empty list where the system does not report them."""
     found: list[int] = []
     try:
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -52,13 +52,13 @@ def children_of(pid: int) -> list[int]:
 
 
 def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
-    """Kill every process below this one, which has called `adopt_orphans`, and reap it.
+    """Kill and reap every process below this one, which must have called `adopt_orphans`.
 
     Args:
-        spared: children that stay, with all that is below them.
+        spared: process ids of children to keep, with everything below them.
 
     Returns:
-        Whether there was one.
+        Whether there was a process to kill.
     """
     found = False
     deadline = time.monotonic() + _PATIENCE_S
@@ -69,7 +69,7 @@ def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
         if not doomed:
             return found
         for pid in doomed:
-            with suppress(ChildProcessError):  # whoever started it has reaped it meanwhile
+            with suppress(ChildProcessError):  # its parent code has reaped it in the meantime
                 if os.waitpid(pid, os.WNOHANG)[0] == 0:
                     found = True
                     _kill_below(pid)
@@ -78,20 +78,20 @@ def end_descendants(spared: frozenset[int] = frozenset()) -> bool:
 
 
 def kill(pid: int) -> None:
-    """Kill a process, if it is there."""
+    """Kill a process if it exists."""
     with suppress(ProcessLookupError, PermissionError):
         os.kill(pid, signal.SIGKILL)
 
 
 def resume(pid: int) -> None:
-    """Resume a process that was stopped, as by SIGSTOP; nothing happens where it runs."""
+    """Resume a process that was stopped, as by SIGSTOP; a running process is not affected."""
     with suppress(OSError, IndexError):
         if Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0] == b"T":
             os.kill(pid, signal.SIGCONT)
 
 
 def is_alive(pid: int) -> bool:
-    """Whether there is such a process; one that has ended and was not reaped counts."""
+    """Return whether a process exists; a zombie counts."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -102,7 +102,7 @@ def is_alive(pid: int) -> bool:
 
 
 def _kill_below(pid: int) -> None:
-    """Kill a process and all below it; what forks meanwhile is handed upwards, and found in the next round."""
+    """Kill a process and all below it; processes forked in the meantime become orphans for the next round."""
     below = children_of(pid)
     kill(pid)
     for child in below:
@@ -110,7 +110,7 @@ def _kill_below(pid: int) -> None:
 
 
 def has_child() -> bool:
-    """Whether this process has a child; one that has ended and was not reaped counts."""
+    """Return whether this process has a child; a zombie counts."""
     try:
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:

@@ -1,8 +1,12 @@
-"""Open files and memory that a process has in common with its forks, and what a fork needs to have its own.
+"""Detects open files and memory that a process shares with its forks, and gives a fork private ones.
 
-A fork shares three things with the process that it is a fork of: the position and flags of every open file, the content
-of files without a name, and memory that is mapped as shared (`mmap.mmap(-1, …)`, `multiprocessing.Value`). What one
-fork changes there, every other one finds.
+A fork shares three things with its parent:
+
+- the position and flags of every open file,
+- the content of files without a name,
+- memory that is mapped as shared (`mmap.mmap(-1, …)`, `multiprocessing.Value`).
+
+A change of any of these by one fork is visible to all others.
 """
 
 from __future__ import annotations

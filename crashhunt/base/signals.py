@@ -32,8 +32,8 @@ _set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
-"""GNU timeout sends its signal to the process and then to its group, and batch systems do the like: what comes twice
-within this is one request, not an impatient person."""
+"""GNU timeout and batch systems send a signal to the process and then to its group. Two signals within this time are
+therefore one request, not a second request of an impatient user."""
 
 
 class _EndedError(BaseException):
@@ -96,8 +96,8 @@ def blocked_signals() -> Iterator[None]:
 def stop_requests() -> Iterator[list[int]]:
     """Collect requests to stop, as numbers of signals, instead of ending; a later second one ends the process at once.
 
-    Whoever ignores hang-ups, as nohup does, goes on ignoring them. In a thread that is not the main one nothing is
-    collected: whoever runs us there handles signals.
+    Hang-ups stay ignored where they are ignored already, as under nohup. In a thread other than the main one nothing is
+    collected, because the embedding program handles signals there.
     """
     asked: list[int] = []
     first_at: list[float] = []

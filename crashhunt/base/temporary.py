@@ -23,32 +23,226 @@ The page `reference/files.md` of the guide lists every temporary thing.
 from __future__ import annotations
 
 import fcntl
+import importlib
 import os
+import re
 import shutil
 import stat
 import threading
 import weakref
+import zlib
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from crashhunt.base.owners import has_ended, owner_in, this_process
-from crashhunt.base.shared_memory import release_shared_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+
 __all__ = [
+    "Owner",
     "TemporaryFolder",
+    "has_ended",
+    "owner_in",
+    "record_shared_memory",
+    "release_shared_memory",
     "remove_at_once",
     "remove_ended",
     "remove_leftovers",
     "remove_scratch",
     "remove_tree",
+    "start_time",
     "temporary_beside",
     "temporary_folder",
     "temporary_name",
+    "this_process",
 ]
+
+
+# Owners of temporary things: a name for a process that no other process on any machine shares, and whether it ended.
+#
+# The token of an owner is ``PID-START-BOOT-NAMESPACE``, such as ``4711-8812345-3f9a1c2b5d6e-8c736521``:
+#
+# * the process id and the time at which the process started, in clock ticks since the machine booted. Process ids are
+#   reused, but no two processes of one boot share both.
+# * the first 12 digits of the kernel's boot id. Another host has another one, and so has this host after a reboot.
+# * a checksum of the PID and time namespaces. A process in another container has ids and times of its own.
+#
+# Only a process that sees the owner's namespaces can tell that the owner ended. Every other process has to take the
+# owner for alive: a folder may be shared by NFS, by containers or by virtual machines.
+
+_BOOT_ID = "/proc/sys/kernel/random/boot_id"
+_NAMESPACES = "/proc/self/ns"  # of PIDs since Linux 3.8, of times since 5.6
+_BOOT_DIGITS = 12
+_UNKNOWN_BOOT = "0" * _BOOT_DIGITS  # where there is no /proc: such an owner counts as alive
+_TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9a-f]{8})(?![0-9a-f])")
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """A process, as the names of its temporary things give it.
+
+    Args:
+        pid: process id in its own PID namespace.
+        started: start time in clock ticks since the boot of the machine.
+        boot: first 12 hexadecimal digits of the kernel's boot id.
+        namespace: checksum of its PID and time namespaces, 8 hexadecimal digits.
+    """
+
+    pid: int
+    started: int
+    boot: str
+    namespace: str
+
+    @property
+    def token(self) -> str:
+        """The part of a file name that names this process."""
+        return f"{self.pid}-{self.started}-{self.boot}-{self.namespace}"
+
+
+def this_process() -> Owner:
+    """Return the owner that this process is."""
+    return _owner(os.getpid())
+
+
+@cache
+def _owner(pid: int) -> Owner:
+    try:
+        boot = Path(_BOOT_ID).read_text(encoding="ascii").replace("-", "")[:_BOOT_DIGITS]
+        names = [_namespace(kind) for kind in ("pid", "time")]
+    except (OSError, UnicodeError):
+        return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
+    started = start_time(pid)
+    if started <= 0 or len(boot) < _BOOT_DIGITS:
+        return Owner(pid, 0, _UNKNOWN_BOOT, "0" * 8)
+    return Owner(pid, started, boot, f"{zlib.crc32(' '.join(names).encode()):08x}")
+
+
+def _namespace(kind: str) -> str:
+    """Return what names a namespace of this process; nothing where the kernel is too old to have any of that kind."""
+    try:
+        return str(Path(_NAMESPACES, kind).readlink())
+    except FileNotFoundError:
+        return ""
+
+
+def owner_in(name: str) -> Owner | None:
+    """Return the owner that a file name gives; None where the name gives none, or several."""
+    found = set(_TOKEN.findall(name))
+    if len(found) != 1:  # a user's file name may have such a token as well
+        return None
+    ((pid, started, boot, namespace),) = found
+    return Owner(int(pid), int(started), boot, namespace)
+
+
+def has_ended(owner: Owner) -> bool:
+    """Return whether it is certain that an owner has ended.
+
+    An owner of another boot, of another host or of another container counts as alive, because this process cannot know.
+    """
+    here = this_process()
+    if here.boot == _UNKNOWN_BOOT or (owner.boot, owner.namespace) != (here.boot, here.namespace):
+        return False
+    return start_time(owner.pid) not in (-1, owner.started)
+
+
+def start_time(pid: int) -> int:
+    """Return when a process started, in clock ticks since the machine booted.
+
+    Returns:
+        0 where there is no such process, or only a zombie is left of it; -1 where the system does not report it.
+    """
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        # The first thread of a process may have ended before the others: it is a zombie then, and the process is not.
+        if stat[0] in "ZX" and len(os.listdir(f"/proc/{pid}/task")) <= 1:  # noqa: PTH208 - how many is enough
+            return 0
+        return int(stat[19])
+    except OSError:
+        pass
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return 0
+    except (PermissionError, OverflowError):
+        pass
+    return -1  # /proc is not mounted, or hides the process
+
+
+# POSIX shared memory that trials create and leave behind.
+#
+# A segment is a file in ``/dev/shm``, and the kernel does not say who created it. So a process that runs trials records
+# each segment that Python's `multiprocessing.shared_memory` creates in it and in its forks. Python's own resource
+# tracker is no replacement: it is killed with the trial. Before Python 3.13 it also removes segments of other programs
+# to which an agent only attached.
+#
+# Every other segment stays, because nothing proves its origin: segments of C code, segments of a Python interpreter
+# that an agent starts itself, and named semaphores.
+
+_RECORDS = "shared-memory-{}.txt"  # with the token of the process that created what the file names
+_SEGMENTS = Path("/dev/shm")
+_NEW = os.O_CREAT | os.O_EXCL  # with both, shm_open has made the segment
+
+
+def record_shared_memory(scratch: Path) -> None:
+    """Record every segment that this process creates from now on.
+
+    Args:
+        scratch: a folder that is given to `release_shared_memory` later, directly or inside of another one.
+    """
+    try:
+        module = importlib.import_module("_posixshmem")
+    except ImportError:  # Python was built without it
+        return
+    original = vars(module)["shm_open"]
+    folder = scratch.absolute()
+
+    @wraps(original)
+    def shm_open(path: str, flags: int, mode: int = 0o777) -> int:
+        descriptor: int = original(path, flags, mode=mode)
+        if flags & _NEW == _NEW:
+            with suppress(OSError, ValueError):
+                found = os.fstat(descriptor)
+                with (folder / _RECORDS.format(this_process().token)).open("a", encoding="utf-8") as records:
+                    records.write(f"{found.st_dev} {found.st_ino} {path.lstrip('/')}\n")
+        return descriptor
+
+    vars(module)["shm_open"] = shm_open
+
+
+def release_shared_memory(scratch: Path, *, of_ended: bool = False) -> None:
+    """Remove the segments that are recorded in a folder.
+
+    Args:
+        scratch: the folder.
+        of_ended: only those of processes that have ended.
+    """
+    name = _RECORDS.format("*")
+    for records in [*scratch.glob(name), *([] if of_ended else scratch.glob(f"*/{name}"))]:
+        owner = owner_in(records.name)
+        if of_ended and (owner is None or not has_ended(owner)):
+            continue
+        with suppress(OSError):
+            for line in records.read_bytes().splitlines():
+                with suppress(ValueError):
+                    device, number, segment = line.decode().split(" ", 2)
+                    _remove(segment, int(device), int(number))
+            records.unlink()
+
+
+def _remove(name: str, device: int, number: int) -> None:
+    """Remove a segment, if it is still the one that was recorded."""
+    path = _SEGMENTS / name
+    if path.parent != _SEGMENTS or not name.strip("."):
+        return
+    with suppress(OSError):
+        found = path.lstat()
+        same = (found.st_dev, found.st_ino, found.st_uid) == (device, number, os.getuid())
+        if same and stat.S_ISREG(found.st_mode):
+            path.unlink()
+
 
 _LINK = "elsewhere"
 _WORK_TREES = "worktrees"  # in the folder of a Git repository
@@ -119,7 +313,7 @@ def temporary_beside(path: Path, *, name: str = "") -> Iterator[Path]:
 
 
 def temporary_name(path: Path, suffix: str = "") -> str:
-    """Return a hidden name with the token of this process for something temporary beside a file or folder.
+    """Return a hidden name with the token of this process, for something temporary in the folder of a path.
 
     Args:
         path: of what is being made.
@@ -235,7 +429,7 @@ class _Things:
 
         Args:
             path: of it.
-            removed: whether what it stands for is gone; otherwise it stays, and the next command tries again.
+            removed: whether the file or folder is gone; otherwise it stays, and the next command tries again.
         """
         with self._lock:
             if removed:
@@ -340,7 +534,7 @@ def _remove_left(folder: Path, token: str) -> None:
 
 
 def _remove_if_ours(path: Path, token: str) -> bool:
-    """Remove something if it is what a token stands for; return whether it is not there, or no longer."""
+    """Remove a path if it carries a token; return whether it is absent or no longer exists."""
     owner = owner_in(path.name)
     try:
         found = path.lstat()

@@ -1,20 +1,23 @@
-"""Text that others have written: agents, simulators, networks, the operating system, and who sent a crash.
+"""Text from outside: agents, simulators, networks, the operating system, and senders of crashes.
 
-A name may hold whatever its writer wanted, and a terminal obeys some of it: it moves the cursor, clears lines,
-retitles its window, or shows letters in another order than they are in. Files keep what was said; what is printed
-is made visible first.
+A name may hold any character, and a terminal obeys some of them: it moves the cursor, clears lines, retitles its
+window, or reorders letters. Files keep the original text. Printed text is made visible first.
 """
 
 from __future__ import annotations
 
+import difflib
 import re
 import unicodedata
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
-__all__ = ["encodable", "in_lines", "one_line", "visible"]
+
+__all__ = ["did_you_mean", "encodable", "in_lines", "listed", "near_path", "one_line", "one_of", "visible"]
+
 
 # Control and format characters, lone surrogates, and separators of lines that are no newline.
 _UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -48,5 +51,62 @@ def one_line(text: str) -> str:
 
 
 def in_lines(lines: Iterable[str]) -> str:
-    """Return lines as one text; what somebody says in one of them makes no other."""
+    """Join lines into one text; line breaks inside a line become spaces."""
     return "\n".join(map(one_line, lines))
+
+
+# What is proposed for a name that is not known: "did you mean …", or what there is.
+
+_SHOWN = 20  # a hunt may have thousands of crashes, and the answer is one line
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return ``did you mean 'NAME'?`` for what was most likely meant; empty where nothing is near."""
+    spelled = {_plain(other): str(other) for other in reversed(list(known))}  # of two that look alike, the first
+    close = difflib.get_close_matches(_plain(name), spelled, 1)
+    return f"did you mean {spelled[close[0]]!r}?" if close else ""
+
+
+def near_path(path: Path, *endings: str) -> str:
+    """Return ``did you mean 'PATH'? `` for a missing path: a folder with a similar name, or a file with an ending.
+
+    Args:
+        path: that is not there.
+        endings: of the files that would do as well.
+    """
+    try:
+        siblings = sorted(path.parent.iterdir())
+    except OSError:
+        return ""
+    wanted = [
+        str(path.parent / found.name)
+        for found in siblings
+        if not found.name.startswith(".") and (found.is_dir() or found.name.endswith(endings))
+    ]
+    hint = did_you_mean(str(path), wanted)
+    return f"{hint} " if hint else ""
+
+
+def listed(known: Iterable[str], *, none: str = "none") -> str:
+    """Return names in one line; of very many, the first."""
+    names = list(known)
+    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{more}" or none
+
+
+def one_of(name: str, known: Iterable[str], *, give: str = "give one of", none: str = "none") -> str:
+    """Return the fix for an unknown name: what was most likely meant, and everything that there is.
+
+    Args:
+        name: the one that is not known.
+        known: those that are.
+        give: what to say before them.
+        none: what to say instead where there are none.
+    """
+    names = list(known)
+    return f"{did_you_mean(name, names)} {give} {listed(names, none=none)}".lstrip()
+
+
+def _plain(name: str) -> str:
+    """A name without what people mix up: upper and lower case, ``-`` and ``_``."""
+    return name.lower().replace("_", "-")

@@ -1,4 +1,4 @@
-"""What another version of crashhunt has written: what is not known is left aside and kept, what is known is checked."""
+"""Tolerant reading of data from other versions of crashhunt: unknown keys are kept aside, known ones are checked."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
 from crashhunt.base.integrity import typed
-from crashhunt.base.names import did_you_mean
+from crashhunt.base.text import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.json_types import Plain
 
 __all__ = [
     "ESSENTIAL",
@@ -33,23 +33,22 @@ ESSENTIAL: Plain = {"essential": True}
 crosses to that version would mean something else."""
 
 
-def known_values(kind: type, data: Plain, *, null: object = None) -> dict[str, Any]:
-    """Return the values that a dataclass has fields for; what a later version has added is left out.
+def known_values(kind: type, data: Plain) -> dict[str, Any]:
+    """Return the values for which a dataclass has fields, without those that a later version has added.
 
     Args:
         kind: the dataclass.
-        data: what there is.
-        null: what a null stands for.
+        data: keys and values as they were read.
     """
     known = {item.name for item in fields(kind)}
-    return {name: null if value is None else value for name, value in data.items() if name in known}
+    return {name: value for name, value in data.items() if name in known}
 
 
 def known_part(kind: Any, data: object) -> tuple[Any, Any]:
-    """Return what of plain data a dataclass and those inside it have fields for, and the rest, laid out alike.
+    """Split plain data into the part for which a dataclass has fields, at any depth, and the rest with the same layout.
 
-    Of a list, what is not known in its items is left out; of the rest nothing is lost. The rest of what is known
-    altogether is an empty dict.
+    Unknown keys of items of a list are dropped; every other unknown key is in the rest. The rest is an empty dict if
+    everything is known.
     """
     if is_dataclass(kind) and isinstance(data, dict):
         hints = _hints_of(cast(Any, kind))
@@ -95,11 +94,11 @@ def merged(data: Plain, rest: Plain) -> dict[str, object]:
 
 
 def slip(rest: Plain, known: Plain, kind: type) -> str:
-    """Return a key that is not known and looks like one that is missing: somebody's slip, or damage; else nothing.
+    """Return an unknown key that resembles a missing one (a typing error or damage); otherwise an empty string.
 
     Args:
-        rest: what `known_part` left aside.
-        known: what it did not.
+        rest: the unknown part, of `known_part`.
+        known: the known part.
         kind: the dataclass.
     """
     missing = [item.name for item in fields(kind) if item.name not in known]

@@ -1,6 +1,6 @@
-"""Validated dataclasses: pydantic does the work, and its finding becomes one line of ours.
+"""Validated dataclasses: pydantic validates, and its finding becomes one line of ours.
 
-What fits to the letter is built without pydantic, whose import and schemas are a third of a worker's start.
+Data that match exactly are built without pydantic, because its import and schemas take a third of a worker's start.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from crashhunt.base.names import did_you_mean
+from crashhunt.base.text import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -58,7 +58,7 @@ def validate(
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where what is validated comes from, for the error."""
+    """The origin of validated data, for the error."""
 
     where: str
     error: type[CrashhuntError]
@@ -67,11 +67,11 @@ class _Place:
 
 
 class _NotToTheLetterError(Exception):
-    """It may be wrong, or something that pydantic converts."""
+    """Data that do not match exactly: they may be wrong, or pydantic may convert them."""
 
 
 def _built(kind: Any, data: Any) -> Any:
-    """Build what pydantic would build, for the types that our tables have; anything doubtful is left to it."""
+    """Build the object that pydantic would build, for the types of our tables; raise where the result is doubtful."""
     if is_dataclass(kind):
         return _dataclass_built(cast(type, kind), data)
     if kind in (Any, object) or type(data) is kind:
@@ -102,7 +102,7 @@ def _dataclass_built(kind: type, data: object) -> Any:
 
 
 def _member_built(kinds: tuple[object, ...], data: object) -> Any:
-    """Of a union, the member whose type it is; of an optional type, that type."""
+    """Build the member of a union that has the type of the data; for an optional type, build that type."""
     if type(data) in kinds:
         return _built(type(data), data)
     others = [kind for kind in kinds if kind is not type(None)]
@@ -113,7 +113,7 @@ def _member_built(kinds: tuple[object, ...], data: object) -> Any:
 
 @cache
 def _hints_of(kind: type) -> tuple[dict[str, object], frozenset[str]]:
-    """The types of a dataclass's fields, and which of them have no default."""
+    """Return the types of a dataclass's fields, and the names of those without a default."""
     items = fields(kind)
     hints = get_type_hints(kind)
     needed = (item.name for item in items if item.default is MISSING and item.default_factory is MISSING)
@@ -141,12 +141,12 @@ def _validated(kind: type[T], data: object, place: _Place) -> T:
 
 
 def _telling(errors: Sequence[ErrorDetails]) -> ErrorDetails:
-    """Of several mistakes the first one; where a key is missing because it is misspelt, that it is."""
+    """Return the first of several mistakes; a misspelt key is preferred to the missing key that it causes."""
     first = errors[0]
     if first["type"] in _MISSING:
         for other in errors[1:]:
-            beside = other["type"] in _UNKNOWN and other["loc"][:-1] == first["loc"][:-1]
-            if beside and did_you_mean(str(other["loc"][-1]), [str(first["loc"][-1])]):
+            is_sibling = other["type"] in _UNKNOWN and other["loc"][:-1] == first["loc"][:-1]
+            if is_sibling and did_you_mean(str(other["loc"][-1]), [str(first["loc"][-1])]):
                 return other
     return first
 
@@ -173,7 +173,7 @@ def _forbid_unknown(kind: Any, config: ConfigDict, seen: set[object]) -> None:
 
 
 def _known_keys(kind: Any, path: tuple[str, ...]) -> list[str]:
-    """The keys that a table at ``path`` may have."""
+    """Return the keys that a table at ``path`` may have."""
     for part in path:
         if is_dataclass(kind):
             kind = get_type_hints(kind).get(part)

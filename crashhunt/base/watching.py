@@ -1,4 +1,4 @@
-"""How far something is that takes its time."""
+"""Progress of slow loops."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["Watch", "watched"]
 
 T = TypeVar("T")
 Watch = Callable[[int, int], None]
-"""Called with how many are done, and how many there are."""
+"""Called with the number of finished items and the total."""
 
 
 def watched(items: Iterable[T], total: int, watch: Watch | None) -> Iterator[T]:
-    """Yield items, and tell after each how many are done.
+    """Yield items, and report the number of finished ones after each.
 
     Args:
-        items: what is worked on.
-        total: how many there are.
-        watch: whom to tell; None for nobody.
+        items: the items to process.
+        total: the number of items.
+        watch: receives the progress; None for no reports.
     """
     for done, item in enumerate(items, 1):
         yield item

@@ -13,19 +13,18 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import DISK, CrashhuntError, UsageError, remedy
-from crashhunt.base.limits import limit_behind
+from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import ended_by_signals
 from crashhunt.base.temporary import remove_leftovers
 from crashhunt.base.text import one_line
 from crashhunt.base.version import __version__
 from crashhunt.cli._bisect import add_bisect
 from crashhunt.cli._check import add_check
-from crashhunt.cli._common import Parser
+from crashhunt.cli._common import INTERRUPTED, Parser
 from crashhunt.cli._compare import add_compare
 from crashhunt.cli._completion import add_completion, complete
 from crashhunt.cli._corpus import add_corpus
 from crashhunt.cli._crashes import add_crashes
-from crashhunt.cli._exit_codes import INTERRUPTED
 from crashhunt.cli._export import add_export
 from crashhunt.cli._guide import add_guide
 from crashhunt.cli._judge import add_judge
@@ -40,6 +39,7 @@ from crashhunt.cli._status import add_status
 from crashhunt.cli._suite import add_rerun, add_suite
 from crashhunt.cli._trials import add_trials
 from crashhunt.cli._trust import add_trust_command
+from crashhunt.cli._whatif import add_whatif
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         code = _run(words)
         _flush()
-    except BrokenPipeError:  # whoever read our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed it
         _give_up_output()
         code = 0
     except KeyboardInterrupt:
@@ -110,7 +110,7 @@ def _report(error: CrashhuntError, *, as_json: bool) -> int:
 
 
 def _explained(error: Exception) -> CrashhuntError:
-    """What nobody has expected, in one line; with a variable of the environment, where it came from as well."""
+    """Return an unexpected error as one line; print its traceback first if CRASHHUNT_TRACEBACK is set."""
     if os.environ.get("CRASHHUNT_TRACEBACK"):
         traceback.print_exc()
     if isinstance(error, OSError):
@@ -120,7 +120,7 @@ def _explained(error: Exception) -> CrashhuntError:
         return CrashhuntError(str(error.strerror or error), fix=remedy(error), where=str(error.filename or ""))
     if limit := limit_behind(error):
         return CrashhuntError(f"the memory does not suffice: {type(error).__name__}", fix=limit)
-    from crashhunt.base.blame import in_words
+    from crashhunt.base.exceptions import in_words
 
     frames = traceback.extract_tb(error.__traceback__)
     where = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
@@ -156,8 +156,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,
-        add_crashes, add_judge, add_shrink, add_corpus, add_bisect, add_trust_command, add_check, add_compare,
-        add_lists, add_guide, add_completion,
+        add_crashes, add_judge, add_whatif, add_shrink, add_corpus, add_bisect, add_trust_command, add_check,
+        add_compare, add_lists, add_guide, add_completion,
     ):  # fmt: skip
         add(commands)
     return parser

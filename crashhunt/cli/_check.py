@@ -33,8 +33,8 @@ def add_check(commands: Commands) -> None:
     )  # fmt: skip
     check.add_argument(
         "--salvage", metavar="TO", type=Path,
-        help="copy what is whole of a hunt into this new directory, where the same hunt goes on; what is damaged is "
-        "left out, and its trials run again. Where the same command was killed, run it again",
+        help="copy the intact parts of a hunt into this new directory, where the hunt can resume; damaged trials are "
+        "excluded, and run again then. If this command was killed, run it again",
     )  # fmt: skip
     add_json(check)
     check.set_defaults(command=_check)
@@ -53,7 +53,7 @@ def _check(options: argparse.Namespace, _words: list[str]) -> int:
         saved = salvage(found[0], options.salvage)
         counts = f"{saved['trials']} trials and {saved['crashes']} crashes"
         say(
-            f"{counts} are in {options.salvage}; crashhunt run with it goes on from there",
+            f"{counts} are in {options.salvage}; resume the hunt there with crashhunt run",
             as_json=options.json,
         )
     fine = all(each.fine for each in found)

@@ -7,24 +7,53 @@ import sys
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import UntrustedError, UsageError
-from crashhunt.base.names import did_you_mean, one_of
-from crashhunt.base.text import visible
+from crashhunt.base.files import cannot_write
+from crashhunt.base.text import did_you_mean, one_of, visible
+from crashhunt.plans import hunt_options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from _typeshed import SupportsWrite
 
+    from crashhunt.base.watching import Watch
     from crashhunt.crashes import Archive, Bundle
+    from crashhunt.plans import Given, HuntOption
+
 
 __all__ = [
-    "Commands", "Parser", "add_crash", "add_json", "add_trust", "ask_to_trust", "check_trust", "chosen_runs", "integer",
-    "number", "opened_crash", "opened_hunt", "pairs", "run_trusted", "say",
-]  # fmt: skip
+    "BAD_INPUT",
+    "DONE",
+    "INTERRUPTED",
+    "NO_VALID_TRIAL",
+    "THE_ANSWER_IS_NO",
+    "Commands",
+    "Parser",
+    "add_ci_options",
+    "add_crash",
+    "add_json",
+    "add_options",
+    "add_options_of_machine",
+    "add_trust",
+    "ask_to_trust",
+    "check_trust",
+    "chosen_of_machine",
+    "chosen_options",
+    "chosen_runs",
+    "integer",
+    "number",
+    "opened_crash",
+    "opened_hunt",
+    "pairs",
+    "run_trusted",
+    "say",
+    "shown_progress",
+    "tell",
+]
 
 
 T = TypeVar("T")
@@ -249,3 +278,130 @@ def ask_to_trust(refusal: UntrustedError, *, as_json: bool) -> bool:
     print(visible(f"{refusal.where}: {refusal.message}"), file=sys.stderr)
     print("Trust this code from now on and run it? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+# What a command's exit code says; 130 is the shell's own for Ctrl-C.
+
+DONE: Final = 0
+THE_ANSWER_IS_NO: Final = 1
+BAD_INPUT: Final = 2
+NO_VALID_TRIAL: Final = 3
+INTERRUPTED: Final = 130
+
+
+# The bar of `film`, `export` and whatever takes its time; what a hunt shows while it runs is in `report`.
+
+
+@contextmanager
+def shown_progress(what: str, *, as_json: bool) -> Iterator[Watch | None]:
+    """Yield a function that shows progress in one line; the line is removed at the end, also after Ctrl-C.
+
+    Args:
+        what: is done, such as ``writing crash.mp4``.
+        as_json: whether the output is JSON; then no progress is shown.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if as_json or not console.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(20),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as line:
+        task = line.add_task(what, total=None)
+        yield lambda done, total: line.update(task, completed=done, total=total)
+
+
+# What commands tell a CI besides what they print: a summary in a file, annotations of GitHub's.
+
+
+def add_ci_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--summary`` and ``--annotate``."""
+    parser.add_argument(
+        "--summary", metavar="FILE", type=Path,
+        help="add a summary in Markdown to the end of FILE, such as $GITHUB_STEP_SUMMARY",
+    )  # fmt: skip
+    parser.add_argument(
+        "--annotate",
+        action="store_true",
+        help="print annotations as well, ten at most, which GitHub shows next to the code",
+    )
+
+
+def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) -> None:
+    """Write the summary and print the annotations, where they were asked for.
+
+    Raises:
+        HuntDirectoryError: the file cannot be written.
+    """
+    if options.summary is not None:
+        try:
+            with options.summary.open("a", encoding="utf-8") as file:
+                file.write(f"{summary}\n")
+        except OSError as error:
+            raise cannot_write(options.summary, error) from error
+    if options.annotate:
+        for line in annotations:
+            say(line, as_json=options.json)
+
+
+# The options of a hunt on the command line, as the list has them.
+
+
+def add_options(groups: Mapping[str, argparse._ArgumentGroup]) -> None:
+    """Add every option that has a flag to its group of the help."""
+    for option in hunt_options():
+        if option.about.flag:
+            _add(groups[option.about.group], option)
+
+
+def chosen_options(given: argparse.Namespace) -> Given:
+    """Return the options that were given, as `crashhunt.prepare` takes them.
+
+    Raises:
+        UsageError: a value has no name, or a name comes twice.
+    """
+    return {option.name: _value(option, getattr(given, option.name)) for option in hunt_options() if option.about.flag}
+
+
+def add_options_of_machine(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where all the hunts of a command run, whatever each of them says."""
+    for option in hunt_options():
+        if option.about.anywhere:
+            _add(parser, option, help_text=option.help_with("as each hunt says"))
+    parser.set_defaults(**{option.name: None for option in hunt_options() if option.about.anywhere})
+
+
+def chosen_of_machine(given: argparse.Namespace) -> Given:
+    """Return those of them that were given."""
+    found = {option.name: getattr(given, option.name) for option in hunt_options() if option.about.anywhere}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _add(group: argparse._ActionsContainer, option: HuntOption, help_text: str = "") -> None:
+    about = option.about
+    if option.form == "flag":
+        action = "store_false" if option.default else "store_true"
+        group.add_argument(about.flag, action=action, dest=option.name, help=help_text or option.help)
+        return
+    words: dict[str, Any] = {"default": option.default}
+    if option.form in ("integer", "number"):
+        words["type"] = integer if option.form == "integer" else number
+    elif option.form == "table" or (option.form == "list" and not about.separator):
+        words = {"action": "append", "default": [], "type": Path if about.metavar == "PATH" else None}
+    group.add_argument(about.flag, metavar=about.metavar, dest=option.name, help=help_text or option.help, **words)
+
+
+def _value(option: HuntOption, given: Any) -> object:
+    about = option.about
+    if option.form == "table":
+        return pairs(given, about.flag, named=about.named)
+    if about.separator and isinstance(given, str):
+        return tuple(word for word in given.split(about.separator) if word)
+    return (given or option.default) if option.form == "list" else given

@@ -44,7 +44,7 @@ def _compare(options: argparse.Namespace, _words: list[str]) -> int:
             if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:
-                say(f"{hunt} has not begun, and is left out", as_json=True)
+                say(f"{hunt} has not begun, and is excluded", as_json=True)
     found = compare(*hunts)
     if options.csv:
         found.write_csv(sys.stdout)

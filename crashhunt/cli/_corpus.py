@@ -10,10 +10,19 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_json, add_trust, check_trust, integer, opened_crash, run_trusted, say
-from crashhunt.cli._exit_codes import INTERRUPTED
-from crashhunt.cli._progress import shown_progress
-from crashhunt.cli._told import add_told, tell
+from crashhunt.cli._common import (
+    INTERRUPTED,
+    add_ci_options,
+    add_json,
+    add_trust,
+    check_trust,
+    integer,
+    opened_crash,
+    run_trusted,
+    say,
+    shown_progress,
+    tell,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -44,8 +53,8 @@ def _add_add(commands: Commands) -> None:
     add = commands.add_parser(
         "add",
         help="put crashes into a corpus",
-        description="Put crashes into a corpus: seed, arguments, scenario, and the log where it is small. The code of "
-        "crashhunt and of the agent is left out, for it is today's that is tested.",
+        description="Put crashes into a corpus: seed, arguments, scenario, and the log if it is small. The code of "
+        "crashhunt and of the agent is excluded, because a corpus tests the current code.",
     )
     add.add_argument(
         "bundles", metavar="BUNDLE", type=Path, nargs="+",
@@ -76,7 +85,7 @@ def _add_run(commands: Commands) -> None:
     )  # fmt: skip
     run.add_argument("--parallel", metavar="N", type=integer, default=0, help="cases at a time; default: one per core")
     add_trust(run)
-    add_told(run)
+    add_ci_options(run)
     add_json(run)
     run.set_defaults(command=_run)
 
@@ -94,9 +103,9 @@ def _add(options: argparse.Namespace, _words: list[str]) -> int:
             # Every run of the corpus runs what its cases name.
             run_trusted(partial(check_trust, bundle), bundle, archive, options, path=path)
             added = add_case(bundle, options.to, expect=options.expect, note=options.note)
-            told = added.case.to_json()
-            answers.append({**told, "new": added.new})
-            say(_added(told["path"], told["bytes"], log=told["log"], new=added.new), as_json=options.json)
+            data = added.case.to_json()
+            answers.append({**data, "new": added.new})
+            say(_added(data["path"], data["bytes"], log=data["log"], new=added.new), as_json=options.json)
             if bundle.confirmed is False:
                 say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
     if options.json:
@@ -124,7 +133,7 @@ def _run(options: argparse.Namespace, _words: list[str]) -> int:
             cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked),
             trusted=True,
         )  # fmt: skip
-    say(_told(reports, len(cases)), as_json=options.json)
+    say(_summary_of(reports, len(cases)), as_json=options.json)
     tell(options, corpus_summary(reports), corpus_annotations(reports))
     if options.json:
         print(json.dumps({"cases": [report.to_json() for report in reports]}))
@@ -143,7 +152,7 @@ def _trust_cases(cases: list[Path], options: argparse.Namespace) -> None:
             run_trusted(partial(check_trust, bundle), bundle, None, options, path=path)
 
 
-def _told(reports: list[CaseReport], count: int) -> str:
+def _summary_of(reports: list[CaseReport], count: int) -> str:
     lines = [report.describe() for report in reports if not report.ok]
     lines += [f"{report.path.name}: {report.line}" for report in reports if report.ok and report.got == "still"]
     tighter = [report for report in reports if report.may_be_tightened]

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.cli._common import add_json, say
-from crashhunt.cli._told import add_told, tell
+from crashhunt.cli._common import add_ci_options, add_json, say, tell
 
 if TYPE_CHECKING:
     import argparse
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 
     from crashhunt.cli._common import Commands
     from crashhunt.corpus import Case
-    from crashhunt.triage import Group, Signature
+    from crashhunt.crashes import Group, Signature
 
 __all__ = ["add_crashes"]
 
@@ -37,16 +36,15 @@ def add_crashes(commands: Commands) -> None:
     crashes.add_argument(
         "--sarif", metavar="FILE", type=Path, help="write the kinds as SARIF 2.1.0, for code scanning and editors"
     )
-    add_told(crashes)
+    add_ci_options(crashes)
     add_json(crashes)
     crashes.set_defaults(command=_crashes)
 
 
 def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
-    from crashhunt.crashes import list_bundles
+    from crashhunt.crashes import group_crashes, list_bundles
     from crashhunt.hunts import dropped_crashes, find_hunts
     from crashhunt.report import describe_groups
-    from crashhunt.triage import group_crashes
 
     cases = _cases(options.known)
     hunts = list(dict.fromkeys(hunt for directory in options.directories for hunt in find_hunts(directory)))
@@ -58,10 +56,10 @@ def _crashes(options: argparse.Namespace, _words: list[str]) -> int:
         say(f"left out: {why}", as_json=True)
     _tell(options, found.groups, known)
     if options.json:
-        told = [dict(group.to_json()) for group in found.groups]
+        groups = [dict(group.to_json()) for group in found.groups]
         if known is not None:
-            told = [{**one, "known": known.get(of.signature)} for one, of in zip(told, found.groups, strict=True)]
-        print(json.dumps({"groups": told, "left_out": list(found.left_out)}))
+            groups = [{**one, "known": known.get(of.signature)} for one, of in zip(groups, found.groups, strict=True)]
+        print(json.dumps({"groups": groups, "left_out": list(found.left_out)}))
     return 0
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, opened_crash, say
-from crashhunt.cli._progress import shown_progress
+from crashhunt.cli._common import add_crash, add_json, opened_crash, say, shown_progress
 
 if TYPE_CHECKING:
     import argparse

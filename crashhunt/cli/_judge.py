@@ -9,9 +9,19 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import add_crash, add_json, add_trust, check_trust, integer, opened_crash, run_trusted, say
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED
-from crashhunt.cli._progress import shown_progress
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    add_crash,
+    add_json,
+    add_trust,
+    check_trust,
+    integer,
+    opened_crash,
+    run_trusted,
+    say,
+    shown_progress,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -27,11 +37,12 @@ def add_judge(commands: Commands) -> None:
     judge = commands.add_parser(
         "judge",
         help="find out until when a collision could have been avoided, and what a crash hangs on, by running it",
-        description="Run the trial of a collision again and again, each time with the agent overruled from another "
-        "step on: braking as hard as its vehicle can, or changing lanes and braking, the others reacting as they then "
-        "do. Says until when that avoids it. Then with one thing left out at a time: a decision of the agent's, what "
-        "another vehicle did, the value of an argument; says what the crash hangs on, which is all that is asked of a "
-        "crash that is no collision with somebody. Writes it into crash.json, and from then on show tells it too.",
+        description="Find the last avoidable step and the causes of a crash. First run a collision repeatedly, with "
+        "the agent overruled from another step on: full braking, or a lane change and braking. Other "
+        "vehicles react. Report the last step from which that avoids the collision. Then run the crash "
+        "with one thing removed at a time: a decision of the agent, a maneuver of another vehicle, the "
+        "value of an argument. Report the causes. Crashes other than collisions get the second analysis "
+        "only. The result is added to crash.json, and shown by show.",
     )
     add_crash(judge)
     judge.add_argument(
@@ -63,23 +74,23 @@ def _judge(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--parallel is {options.parallel}", fix="give at least 0 (0: one per core)")
     if options.all and options.crash:
         raise UsageError(f"--all and --crash {options.crash} contradict each other", fix="leave one of them out")
-    told: list[dict[str, object]] = []
+    answers: list[dict[str, object]] = []
     with stop_requests() as stops:
         if options.all:
             bundles = _unjudged(options)
             for bundle in bundles:  # before the first one runs
                 run_trusted(partial(check_trust, bundle), bundle, None, options)
-            told += (_judge_one(options, bundle, stops, True, write=True) for bundle in bundles if not stops)
+            answers += (_judge_one(options, bundle, stops, True, write=True) for bundle in bundles if not stops)
         else:
             with opened_crash(options.directory, options.crash) as (bundle, archive):
-                told.append(
+                answers.append(
                     run_trusted(
                         lambda trusted: _judge_one(options, bundle, stops, trusted, write=archive is None),
                         bundle, archive, options,
                     )
                 )  # fmt: skip
     if options.json:
-        print(json.dumps({"judged": told}))
+        print(json.dumps({"judged": answers}))
     return INTERRUPTED if stops else DONE
 
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say
-from crashhunt.cli._progress import shown_progress
+from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, say, shown_progress
 
 if TYPE_CHECKING:
     import argparse

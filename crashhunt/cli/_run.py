@@ -11,9 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.cli._common import add_json, integer
-from crashhunt.cli._exit_codes import DONE, INTERRUPTED, NO_VALID_TRIAL, THE_ANSWER_IS_NO
-from crashhunt.cli._options import add_options, chosen_options
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    NO_VALID_TRIAL,
+    THE_ANSWER_IS_NO,
+    add_json,
+    add_options,
+    chosen_options,
+    integer,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -31,7 +38,7 @@ def add_run(commands: Commands) -> None:
         "run",
         help="hunt for a crash",
         description="Hunt for a crash: run trials in parallel, each with its own seed and arguments, and stop as soon "
-        "as one crashes. The same command on the same DIR goes on from where it was.",
+        "as one crashes. The same command on the same DIR resumes the hunt.",
     )
     run.add_argument("directory", metavar="DIR", type=Path, help="where everything is kept; made if it is not there")
     run.add_argument("parallel", metavar="PARALLEL", type=integer, help="trials at a time; 0: one per core")
@@ -40,15 +47,15 @@ def add_run(commands: Commands) -> None:
     what = run.add_argument_group("what is hunted")
     how = run.add_argument_group("how it is hunted")
     add_options({"what": what, "how": how})
-    how.add_argument("--overwrite", action="store_true", help="begin anew, whatever hunt is in DIR")
+    how.add_argument("--overwrite", action="store_true", help="start a new hunt, even if DIR holds another one")
     how.add_argument("--fail-on-crash", action="store_true", help="exit with 1 if a crash was found")
     add_json(how)
     run.set_defaults(command=_run)
 
 
 def _run(options: argparse.Namespace, words: list[str]) -> int:
-    # From here to where the hunt takes over there is nothing to keep, and an exception would be lost where somebody
-    # else's import swallows it.
+    # Exit at once, because nothing has to be kept before the hunt takes over, and an import in user code could swallow
+    # an exception.
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
     from crashhunt.api import prepare
 
@@ -91,9 +98,8 @@ def _tell_of_the_survey(options: argparse.Namespace) -> threading.Timer:
     def tell() -> None:
         scenario = Path(str(options.scenario))
         if scenario.is_file() and scenario.suffix != ".toml":  # only a simulator's own configuration is surveyed
-            print(
-                "simulating the plain traffic, to find vehicles that enter (60 s at most)", file=sys.stderr, flush=True
-            )
+            limit = "60 s of processor time at most"
+            print(f"simulating the plain traffic, to find vehicles that enter ({limit})", file=sys.stderr, flush=True)
 
     timer = threading.Timer(_LONG_WAIT_S, tell)
     timer.daemon = True

@@ -7,9 +7,17 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import in_lines
-from crashhunt.cli._common import add_crash, add_json, add_trust, integer, opened_crash, run_trusted, say
-from crashhunt.cli._exit_codes import INTERRUPTED
-from crashhunt.cli._progress import shown_progress
+from crashhunt.cli._common import (
+    INTERRUPTED,
+    add_crash,
+    add_json,
+    add_trust,
+    integer,
+    opened_crash,
+    run_trusted,
+    say,
+    shown_progress,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -29,12 +37,12 @@ def add_shrink(commands: Commands) -> None:
     shrink = commands.add_parser(
         "shrink",
         help="make a crash smaller while it stays the same kind of crash",
-        description="Make a crash smaller while it stays the same kind of crash: leave others out, drop disturbances, "
-        "bring arguments to their defaults and to round numbers; where it takes many others, move these along their "
-        "recorded ways, leave out those whom it does not take, and cut the beginning off. Each step is really run, by "
-        "the code of the snapshot. "
-        "What is left is a crash of its own beside the first, ID.small. Interrupted, it leaves the best that it has, "
-        "and the same command goes on from there. Exits with 1 where the crash does not come again.",
+        description="Minimize a crash while its crash type stays the same: remove other actors, drop disturbances, "
+        "and set arguments to their defaults and to round numbers. If the crash needs many other actors, "
+        "move them along their recorded ways, remove the unnecessary ones, and cut off the beginning. "
+        "Each candidate is run with the code of the snapshot. The result is a new crash next to the "
+        "first, ID.small. If you interrupt the command, it keeps the best result, and the same command "
+        "resumes. Exits with 1 if the crash does not reproduce.",
     )
     add_crash(shrink)
     shrink.add_argument(
@@ -47,7 +55,7 @@ def add_shrink(commands: Commands) -> None:
     )  # fmt: skip
     shrink.add_argument(
         "--form", choices=("either", "traffic", "scripted"), default="either",
-        help="whether the others go on driving (traffic), or are moved along their recorded ways (scripted); default: "
+        help="whether other actors keep driving (traffic), or are moved along their recorded ways (scripted); default: "
         "either, traffic where that leaves few of them",
     )  # fmt: skip
     shrink.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
@@ -70,7 +78,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
         raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
     if options.directory.is_file():
         raise UsageError(
-            "shrink writes the minimized crash beside the crash, and cannot write into an exported file",
+            "shrink writes the minimized crash next to the crash, and cannot write into an exported file",
             fix="unpack it (a zip file) into a new folder and give that folder; shrink asks before it runs the code",
             where=str(options.directory),
         )
@@ -84,7 +92,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
                 )  # fmt: skip
 
         found = run_trusted(run, bundle, None, options)
-    say(_told(found), as_json=options.json)
+    say(_summary_of(found), as_json=options.json)
     if options.json:
         print(json.dumps(found.to_json()))
     if found.ended == "interrupted":
@@ -92,7 +100,7 @@ def _shrink(options: argparse.Namespace, _words: list[str]) -> int:
     return 1 if found.verdict == "not_reproduced" else 0
 
 
-def _told(found: Shrunk) -> str:
+def _summary_of(found: Shrunk) -> str:
     was, small = found.bundle.result, found.small
     lines = [f"{found.bundle.id}: {was.summary}"]
     if small is None:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import one_line
-from crashhunt.cli._common import add_json
-from crashhunt.cli._exit_codes import BAD_INPUT, DONE
+from crashhunt.cli._common import BAD_INPUT, DONE, add_json
 
 if TYPE_CHECKING:
     import argparse
@@ -67,7 +66,7 @@ def _states(directories: list[Path]) -> list[HuntState]:
 
 
 def states_console(*, stderr: bool = False) -> Console:
-    """Return where the table goes; where nobody says how wide that is, as wide as most logs."""
+    """Return the console for the table; where its width is unknown, as wide as most logs."""
     from rich.console import Console
 
     console = Console(stderr=stderr, highlight=False)
@@ -100,8 +99,8 @@ def states_table(states: list[HuntState]) -> Table:
             str(state.errors),
             Text(said),
         )
-        for told in copies_told(state):
-            table.add_row(*[""] * 7, Text(told))
+        for line in fork_lines(state):
+            table.add_row(*[""] * 7, Text(line))
         if state.core is not None:
             table.add_row(Text(one_line(f"  compiled core {state.core}")))
         for node in (state.nodes or [])[:_NODES]:
@@ -112,21 +111,21 @@ def states_table(states: list[HuntState]) -> Table:
     return table
 
 
-def copies_told(state: HuntState) -> list[str]:
-    """Return what came of the copies of a hunt's trials so far, a line each; nothing where it has none."""
-    told = []
+def fork_lines(state: HuntState) -> list[str]:
+    """Return the results of the forks of a hunt's trials so far, one line each; an empty list where it has none."""
+    lines = []
     if (probes := state.probes) is not None:
         least = "no stress margin yet"
         if probes["least"] is not None:
             least = f"least stress margin {probes['least']:.2f} (trial {probes['trial']})"
         crashed = f"{probes['crashed_trials']} of {probes['trials'] + probes['not_fully_asked']} trials"
         said = f"{least}; probes {probes['probes']}, made to crash {crashed}{_confirmed(probes)}"
-        told.append(said + _not_fully_asked(probes))
+        lines.append(said + _not_fully_asked(probes))
     if (branches := state.branches) is not None:
         asked = f"branches {branches['branches']} (moments {branches['moments']})"
         crashed = f"crashed {branches['crashed']} (in {branches['crashed_trials']} of {branches['trials']} trials)"
-        told.append(f"{asked}, {crashed}{_confirmed(branches)}{_not_fully_asked(branches)}")
-    return told
+        lines.append(f"{asked}, {crashed}{_confirmed(branches)}{_not_fully_asked(branches)}")
+    return lines
 
 
 def _not_fully_asked(sums: ProbeSums | BranchSums) -> str:

@@ -7,9 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.errors import UntrustedError
-from crashhunt.cli._common import add_json, add_trust, ask_to_trust, chosen_runs, integer, pairs, say
-from crashhunt.cli._exit_codes import DONE, THE_ANSWER_IS_NO
-from crashhunt.cli._options import add_options_of_machine, chosen_of_machine
+from crashhunt.cli._common import (
+    DONE,
+    THE_ANSWER_IS_NO,
+    add_json,
+    add_options_of_machine,
+    add_trust,
+    ask_to_trust,
+    chosen_of_machine,
+    chosen_runs,
+    integer,
+    pairs,
+    say,
+)
 from crashhunt.cli._status import show_states, states_console, states_table
 
 if TYPE_CHECKING:
@@ -35,8 +45,8 @@ def add_suite(commands: Commands) -> None:
     run = verbs.add_parser(
         "run",
         help="run what has not ended",
-        description="Plan every run as a folder of DIR, and run those that have not ended, whatever becomes of the "
-        "others. Done again, it goes on. Exits with 1 where a hunt could not run.",
+        description="Plan every run as a folder of DIR, and run those that have not ended, even if "
+        "others fail. The same command resumes the suite. Exits with 1 where a hunt could not run.",
     )
     run.add_argument("file", metavar="FILE", type=Path, help="a suite.toml")
     run.add_argument("directory", metavar="DIR", type=Path, help="made if it is not there")
@@ -59,8 +69,8 @@ def add_rerun(commands: Commands) -> None:
     rerun = commands.add_parser(
         "rerun",
         help="run again what failed, or a hunt with other settings elsewhere",
-        description="Run again what failed: hunts that ended in an error anew, those that were interrupted or killed "
-        "from where they were, and trials that could not be set up. What is replaced is kept beside it. With --to, run "
+        description="Run again what failed: restart hunts that ended in an error, resume those that were interrupted "
+        "or killed, and repeat trials whose setup failed. Replaced files are kept next to the new ones. With --to, run "
         "one hunt with other settings in another directory.",
     )
     rerun.add_argument("directory", metavar="DIR", type=Path, help="of a hunt or a suite")
@@ -68,7 +78,7 @@ def add_rerun(commands: Commands) -> None:
                        help="of a suite: only this run, such as town/0, or those of town; may be repeated")  # fmt: skip
     which = rerun.add_mutually_exclusive_group()
     which.add_argument("--failed", action="store_true", help="only what failed (the default)")
-    which.add_argument("--all", action="store_true", help="everything, anew")
+    which.add_argument("--all", action="store_true", help="everything, from the start")
     rerun.add_argument("--set", metavar="NAME=SPEC", action="append", default=[], dest="sets",
                        help="with --to or --all: another specification for an argument (ID.NAME for one of several "
                        "agents), or for trials, max_steps or seed")  # fmt: skip

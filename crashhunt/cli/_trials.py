@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.names import one_of
-from crashhunt.base.text import visible
+from crashhunt.base.text import one_of, visible
 
 if TYPE_CHECKING:
     import argparse

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UsageError
-from crashhunt.base.names import near_path
+from crashhunt.base.text import near_path
 from crashhunt.cli._common import add_json, say
 
 if TYPE_CHECKING:

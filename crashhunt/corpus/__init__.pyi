@@ -1,17 +1,16 @@
-from ._bisect import Bisected as Bisected, BisectedData as BisectedData, bisect as bisect
-from ._case import (
+from ._bisect import Bisected as Bisected, bisect as bisect
+from ._cases import (
+    Added as Added,
     Case as Case,
-    CaseData as CaseData,
     Expectation as Expectation,
+    add_case as add_case,
     find_cases as find_cases,
+    known_kinds as known_kinds,
     read_case as read_case,
 )
-from ._known import known_kinds as known_kinds
 from ._run import (
     CaseReport as CaseReport,
     Got as Got,
-    ReportData as ReportData,
     run_cases as run_cases,
     untrusted_case as untrusted_case,
 )
-from ._store import Added as Added, add_case as add_case

@@ -10,37 +10,28 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import environment_of_git
-from crashhunt.base.owners import this_process
 from crashhunt.base.processes import die_with
-from crashhunt.base.temporary import temporary_beside, temporary_folder
-from crashhunt.corpus._store import add_case
+from crashhunt.base.temporary import temporary_beside, temporary_folder, this_process
+from crashhunt.corpus._cases import add_case
 from crashhunt.plans import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.corpus._run import Got
     from crashhunt.crashes import Bundle
 
-__all__ = ["Bisected", "BisectedData", "bisect"]
+__all__ = ["Bisected", "bisect"]
 
 _WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
 _FOUND = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
 _ORIGIN = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
-
-
-class BisectedData(TypedDict):
-    """What ``bisect --json`` prints."""
-
-    commit: str | None
-    subject: str
-    candidates: list[str]
-    tried: dict[str, Got]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +50,7 @@ class Bisected:
     candidates: tuple[str, ...]
     tried: dict[str, Got]
 
-    def to_json(self) -> BisectedData:
+    def to_json(self) -> JsonObject:
         """Return the shape that ``bisect --json`` prints."""
         return {
             "commit": self.commit or None,

@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from collections import deque
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.temporary import TemporaryFolder
 from crashhunt.base.text import in_lines, one_line
-from crashhunt.corpus._case import Case, Expectation, read_case
-from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, snapshot_of, write_bundle
+from crashhunt.corpus._cases import Case, Expectation, read_case
+from crashhunt.crashes import Bundle, is_bundle_trusted, refuse_untrusted, signature_of, snapshot_of, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.plans import (
@@ -25,7 +26,6 @@ from crashhunt.plans import (
     write_settings,
 )
 from crashhunt.snapshots import Snapshot, environment_changes, take_snapshot
-from crashhunt.triage import signature_of
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
@@ -35,29 +35,15 @@ if TYPE_CHECKING:
     from crashhunt.plans import HuntSettings
     from crashhunt.trial import TrialResult
 
-__all__ = ["CaseReport", "Got", "ReportData", "run_cases", "untrusted_case"]
+__all__ = ["CaseReport", "Got", "run_cases", "untrusted_case"]
 
 Got = Literal["still", "fixed", "changed", "cannot_run"]
 _LOOK_EVERY_S = 0.01  # at each of those that run
 _NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
 
 
-class ReportData(TypedDict):
-    """A case as ``corpus run --json`` prints it."""
-
-    path: str
-    expected: Expectation
-    got: Got
-    ok: bool
-    may_be_tightened: bool
-    was: str
-    now: str
-    warnings: list[str]
-    kept: NotRequired[str]
-
-
 @dataclass(frozen=True, slots=True)
-class CaseReport:
+class CaseReport(Serializable):
     """What came of a case.
 
     Args:
@@ -79,7 +65,9 @@ class CaseReport:
     now: str = ""
     note: str = ""
     warnings: tuple[str, ...] = ()
-    kept: Path | None = None
+    kept: Path | None = field(default=None, metadata=OMIT_DEFAULT)
+
+    json_keys = ("path", "expected", "got", "ok", "may_be_tightened", "was", "now", "warnings", "kept")
 
     @property
     def ok(self) -> bool:
@@ -109,22 +97,6 @@ class CaseReport:
         if self.kept is not None:
             lines.append(f"  look at it: crashhunt show {self.kept}")
         return in_lines(lines)
-
-    def to_json(self) -> ReportData:
-        """Return the shape that ``corpus run --json`` prints."""
-        data: ReportData = {
-            "path": str(self.path),
-            "expected": self.expected,
-            "got": self.got,
-            "ok": self.ok,
-            "may_be_tightened": self.may_be_tightened,
-            "was": self.was,
-            "now": self.now,
-            "warnings": list(self.warnings),
-        }
-        if self.kept is not None:
-            data["kept"] = str(self.kept)
-        return data
 
 
 _WORDS = {

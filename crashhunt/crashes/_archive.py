@@ -21,9 +21,8 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.watching import watched
-from crashhunt.crashes._data import ArchiveIndex
-from crashhunt.crashes._origins import is_bundle_made_here
-from crashhunt.crashes._trust import is_made_here, signature
+from crashhunt.crashes._bundle import ArchiveIndex
+from crashhunt.crashes._trust import is_bundle_made_here, is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
-from crashhunt.base.integrity import changed_file, digest_of_data, read_object, typed
+from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
 from crashhunt.base.temporary import temporary_beside
+from crashhunt.base.text import listed, near_path, one_of
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
-from crashhunt.crashes._beside import collect_output, files_beside, see_that_it_is_whole
-from crashhunt.crashes._data import CrashData
-from crashhunt.crashes._origins import authenticate_bundle
+from crashhunt.crashes._trust import authenticate_bundle
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.snapshots import versions
 from crashhunt.trial import (
@@ -36,18 +36,177 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.integrity import FileEntry
-    from crashhunt.base.plain import Plain
-    from crashhunt.crashes._data import CrashSummary
+    from crashhunt.base.json_types import Plain
     from crashhunt.recording import DivergenceData
+    from crashhunt.trial import Value
     from crashhunt.world import Lane
 
+
 __all__ = [
+    "ArchiveIndex",
     "Bundle",
+    "CrashData",
+    "CrashSummary",
+    "Protected",
+    "collect_output",
+    "crash_folders",
+    "files_beside",
+    "files_of",
+    "find_bundle",
+    "list_bundles",
+    "list_near_misses",
     "read_bundle",
+    "read_params",
+    "refuse_damaged",
     "write_bundle",
     "write_trial",
 ]
+
+
+# The shapes of what a crash consists of on disk: ``crash.json``, and the index of an archive.
+#
+# What an earlier version did not write need not be there, and what a later one has added may be there as well.
+
+
+class Protected(TypedDict):
+    """What says of itself, and of the files beside it, what they were when they were written."""
+
+    schema: int
+    files: dict[str, FileEntry]
+    integrity: NotRequired[str]
+
+
+class CrashData(Protected):
+    """``crash.json``."""
+
+    id: str
+    hunt_seed: int
+    trial: int
+    seed: int
+    max_steps: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    outcome: str
+    category: NotRequired[str]
+    summary: str
+    step: int
+    sim_time_s: float
+    collision: JsonObject | None
+    failure: JsonObject | None
+    escape: NotRequired[JsonObject | None]
+    event: NotRequired[JsonObject | None]
+    events: NotRequired[dict[str, int] | None]
+    closest_approach: JsonObject
+    digest: str
+    snapshot: str
+    versions: dict[str, str]
+    confirmed: bool | None
+    divergence: DivergenceData | None
+    disturbed: NotRequired[bool]
+    log_likelihood: NotRequired[float | None]
+    danger: NotRequired[float | None]
+    disturbances: NotRequired[list[JsonObject]]
+    planned_disturbances: NotRequired[list[JsonObject]]
+    only: NotRequired[list[str] | None]
+    script: NotRequired[JsonObject | None]
+    why_unconfirmed: NotRequired[str]
+    why_no_escape: NotRequired[str]
+    authentication_code: NotRequired[str]
+
+
+class CrashSummary(TypedDict):
+    """A crash as ``run --json`` prints it."""
+
+    id: str
+    trial: int
+    seed: int
+    outcome: str
+    step: int
+    arguments: Mapping[str, Mapping[str, Value]]
+    scenario_arguments: Mapping[str, Value]
+    path: str
+    digest: str
+    confirmed: bool | None
+    why_unconfirmed: NotRequired[str]
+    disturbed: NotRequired[bool]
+    log_likelihood: NotRequired[float | None]
+    danger: NotRequired[float | None]
+
+
+class ArchiveIndex(TypedDict):
+    """The index of an archive."""
+
+    schema: int
+    crash: str
+    made_by: str
+    made_at: str
+    files: dict[str, FileEntry]
+    signature: NotRequired[str]
+
+
+# The files beside ``crash.json``, and beside ``params.json`` of a trial that is kept for another reason.
+
+
+def refuse_damaged(data: Protected) -> None:
+    """See that what says what it was is what was written.
+
+    Raises:
+        ValueError: it is not.
+    """
+    typed(data, {"integrity": str, "files": FILES})
+    said = data.pop("integrity")
+    if digest_of_data(data) != said:
+        raise ValueError("it has changed since it was written")
+    for name, entry in data["files"].items():
+        typed(entry, {"size": int, "blake2b": str})
+        if "/" in name or name in ("", ".", ".."):
+            raise ValueError(f"the file {name!r} is not beside it")
+
+
+def files_of(folder: Path) -> dict[str, FileEntry]:
+    """Return size and digest of what a crash or a kept trial came with, where that was written down and can be read."""
+    for name in (layout.CRASH, layout.PARAMS):
+        with suppress(OSError, ValueError):
+            data = read_object(folder / name, Protected)
+            if "integrity" in data:
+                refuse_damaged(data)
+                return dict(data["files"])
+    return {}
+
+
+def files_beside(folder: Path) -> dict[str, FileEntry]:
+    """Return size and digest of every file of a folder but the one that says so."""
+    found = describe_files(folder)
+    return {
+        name: entry for name, entry in found.items() if name not in (layout.CRASH, layout.PARAMS) and name[0] != "."
+    }
+
+
+def read_params(folder: Path) -> list[str]:
+    """Return what of a trial that was kept is not as it was written."""
+    try:
+        data = read_object(folder / layout.PARAMS, Protected)
+        if "integrity" in data:  # which earlier versions did not write
+            refuse_damaged(data)
+        files = data.get("files", {}).items()
+        return [f"{name} {wrong}" for name, entry in files if (wrong := changed_file(folder / name, entry))]
+    except (OSError, ValueError) as error:
+        return [f"params.json: {error.strerror if isinstance(error, OSError) else error}"]
+
+
+def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
+    """Copy what a trial has printed, and write down how it failed."""
+    run_log = scratch / layout.RUN_LOG
+    if run_log.is_file():
+        shutil.copyfile(run_log, target / layout.RUN_LOG)
+    failure = result.failure
+    if failure is not None:
+        parts = (f"{failure.kind}: {failure.message}", failure.traceback, failure.last_output)
+        text = "\n\n".join(part.rstrip() for part in parts if part.strip())
+        (target / layout.ERROR_LOG).write_text(text + "\n", encoding="utf-8", errors="replace")
+
 
 SCHEMA = 5
 _ALL_DRIVE = 4  # what is written where nobody is scripted
@@ -264,7 +423,7 @@ def read_bundle(path: Path) -> Bundle:
                 f"schema {data['schema']} is above {SCHEMA}", fix="use the version that wrote it", where=str(file)
             )
         if data["schema"] >= _PROTECTED or "integrity" in data:
-            see_that_it_is_whole(data)
+            refuse_damaged(data)
         return _bundle(path, data)
     except OSError as error:
         raise BundleError(
@@ -403,3 +562,121 @@ def write_trial(directory: Path, result: TrialResult, scratch: Path) -> None:
     with whole_file(target / layout.PARAMS, lasting=False) as temporary:
         temporary.write_text(json.dumps(data, indent=2), encoding="utf-8")
     shutil.rmtree(scratch, ignore_errors=True)
+
+
+# Finding the crashes of a hunt, and the one that somebody means.
+
+
+def list_bundles(directory: Path) -> list[Bundle]:
+    """Return the crashes of a hunt, in order of their trials."""
+    return [read_bundle(folder) for folder in crash_folders(directory)]
+
+
+def list_near_misses(directory: Path) -> list[Bundle]:
+    """Return the near misses of a hunt, the most dangerous first."""
+    found = [read_bundle(folder) for folder in crash_folders(directory, layout.NEAR_MISSES)]
+    return sorted(found, key=lambda bundle: (-(bundle.result.danger or 0.0), bundle.result.spec.number))
+
+
+def crash_folders(directory: Path, place: str = layout.CRASHES) -> list[Path]:
+    """Return the folders of crashes, also of one that has lost its ``crash.json``; not of those that were made smaller.
+
+    Args:
+        directory: of the hunt.
+        place: the folder there that has them.
+    """
+    folders = (directory / place).glob(layout.SHOWN)
+    found = (path for path in folders if path.is_dir() and not path.name.endswith(layout.SMALL))
+    return sorted(path for path in found if re.match(r"\d+-", path.name) or (path / layout.CRASH).exists())
+
+
+def find_bundle(directory: Path, crash: str = "") -> Bundle:
+    """Return one crash or near miss of a hunt: the one that is named, or the crash with the fewest steps.
+
+    Of a hunt that has near misses only, that is the most dangerous of them; else one that copies have found; and else
+    one that was made smaller, as in the file to which that was exported.
+
+    Args:
+        directory: of the hunt, or of the bundle itself.
+        crash: its id or that of a near miss, or else of what probes or branches have found; the beginning of it, or its
+            trial's number, with leading zeros or without. One that was made smaller is only meant by its whole id.
+
+    Raises:
+        BundleError: there is no such crash.
+    """
+    if (directory / layout.CRASH).is_file() and not crash:
+        return read_bundle(directory)
+    small = directory / layout.CRASHES / crash
+    if crash.endswith(layout.SMALL) and small.parent == directory / layout.CRASHES and small.is_dir():
+        return read_bundle(small)
+    if crash:
+        # What copies have found of a trial has its number as well, and may have the name of a crash.
+        found = (_readable(directory, crash, places) for places in _PLACES)
+        bundles = next((some for some in found if any(_may_be(bundle, crash) for bundle in some)), None)
+        bundles = bundles if bundles is not None else _readable(directory, crash, _PLACES[0])
+    else:
+        bundles = list_bundles(directory) or list_near_misses(directory)[:1] or _of_copies(directory)
+        bundles = bundles or _made_smaller(directory)
+    if not bundles:
+        if directory.is_file():
+            raise BundleError(
+                f"{str(directory)!r} is a file, not the directory of a hunt",
+                fix="unpack it into a new folder if crashhunt export wrote it, and give that folder",
+            )
+        if not directory.is_dir():
+            fix = f"{near_path(directory, '.zip')}give the directory of a hunt"
+            raise BundleError(f"{str(directory)!r} does not exist", fix=fix)
+        raise BundleError(
+            "no crash was saved here", fix="give the directory of a hunt that found one", where=str(directory)
+        )
+    if not crash:
+        return min(bundles, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
+    return _named(bundles, crash, directory)
+
+
+_PLACES = ((layout.CRASHES, layout.NEAR_MISSES), (layout.PROBES,), (layout.BRANCHES,))
+
+
+def _of_copies(directory: Path) -> list[Bundle]:
+    return [
+        read_bundle(folder) for place in (layout.PROBES, layout.BRANCHES) for folder in crash_folders(directory, place)
+    ]
+
+
+def _made_smaller(directory: Path) -> list[Bundle]:
+    found = sorted((directory / layout.CRASHES).glob(f"*{layout.SMALL}"))
+    return [read_bundle(path) for path in found if (path / layout.CRASH).is_file()]
+
+
+def _may_be(bundle: Bundle, crash: str) -> bool:
+    return bundle.id.startswith(crash) or (crash.isdecimal() and bundle.result.spec.number == int(crash))
+
+
+def _readable(directory: Path, crash: str, places: Sequence[str]) -> list[Bundle]:
+    """The crashes of a hunt; one that is damaged is in the way of nobody who means another."""
+    found = []
+    for path in (folder for place in places for folder in crash_folders(directory, place)):
+        try:
+            found.append(read_bundle(path))
+        except BundleError:
+            name = path.name
+            if name.startswith(crash) or name.partition("-")[0].lstrip("0") == crash.lstrip("0"):
+                raise
+    return found
+
+
+def _named(bundles: Sequence[Bundle], crash: str, directory: Path) -> Bundle:
+    """The one crash that somebody can mean; an id is exact, and else a number, before the beginning of an id."""
+    number = int(crash) if crash.isdecimal() else None
+    for meant in (
+        [bundle for bundle in bundles if bundle.id == crash],
+        [bundle for bundle in bundles if bundle.result.spec.number == number],
+        [bundle for bundle in bundles if bundle.id.startswith(crash)],
+    ):
+        if len(meant) == 1:
+            return meant[0]
+        if meant:
+            fix = f"give one of {listed(bundle.id for bundle in meant)}"
+            raise BundleError(f"{crash!r} may be several crashes", fix=fix, where=str(directory))
+    fix = one_of(crash, (bundle.id for bundle in bundles))
+    raise BundleError(f"there is no crash {crash!r}", fix=fix, where=str(directory))

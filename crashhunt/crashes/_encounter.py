@@ -4,18 +4,41 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from crashhunt.world import Roster, Scene, approaches, outlines_overlap, rectangle_gap, time_to_contact
+from crashhunt.world import (
+    DangerMeter,
+    Roster,
+    Scene,
+    approaches,
+    dangers,
+    followers_danger,
+    outlines_overlap,
+    rectangle_gap,
+    time_to_contact,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.recording import Recording
+    from crashhunt.world import DangerousMoment
 
-__all__ = ["Encounter", "Manner", "Moment", "Position", "last_escape"]
+
+__all__ = [
+    "DangerCourse",
+    "Encounter",
+    "Manner",
+    "Moment",
+    "Position",
+    "danger_course",
+    "last_escape",
+    "most_dangerous",
+    "visible_from",
+]
+
 
 _LOOKS_BACK_S = 30.0  # before the end; what was longer ago has not led to it
 _PART_M, _MOST_PARTS = 0.5, 100  # within a step, outlines are compared each time both together have moved so far
@@ -294,3 +317,134 @@ def _turned(vectors: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArr
     """Vectors of the map in frames with these headings."""
     c, s = np.cos(heading), np.sin(heading)
     return np.stack((vectors[:, 0] * c + vectors[:, 1] * s, vectors[:, 1] * c - vectors[:, 0] * s), axis=1)
+
+
+# How dangerous a recorded trial was from step to step: for the agent, and by those behind it.
+
+_UNKNOWN_S = 4.0  # before the end: whoever would have been met later is not in the recording
+
+
+@dataclass(frozen=True, slots=True)
+class DangerCourse:
+    """The danger of a recorded trial over time, measured after the fact.
+
+    A danger is not a number in steps in which the agent is not there, and where it would be 0 within the last 4 s: it
+    is measured by what came afterwards, and that was not recorded.
+
+    Args:
+        agent: whose.
+        steps: that have a scene.
+        own: the danger of each of them that is the agent's own: towards whoever is ahead or crosses its way.
+        behind: that of each by those who close in on the agent from behind, on its way.
+        greatest: the moment of the greatest own danger.
+        greatest_behind: likewise of those behind; ``other`` is who.
+        own_total: the integral over the trial, from 0 to below 1: for a trial without a crash and with one agent that
+            is what trials are ranked by.
+        behind_total: likewise.
+    """
+
+    agent: str
+    steps: tuple[int, ...]
+    own: NDArray[np.float64]
+    behind: NDArray[np.float64]
+    greatest: DangerousMoment
+    greatest_behind: DangerousMoment
+    own_total: float
+    behind_total: float
+
+    def of_step(self, step: int) -> tuple[float, float] | None:
+        """The own danger of a step and that by those behind; None where it has no scene."""
+        if step not in self.steps:
+            return None
+        place = self.steps.index(step)
+        return float(self.own[place]), float(self.behind[place])
+
+
+def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
+    """Return the danger of a trial over time; None where the agent is in no scene."""
+    steps = tuple(step.step for step in recording.all_steps if step.scene is not None)
+    frames = [scene.frame for scene in recording.scenes()]
+    if not any(agent in frame.roster.index for frame in frames):
+        return None
+    dt = recording.prologue.step_length_s
+    own, greatest = dangers(frames, [agent], dt)
+    meter = DangerMeter([agent], dt)
+    meter.add(frames)
+    behind, greatest_behind, behind_total = followers_danger(frames, agent, dt)
+    there = np.flatnonzero([agent in frame.roster.index for frame in frames])
+    known = np.zeros(len(steps), bool)
+    known[there] = True
+    unsure = np.arange(len(steps)) > there[-1] - _UNKNOWN_S / dt
+    return DangerCourse(
+        agent,
+        steps,
+        np.where(known & ((own > 0) | ~unsure), own, np.nan),
+        np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
+        greatest._replace(step=steps[greatest.step]),
+        greatest_behind._replace(step=steps[greatest_behind.step]),
+        meter.danger or 0.0,
+        behind_total,
+    )
+
+
+def most_dangerous(recording: Recording) -> DangerousMoment | None:
+    """Return when which of the controlled vehicles was in the greatest danger; None where none ever was in any."""
+    steps = [step.step for step in recording.all_steps if step.scene is not None]
+    frames = [scene.frame for scene in recording.scenes()]
+    if not frames:
+        return None
+    _, most = dangers(frames, recording.agents, recording.prologue.step_length_s)
+    return most._replace(step=steps[most.step]) if most.danger > 0 else None
+
+
+# From when on an agent was shown the other one of a collision: looked up in what it was shown.
+
+_TOLERANCE_M = 0.02  # of single precision, some hundred metres away
+_COLUMNS = ("presence", "x", "y")
+
+
+def visible_from(recording: Recording, agent: str, other: str) -> int | None:
+    """Return the first step after which an agent was shown somebody; None where it never was, or nobody knows.
+
+    That is known where what it is shown is a table with a row an actor, and the places in it are those of the scene:
+    x ahead of it and y to its right, in m, as `Kinematics` shows them. Where a row is of nobody, as with noise or
+    delays, nothing is known.
+
+    Args:
+        recording: of the episode.
+        agent: who is shown something.
+        other: whom.
+    """
+    names = next((list(one.observation_names) for one in recording.prologue.agents if one.id == agent), [])
+    if not all(name in names for name in _COLUMNS):
+        return None
+    columns = [names.index(name) for name in _COLUMNS]
+    before: Scene | None = None
+    first = None
+    for step in recording.all_steps:
+        shown = step.observations.get(agent)
+        if shown is not None and shown.ndim == 2 and before is not None and agent in before.roster.index:
+            seen = _shown(shown[:, columns].astype(float), before, agent)
+            if seen is None:
+                return None
+            if first is None and other in seen:
+                first = step.step - 1
+        before = step.scene
+    return first
+
+
+def _shown(rows: NDArray[Any], scene: Scene, agent: str) -> set[str] | None:
+    """Who is in the rows of others; None where one of them is nobody's."""
+    row = scene.roster.index[agent]
+    offset = scene.centers - scene.centers[row]
+    c, s = math.cos(scene.headings[row]), math.sin(scene.headings[row])
+    places = np.stack((offset[:, 0] * c + offset[:, 1] * s, offset[:, 0] * s - offset[:, 1] * c), axis=1)
+    places[row] = math.inf  # it does not see itself
+    found = set()
+    for _, x, y in rows[1:][rows[1:, 0] > 0]:
+        away = np.hypot(*(places - (x, y)).T)
+        nearest = int(np.argmin(away))
+        if not away[nearest] <= _TOLERANCE_M:
+            return None
+        found.add(scene.roster.actors[nearest].id)
+    return found

@@ -2,29 +2,170 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, Literal
 
+from crashhunt.base.codec import JsonObject, Serializable
 from crashhunt.base.integrity import typed
-from crashhunt.crashes._why import why_from
+from crashhunt.trial import Value
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from crashhunt.crashes._bundle import Bundle
     from crashhunt.crashes._escape import Ending
-    from crashhunt.crashes._why import Why, WhyData
+
 
 __all__ = [
     "INTERRUPTED",
     "Attempt",
-    "AttemptData",
+    "Factor",
     "Judgement",
-    "JudgementData",
     "JudgementVerdict",
+    "LeftOut",
+    "Why",
+    "Without",
     "judgement_of",
+    "why_from",
+    "wilson",
     "with_judgement",
 ]
+
+
+# What a collision hangs on, as runs have shown in which one thing each was left out.
+
+Without = Literal["same", "other", "none", "unclear"]
+"""What became of the collision: the same two again, another crash, none, or something that does not say it."""
+
+_Z = 1.959963984540054  # of 95 % confidence
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut(Serializable):
+    """One run.
+
+    Args:
+        given: of an argument or a seed its other value, of everything else the step after which it was left out.
+        ending: what became of the collision.
+        into: whom a vehicle that was held to its speed drove into itself; empty for nobody.
+    """
+
+    given: Value
+    ending: Without
+    into: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Factor(Serializable):
+    """Something that may be why, and the runs without it.
+
+    Args:
+        kind: ``argument``, ``seed``, ``disturbance``, ``other`` (something that somebody else did) or ``agent``.
+        name: of the argument, or who.
+        what: of an argument ``default`` or ``drawn``; of a disturbance its kind; of the others ``braked``, ``sped up``,
+            ``changed lanes``, and ``there`` for that it was there at all.
+        step: after which it did that, or at which the disturbance began; None of arguments and seeds.
+        was: the value of an argument or a seed; the speed in m/s to which a vehicle was held; None for nothing.
+        runs: without it.
+    """
+
+    kind: str
+    name: str
+    what: str
+    step: int | None = None
+    was: Value | None = None
+    runs: tuple[LeftOut, ...] = ()
+
+    json_keys = ("kind", "name", "what", "step", "was", "runs", "clear", "crashed", "same", "interval", "needed")
+
+    @property
+    def clear(self) -> int:
+        """How many runs say something."""
+        return sum(run.ending != "unclear" for run in self.runs)
+
+    @property
+    def crashed(self) -> int:
+        """How many of these crashed all the same, in whatever way."""
+        return sum(run.ending in ("same", "other") for run in self.runs)
+
+    @property
+    def same(self) -> int:
+        """In how many the same two collided."""
+        return sum(run.ending == "same" for run in self.runs)
+
+    @property
+    def needed(self) -> bool | None:
+        """True where no run crashed without it, False where all did; None where that differs, or none says it."""
+        if not self.clear:
+            return None
+        return True if self.crashed == 0 else False if self.crashed == self.clear else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Between which shares of such runs crash, with 95 % confidence (Wilson's)."""
+        return wilson(self.crashed, self.clear) if self.clear else None
+
+
+@dataclass(frozen=True, slots=True)
+class Why(Serializable):
+    """What has been found out.
+
+    Args:
+        factors: in the order in which they were looked at.
+        steps: after how many a run ended that did not crash; of those with other arguments or seeds.
+        left: how many runs more there would have been.
+        why_not: why there is no answer, or not a whole one; empty where there is.
+    """
+
+    factors: tuple[Factor, ...] = ()
+    steps: int = 0
+    left: int = 0
+    why_not: str = ""
+
+    json_keys = ("factors", "runs", "steps", "left", "why_not")
+
+    @property
+    def runs(self) -> int:
+        """How many trials were run for it, besides the one that must be as it was."""
+        return sum(len(factor.runs) for factor in self.factors)
+
+
+def why_from(data: Any) -> Why | None:
+    """Rebuild what `Why.to_json` returned; None of what is none.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is damaged.
+    """
+    if data is None:
+        return None
+    factors = [
+        Factor(
+            str(each["kind"]), str(each["name"]), str(each["what"]), each["step"], each["was"],
+            tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
+        )
+        for each in data["factors"]
+    ]  # fmt: skip
+    return Why(tuple(factors), int(data["steps"]), int(data["left"]), str(data["why_not"]))
+
+
+def wilson(found: int, of: int) -> tuple[float, float]:
+    """Return the interval of a share, with 95 % confidence.
+
+    E. B. Wilson, *Probable inference, the law of succession, and statistical inference*, 1927.
+
+    >>> low, high = wilson(3, 20)
+    >>> f"{low:.3f} to {high:.3f}"
+    '0.052 to 0.360'
+
+    Args:
+        found: how many.
+        of: of how many; at least 1.
+    """
+    share, spread = found / of, _Z * _Z / of
+    center, half = share + spread / 2, math.sqrt(spread * share * (1 - share) + spread * spread / 4)
+    return max(0.0, (center - half) / (1 + spread)), min(1.0, (center + half) / (1 + spread))
+
 
 INTERRUPTED = "it was interrupted"
 """Why there is no whole answer where somebody has stopped it."""
@@ -34,31 +175,6 @@ _KEY = "judged"
 JudgementVerdict = Literal["avoidable", "too late when visible", "invalid", "unknown"]
 """It could be avoided when the agent could see the other one, or not any more, or never: then the agent was put into
 it, and the trial says nothing about it. Unknown is what the runs do not settle."""
-
-
-class AttemptData(TypedDict):
-    """An `Attempt` as JSON."""
-
-    manoeuvre: str
-    endings: dict[str, Ending]
-    last_step: int | None
-    too_late_step: int | None
-    all_later_run: bool
-    deceleration: float | None
-
-
-class JudgementData(TypedDict):
-    """A `Judgement` as JSON."""
-
-    avoidable: bool | None
-    manoeuvre: str
-    last_step: int | None
-    runs: int
-    why_not: str
-    attempts: list[AttemptData]
-    verdict: JudgementVerdict
-    visible_step: int | None
-    why: NotRequired[WhyData]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +216,7 @@ class Attempt:
         """Whether it was run from every step from this one on, up to the one before the crash, and each crashed."""
         return all(self.endings.get(each) in ("hit", "other") for each in range(step, self.end))
 
-    def to_json(self) -> AttemptData:
+    def to_json(self) -> JsonObject:
         """Return plain data."""
         return {
             "manoeuvre": self.manoeuvre,
@@ -165,10 +281,10 @@ class Judgement:
         settled = all(ending in ("hit", "other") for attempt in self.attempts for ending in attempt.endings.values())
         return False if from_the_first and all(from_the_first) and settled and not self.why_not else None
 
-    def to_json(self) -> JudgementData:
+    def to_json(self) -> JsonObject:
         """Return plain data."""
         best = self.best
-        found: JudgementData = {
+        found: JsonObject = {
             "avoidable": self.avoidable,
             "manoeuvre": best.manoeuvre if best else "",
             "last_step": best.last_step if best else None,

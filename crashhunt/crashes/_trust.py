@@ -1,17 +1,408 @@
-"""Whose a bundle is: an archive that this user made on this machine is signed, and every other one is a stranger's."""
+"""Whether the code of a crash may run here without asking: it was made here, is trusted, or is of this repository."""
 
 from __future__ import annotations
 
 import hmac
 import json
-from typing import TYPE_CHECKING
+import os
+import shlex
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.authentication import user_key
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
+from crashhunt.base.files import whole_file
+from crashhunt.base.git import tracked_files, work_tree
+from crashhunt.base.integrity import authentication_code, is_authentic, parse_object, state_folders, user_key
+from crashhunt.base.plugins import registered
+from crashhunt.oracles import oracle_name
+from crashhunt.plans import read_settings, with_settings
+from crashhunt.scenario import backend_of
+from crashhunt.snapshots import Snapshot
+from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
-    from crashhunt.crashes._data import ArchiveIndex
+    from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["is_made_here", "signature"]
+    from crashhunt.base.plugins import Group
+    from crashhunt.crashes._bundle import ArchiveIndex, Bundle
+    from crashhunt.plans import HuntSettings
+    from crashhunt.scenario import Scenario
+    from crashhunt.trial import Distribution, TrialSpec
+
+
+__all__ = [
+    "TrustedOrigin",
+    "add_trusted",
+    "authenticate_bundle",
+    "describe_code",
+    "is_bundle_made_here",
+    "is_bundle_trusted",
+    "is_fingerprint_trusted",
+    "is_hunt_trusted",
+    "is_made_here",
+    "is_snapshot_trusted",
+    "list_trusted",
+    "refuse_side_effects",
+    "refuse_untrusted",
+    "remove_trusted",
+    "signature",
+    "snapshot_of",
+    "trust_snapshot",
+]
+
+
+# What this user trusts although it was not made here: a file for each origin in the folder of the user's state.
+
+_FOLDER = "trusted"
+_SHOWN = 12  # characters of a fingerprint
+_SHORTEST = 6  # characters of a fingerprint that name an origin
+
+
+@dataclass(frozen=True, slots=True)
+class TrustedOrigin:
+    """Code that this user trusts.
+
+    Args:
+        fingerprint: SHA-256 of everything that says what would run, in hexadecimal.
+        path: where it was when the user trusted it.
+        runs: what would run, in words.
+        trusted_at: when, as UTC.
+    """
+
+    fingerprint: str
+    path: str
+    runs: str
+    trusted_at: str
+
+    @property
+    def id(self) -> str:
+        """The beginning of the fingerprint, which names the origin."""
+        return self.fingerprint[:_SHOWN]
+
+
+def add_trusted(fingerprint: str, *, path: str, runs: str) -> TrustedOrigin:
+    """Trust code from now on, and return the entry.
+
+    Args:
+        fingerprint: of the code.
+        path: where it is now.
+        runs: what would run, in words.
+
+    Raises:
+        HuntDirectoryError: no folder can keep the entry.
+    """
+    now = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    origin = TrustedOrigin(fingerprint, path, runs, now)
+    error: Exception | None = None
+    for folder in _folders():
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with whole_file(folder / f"{fingerprint}.json") as temporary:
+                temporary.write_text(json.dumps({"schema": 1, **asdict(origin)}, indent=1), encoding="utf-8")
+        except (OSError, HuntDirectoryError) as failed:
+            error = failed
+            continue
+        return origin
+    raise HuntDirectoryError(
+        f"no folder can keep what is trusted: {error}", fix="set XDG_STATE_HOME to a folder that can be written"
+    )
+
+
+def list_trusted() -> list[TrustedOrigin]:
+    """Return everything that this user trusts, the oldest first."""
+    names = {field.name for field in fields(TrustedOrigin)}
+    found: dict[str, TrustedOrigin] = {}
+    for folder in _folders():
+        for file in folder.glob("*.json"):
+            with suppress(OSError, ValueError, TypeError):  # a file that is damaged trusts nothing
+                data = parse_object(file.read_bytes(), dict)
+                origin = TrustedOrigin(**{name: str(value) for name, value in data.items() if name in names})
+                if file.stem == origin.fingerprint:
+                    found.setdefault(origin.fingerprint, origin)
+    return sorted(found.values(), key=lambda origin: (origin.trusted_at, origin.fingerprint))
+
+
+def is_fingerprint_trusted(fingerprint: str) -> bool:
+    """Return whether this user trusts the code with a fingerprint."""
+    return any((folder / f"{fingerprint}.json").is_file() for folder in _folders())
+
+
+def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
+    """Trust some origins no longer, and return them.
+
+    Args:
+        names: of each the beginning of its fingerprint, or the path that it was trusted at.
+
+    Raises:
+        UsageError: a name is none of a trusted origin, or may be several; then nothing is removed.
+        HuntDirectoryError: an entry cannot be removed.
+    """
+    known = list_trusted()
+    chosen: dict[str, TrustedOrigin] = {}
+    for name in names:
+        place = str(Path(name).resolve())
+        found = [origin for origin in known if place == origin.path]
+        if not found and len(name) >= _SHORTEST:
+            found = [origin for origin in known if origin.fingerprint.startswith(name.lower())]
+            if len(found) > 1:
+                raise UsageError(f"--remove {name!r} may be {len(found)} origins", fix="give more of the fingerprint")
+        if not found:
+            raise UsageError(f"--remove {name!r}: no such origin is trusted", fix="crashhunt trust lists them")
+        chosen |= {origin.fingerprint: origin for origin in found}
+    for fingerprint in chosen:
+        for folder in _folders():
+            try:
+                (folder / f"{fingerprint}.json").unlink(missing_ok=True)
+            except OSError as error:
+                raise HuntDirectoryError(
+                    f"cannot be removed: {error.strerror or error}", fix="make the folder writable", where=str(folder)
+                ) from error
+    return list(chosen.values())
+
+
+def _folders() -> list[Path]:
+    return [folder / _FOLDER for folder in state_folders()]
+
+
+_PURPOSE = "crash bundle"
+
+
+def snapshot_of(bundle: Bundle) -> Snapshot:
+    """Return the snapshot of the code that a bundle ran."""
+    return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
+
+
+def authenticate_bundle(bundle: Bundle) -> str:
+    """Return the authentication code of a bundle that this process makes; empty where its code is not of this user.
+
+    Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
+    """
+    try:
+        made_here = snapshot_of(bundle).is_made_here
+    except CrashhuntError:  # there is none, as of a candidate of a minimization
+        return ""
+    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
+
+
+def is_bundle_made_here(bundle: Bundle) -> bool:
+    """Return whether this user made a bundle and its snapshot on this machine; files of the snapshot are not read.
+
+    Raises:
+        BundleError: the manifest of the snapshot is missing or damaged.
+    """
+    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
+
+
+def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:
+    """Return whether the code of a crash may run without asking.
+
+    Args:
+        bundle: the crash.
+        faults: those of its snapshot, where they are known already.
+    """
+    try:
+        snapshot = snapshot_of(bundle)
+        settings = read_settings(bundle.hunt / layout.HUNT)
+        if snapshot.faults() if faults is None else faults:
+            return False
+        # The settings beside the crash say what is imported, and only those in the snapshot are authenticated.
+        if not _unknown_names(settings, snapshot):
+            if is_bundle_made_here(bundle):
+                return True
+            # The user has seen the texts that the settings name, such as files of weights, and no others.
+            if is_fingerprint_trusted(snapshot.fingerprint()) and _has_known_texts(
+                bundle.result.spec, settings, snapshot
+            ):
+                return True
+    except CrashhuntError:  # what cannot be read cannot be known
+        return False
+    decisive = (bundle.path / layout.CRASH, bundle.hunt / layout.HUNT, snapshot.path / layout.MANIFEST)
+    return _is_of_this_repository(decisive)
+
+
+def is_snapshot_trusted(snapshot: Snapshot) -> bool:
+    """Return whether the code of a snapshot may run without asking."""
+    try:
+        if snapshot.faults():
+            return False
+        return snapshot.is_made_here or is_fingerprint_trusted(snapshot.fingerprint())
+    except CrashhuntError:
+        return False
+
+
+def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
+    """Return whether what the settings of a hunt name may run without asking.
+
+    Args:
+        hunt: its directory.
+        snapshot: the latest of the hunt.
+    """
+    try:
+        settings = read_settings(hunt / layout.HUNT)
+        same_scenario = settings.scenario == snapshot.settings().scenario
+        if same_scenario and not _unknown_names(settings, snapshot) and is_snapshot_trusted(snapshot):
+            return True
+    except CrashhuntError:
+        return False
+    return _is_of_this_repository((hunt / layout.HUNT, snapshot.path / layout.MANIFEST))
+
+
+def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
+    """Trust the code of a snapshot from now on, and return the entry.
+
+    Args:
+        snapshot: of a hunt or a corpus.
+        path: what the user named.
+
+    Raises:
+        BundleError: the snapshot is damaged.
+        HuntDirectoryError: the entry cannot be written.
+    """
+    snapshot.verify()
+    runs = describe_code(snapshot, snapshot.settings())
+    return add_trusted(snapshot.fingerprint(), path=str(path.resolve()), runs=runs)
+
+
+def describe_code(snapshot: Snapshot, settings: HuntSettings) -> str:
+    """Return in words what would run: the agents and crashhunt, and from where."""
+    names = {agent.agent for agent in settings.agents.values()}
+    names |= {oracle for oracle in settings.oracles if ":" in oracle}
+    with suppress(CrashhuntError):  # a scenario that cannot be read runs nothing
+        names |= set(snapshot.scenario().modules())
+    agents = ", ".join(sorted(names)) or "no agent"
+    if not snapshot.has_code:
+        return f"{agents}, as installed here or found from the current folder, in the scenario of {snapshot.digest}"
+    version = snapshot.environment().get("versions", {}).get("crashhunt", "of an unknown version")
+    return f"{agents} and crashhunt {version}, both from the snapshot {snapshot.digest}"
+
+
+def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> UntrustedError:
+    """Return the refusal to run the code of a crash.
+
+    Args:
+        bundle: the crash.
+        where: what the user named; the folder of the crash where it is empty.
+        made_by: who made it, as it says itself.
+    """
+    place = where or str(bundle.path)
+    fix = f"if you trust that code, run crashhunt trust {shlex.quote(place)} once, or add --trust"
+    snapshot = snapshot_of(bundle)
+    changed = ""
+    try:
+        settings = read_settings(bundle.hunt / layout.HUNT)
+        runs = describe_code(snapshot, settings)
+        changed = _first_change(settings, snapshot)
+    except CrashhuntError as error:
+        runs = f"what cannot be described: {error.message}"
+    if changed:  # trust in the code as it was taken is no trust in the code as it is now
+        proof, fix = changed, "get an undamaged copy, or add --trust if you trust that code as it is now"
+        if made_by:
+            proof = f"it says that {made_by} made it; {changed}"
+    elif made_by:
+        proof = f"it says that {made_by} made it"
+    elif bundle.authentication_code:
+        proof = "you did not make it on this machine, or it has changed since"
+    else:
+        proof = "nothing proves that you made it on this machine (earlier versions of crashhunt wrote no proof)"
+    return UntrustedError(
+        f"{proof}, and this would run its code: {runs}",
+        fix=f"{fix}; crashhunt replay --from-log runs none of it",
+        where=place,
+    )
+
+
+def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
+    """What of a bundle is not as the snapshot says, in words; empty where everything is."""
+    faults = snapshot.faults()
+    if faults:
+        return f"the snapshot is damaged: {faults[0]}"
+    names = _unknown_names(settings, snapshot)
+    if names:
+        return f"hunt.toml names {names[0]!r}, which it did not name when the snapshot was taken"
+    if is_fingerprint_trusted(snapshot.fingerprint()):
+        return "its arguments name texts that its hunt does not name"
+    return ""
+
+
+def _statement(bundle: Bundle) -> dict[str, object]:
+    """Everything of a bundle that determines what runs, and the digest of what was recorded."""
+    spec = bundle.result.spec.to_json()
+    return {
+        "number": spec["number"],
+        "seed": spec["seed"],
+        "max_steps": spec["max_steps"],
+        "arguments": spec["arguments"],
+        "scenario_arguments": spec["scenario_arguments"],
+        "disturbances": spec.get("disturbances") or [],
+        "only": spec.get("only"),
+        "script": spec.get("script"),
+        "digest": bundle.result.digest,
+        "snapshot": bundle.snapshot,
+    }
+
+
+def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot) -> bool:
+    """Whether every text among the arguments of a trial is one that its hunt or its scenario names."""
+    scenario = with_settings(snapshot.scenario(), settings)
+    arguments = [*scenario.scenario_arguments().values()]
+    for agent in scenario.agents:
+        arguments += scenario.agent_arguments(agent).values()
+    known = _texts([*settings.space.values(), *(argument.distribution for argument in arguments)])
+    known |= {argument.default for argument in arguments if isinstance(argument.default, str)}
+    values = [*spec.scenario_arguments.values(), *(one for each in spec.arguments.values() for one in each.values())]
+    return all(value in known for value in values if isinstance(value, str))
+
+
+def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:
+    """What settings name that may be imported or opened, and that those in a snapshot do not name.
+
+    Numbers may differ, so that the user can edit them and replay the crash.
+    """
+    known = snapshot.settings()
+    agents = {agent.agent for agent in known.agents.values()}
+    found = [agent.agent for agent in settings.agents.values() if agent.agent not in agents]
+    plugins: tuple[tuple[Group, str, str, tuple[str, ...]], ...] = (
+        *(("oracles", oracle_name(text), text, known.oracles) for text in settings.oracles),
+        ("samplers", settings.sampler, settings.sampler, (known.sampler,)),
+        ("executors", settings.run.executor.partition(":")[0], settings.run.executor, (known.run.executor,)),
+    )
+    found += [text for group, name, text, before in plugins if text not in before and name not in registered(group)]
+    return found + sorted(_texts(settings.space.values()) - _texts(known.space.values()))
+
+
+def _texts(distributions: Iterable[Distribution | None]) -> set[str]:
+    """The texts among the values of arguments, such as names of files."""
+    values: list[object] = []
+    for distribution in distributions:
+        if isinstance(distribution, Constant):
+            values.append(distribution.value)
+        elif isinstance(distribution, Choice):
+            values += distribution.options
+    return {value for value in values if isinstance(value, str)}
+
+
+def _is_of_this_repository(files: Iterable[Path]) -> bool:
+    """Whether files belong to the project that the user works in: its tests could run the same code.
+
+    They are tracked by git in the work tree of the current folder. Where there is no work tree, as in a container
+    without ``.git``, they are below the current folder of a job of a CI, which runs what its repository holds.
+    """
+    resolved = [Path(os.path.realpath(file)) for file in files]
+    here = Path(os.path.realpath(os.curdir))
+    top = work_tree(here)
+    if top is None:
+        return bool(os.environ.get("CI")) and all(file.is_relative_to(here) for file in resolved)
+    if not all(file.is_relative_to(top) for file in resolved):
+        return False
+    tracked = tracked_files(top)
+    return all(file.relative_to(top).as_posix() in tracked for file in resolved)
+
+
+# Whose a bundle is: an archive that this user made on this machine is signed, and every other one is a stranger's.
 
 
 def is_made_here(index: ArchiveIndex) -> bool:
@@ -25,3 +416,37 @@ def signature(index: ArchiveIndex) -> str:
     content = {name: value for name, value in index.items() if name != "signature"}
     text = json.dumps(content, sort_keys=True, default=str).encode()
     return hmac.new(user_key(), text, "sha256").hexdigest()
+
+
+# What a stranger's crash may make this process do when its recorded actions are driven: simulate, and nothing else.
+
+
+def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
+    """Refuse a scenario that does anything but simulate, as far as is known; what nobody knows is refused.
+
+    Args:
+        scenario: of the crash.
+        settings: of its hunt.
+        values: of the scenario's arguments in the trial.
+
+    Raises:
+        UsageError: with what it would do.
+    """
+    names: list[tuple[Group, str]] = [("simulators", scenario.simulator)]
+    names += [("oracles", oracle_name(text)) for text in settings.oracles]
+    for group, name in names:
+        if name not in registered(group):
+            raise _refusal(f"it would import {name!r}")
+    for module in scenario.modules():
+        raise _refusal(f"it would import {module!r}")
+    backend = backend_of(scenario.simulator)
+    if backend is None or backend.side_effect is None:
+        raise _refusal(f"nobody knows what the simulator {scenario.simulator!r} does besides simulating")
+    asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
+    effect = backend.side_effect(scenario, values, asked)
+    if effect:
+        raise _refusal(effect)
+
+
+def _refusal(reason: str) -> UsageError:
+    return UsageError(f"the crash is a stranger's, and {reason}", fix="give --trust if you trust who made it")

@@ -1,4 +1,4 @@
-"""Disturbances: how likely it is that somebody around the agent errs, and which of it happens in which trial."""
+"""Disturbances: draws faults of other actors and of the agent's sensors, and returns their log-likelihood."""
 
 import lazy_loader
 

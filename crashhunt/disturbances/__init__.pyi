@@ -1,4 +1,3 @@
-from ._fixed import FORM as FORM, is_fixed as is_fixed, parse_fixed as parse_fixed, word_of as word_of
 from ._models import (
     Choices as Choices,
     brake as brake,
@@ -15,4 +14,13 @@ from ._models import (
     unseen as unseen,
 )
 from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn
-from ._rates import NONE as NONE, Disturber as Disturber, disturber_of as disturber_of, parse_rates as parse_rates
+from ._rates import (
+    FORM as FORM,
+    NONE as NONE,
+    DisturbanceSampler as DisturbanceSampler,
+    disturber_of as disturber_of,
+    is_fixed as is_fixed,
+    parse_fixed as parse_fixed,
+    parse_rates as parse_rates,
+    word_of as word_of,
+)

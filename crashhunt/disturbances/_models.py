@@ -65,44 +65,44 @@ class Choices:
 
 
 def brake() -> Choices:
-    """Whoever is ahead brakes hard, and lets go again."""
+    """The vehicle ahead brakes hard for a while."""
     return Choices("brake", {"ahead": 1.0}, {2.0: 3.0, 4.0: 2.0, 6.0: 1.0}, {1.0: 1.0, 2.0: 2.0, 3.0: 1.0})
 
 
 def stop() -> Choices:
-    """Whoever is ahead comes to a stop in the middle of the road, and goes on later."""
+    """The vehicle ahead stops in the middle of the road, and continues later."""
     return Choices("stop", {"ahead": 1.0}, {3.0: 1.0, 6.0: 1.0}, {8.0: 1.0, 15.0: 1.0})
 
 
 def dawdle() -> Choices:
-    """Whoever is ahead drives much slower for a while."""
+    """The vehicle ahead drives much slower for a while."""
     return Choices("dawdle", {"ahead": 1.0}, {0.3: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
 
 
 def speed() -> Choices:
-    """Whoever is behind wants to drive faster than allowed."""
+    """The vehicle behind drives faster than allowed."""
     places = {"behind": 2.0, "left behind": 1.0, "right behind": 1.0}
     return Choices("speed", places, {0.2: 2.0, 0.5: 1.0}, {10.0: 1.0, 20.0: 1.0})
 
 
 def cut_in() -> Choices:
-    """Somebody from a neighbouring lane changes into the agent's, however small the gap, and may brake there."""
+    """A vehicle changes from a neighbouring lane to the agent's, even into a small gap, and may brake there."""
     return Choices("cut_in", _AROUND, {0.0: 2.0, 2.0: 1.0, 4.0: 1.0}, {2.0: 1.0, 4.0: 1.0})
 
 
 def late_merge() -> Choices:
-    """Somebody whose lane ends, beside the agent or ahead, merges at the very end of it, however small the gap."""
+    """A vehicle next to or ahead of the agent merges at the very end of its lane, even into a small gap."""
     return Choices("late_merge", _AROUND, {5.0: 1.0, 15.0: 1.0, 30.0: 1.0}, {10.0: 1.0, 20.0: 1.0})
 
 
 def step_out() -> Choices:
-    """Somebody who walks at the roadside steps out onto the road, and turns back in the middle of the agent's way."""
+    """A person at the roadside steps onto the road, and turns back in the middle of the agent's way."""
     places = {"right ahead": 2.0, "left ahead": 1.0}
     return Choices("step_out", places, {0.8: 1.0, 1.4: 2.0, 2.0: 1.0}, {6.0: 1.0, 10.0: 1.0})
 
 
 def ignore_priority() -> Choices:
-    """Somebody on another way into the junction heeds neither its lights nor who has priority."""
+    """A vehicle from another approach ignores the lights and the right of way at the junction."""
     places = {"left ahead": 2.0, "right ahead": 2.0, "left": 1.0, "right": 1.0}
     return Choices("ignore_priority", places, {1.0: 1.0}, {5.0: 1.0, 10.0: 1.0})
 
@@ -118,7 +118,7 @@ def noisy_observation() -> Choices:
 
 
 def unseen() -> Choices:
-    """The agent does not see somebody."""
+    """The agent does not see another actor."""
     return Choices("unseen", {"ahead": 2.0, **_AROUND}, {1.0: 1.0}, {1.0: 2.0, 2.0: 1.0, 4.0: 1.0})
 
 

@@ -27,7 +27,7 @@ class Drawn:
 
 
 class DisturbanceModel(Protocol):
-    """Says what disturbances of one kind are like, once one happens; how often that is, whoever hunts says.
+    """Draws the actor, strength and duration of disturbances of one kind; the hunt sets their rate.
 
     To give one a name, register what makes it, called without arguments::
 

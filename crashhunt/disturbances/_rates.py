@@ -1,7 +1,7 @@
-"""``brake=0.02,cut_in=0.01``: how often what happens; and from that, which disturbances a trial has.
+"""Rates of disturbances, such as ``brake=0.02,cut_in=0.01``, and the draws of disturbances for a trial.
 
-Every model has a generator of its own around every agent, made of the trial's seed and its name: whatever else is drawn
-of the seed stays as it is, and so do the draws of a model where another one is added.
+Each model has a separate random generator around each agent, seeded by the trial's seed and the model's name. Adding a
+model therefore changes neither the draws of other models nor anything else that is drawn from the seed.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.blame import blamed
 from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
-from crashhunt.base.names import one_of
+from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
-from crashhunt.disturbances._fixed import FORM, is_fixed
+from crashhunt.base.text import one_of
 from crashhunt.disturbances._protocol import Drawn
 from crashhunt.trial import CELLS, KINDS, OF_AGENT, Disturbance, in_turn, why_not
 
@@ -26,19 +25,94 @@ if TYPE_CHECKING:
     from crashhunt.disturbances._protocol import DisturbanceModel
     from crashhunt.trial import TrialResult
 
-__all__ = ["NONE", "Disturber", "disturber_of", "parse_rates"]
+
+__all__ = ["FORM", "NONE", "DisturbanceSampler", "disturber_of", "is_fixed", "parse_fixed", "parse_rates", "word_of"]
+
+
+# ``brake@124=ahead:4:2``: a disturbance that every trial has, in a given step.
+
+FORM = "KIND@STEP=WHO:HOW_STRONG:HOW_LONG"
+_FIX = f"write {FORM}, such as brake@124=ahead:4:2 for 4 m/s² and 2 s from step 124 on"
+
+
+def is_fixed(word: str) -> bool:
+    """Whether a word is about a disturbance in a step of its own, and says no rate."""
+    return "@" in word
+
+
+def parse_fixed(words: Iterable[str], agents: Sequence[str], *, shown: str = "--disturb") -> tuple[Disturbance, ...]:
+    """Return the disturbances that words fix, ``[AGENT.]KIND@STEP=WHO:HOW_STRONG:HOW_LONG``, in the order of steps.
+
+    Args:
+        words: as they are given; words with a rate are ignored.
+        agents: the controlled vehicles, around which they are.
+        shown: the option or key that has the words, for the error.
+
+    Raises:
+        UsageError: a word is not valid, or a kind comes twice in one step around one agent.
+    """
+    found: dict[tuple[int, str, str], Disturbance] = {}
+    for word in filter(is_fixed, words):
+        one = _parsed(word, agents, shown)
+        key = one.step, one.agent, one.what
+        if key in found:
+            raise UsageError(f"{shown} {word}: {one.what} begins twice at step {one.step}", fix="give it once")
+        found[key] = one
+    return tuple(one for _, one in sorted(found.items()))
+
+
+def word_of(one: Disturbance, agents: Sequence[str]) -> str:
+    """Return the word that fixes a disturbance; whose it is only where there are several agents."""
+    whose = f"{one.agent}." if len(agents) > 1 else ""
+    place = one.who.replace(" ", "_")  # so that no shell needs quotes
+    return f"{whose}{one.what}@{one.step}={place}:{one.how_strong!r}:{one.how_long!r}"
+
+
+def _parsed(word: str, agents: Sequence[str], shown: str) -> Disturbance:
+    name, equals, text = word.partition("=")
+    kind, _, step = name.partition("@")
+    parts = [part.strip() for part in text.split(":")]
+    agent, what = _whose(kind, agents, f"{shown} {word}")
+    if not (equals and what and len(parts) == 3 and step.isascii() and step.isdecimal() and int(step) > 0):
+        raise UsageError(f"{shown} {word!r} is no disturbance", fix=_FIX)
+    who = parts[0].replace("_", " ")
+    if who not in CELLS:
+        raise UsageError(f"{shown} {word}: {parts[0]!r} is no place around an agent", fix=one_of(who, CELLS))
+    one = Disturbance(int(step), who, what, _number(parts[1]), _number(parts[2]), agent)
+    if reason := why_not(one):
+        raise UsageError(f"{shown} {word}: {reason[0]}", fix=reason[1])
+    return one
+
+
+def _whose(name: str, agents: Sequence[str], shown: str) -> tuple[str, str]:
+    """The agent around which it is, and the kind."""
+    agent, dot, what = name.rpartition(".")
+    if dot and agent not in agents:
+        raise UsageError(f"{shown}: there is no controlled vehicle {agent!r}", fix=one_of(agent, agents))
+    if not dot and len(agents) > 1:
+        fix = f"write {agents[0]}.{name}@…"
+        raise UsageError(f"{shown} does not say around whom, and there are {', '.join(agents)}", fix=fix)
+    return agent or agents[0], what
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
 
 NONE = "none"
 """The word for no disturbances, whatever the scenario says."""
 _STREAM = 0x64697374  # apart from what else is drawn of a trial's seed: agents count from 0
 _BRANCH = 0x6272616E  # and what is drawn for copies of it
 _STRONGEST = 0x73747267  # as strong as it may be
-_TRIED = 32  # draws of a model, of which the strongest is taken: what a model may draw at most, nobody says
+_TRIED = 32  # draws of a model, of which the strongest is used: models do not report their maximum
 _SHOWN = "--disturb"
 
 
 def parse_rates(words: Iterable[str]) -> dict[str, float]:
-    """Return how often what happens, from ``NAME=RATE``; what has the rate 0 is left out.
+    """Return the rate of each disturbance in 1/s, from ``NAME=RATE``; rates of 0 are excluded.
 
     Args:
         words: as they are given; ``none`` alone for nothing. Those that fix a disturbance are left aside.
@@ -79,15 +153,15 @@ def _rate(name: str, text: str) -> float:
 def disturber_of(
     rates: Mapping[str, float], *, agents: Sequence[str], step_length_s: float, known: Sequence[str] | None = None,
     simulator: str = "the simulator", fixed: Sequence[Disturbance] = (),
-) -> Disturber:  # fmt: skip
-    """Return what draws the disturbances of trials.
+) -> DisturbanceSampler:  # fmt: skip
+    """Return the sampler of the disturbances of trials.
 
     Args:
         rates: name of a model to how often it happens a second, around each agent.
         agents: the controlled vehicles.
         step_length_s: in s.
-        known: the kinds that the simulator can do; None where nobody knows.
-        simulator: how people call it.
+        known: the kinds that the simulator supports; None if that is unknown.
+        simulator: its name in messages.
         fixed: what every trial has besides.
 
     Raises:
@@ -113,7 +187,7 @@ def disturber_of(
             fix = one_of(one.what, sorted({*KINDS, *(known or ())}))
             raise UsageError(f"{_SHOWN}: there is no kind of disturbance {one.what!r}", fix=fix)
         _refuse_what_it_cannot(f"{one.what}@{one.step}", one.what, known, simulator)
-    return Disturber(models, dict(rates), tuple(agents), step_length_s, tuple(fixed))
+    return DisturbanceSampler(models, dict(rates), tuple(agents), step_length_s, tuple(fixed))
 
 
 def _refuse_what_it_cannot(name: str, what: str, known: Sequence[str] | None, simulator: str) -> None:
@@ -137,7 +211,7 @@ def locate_model(name: str) -> DisturbanceModel:
         made: DisturbanceModel = locate("disturbances", name)()
     except CrashhuntError:
         raise
-    except Exception as error:  # somebody's own
+    except Exception as error:  # of user code
         raise blamed(f"the disturbance {name!r} cannot be made", error) from error
     for part in ("what", "draw", "log_likelihood"):
         if not hasattr(made, part):
@@ -149,7 +223,7 @@ def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Draw
     try:
         drawn = model.draw(rng)
         fine = drawn.who in CELLS and math.isfinite(drawn.how_strong) and 0 < drawn.how_long < math.inf
-    except Exception as error:  # somebody's own
+    except Exception as error:  # of user code
         raise blamed(f"the disturbance {name!r} cannot be drawn", error) from error
     if not fine:
         fix = f"draw one of {', '.join(CELLS)}, a finite strength, and a length above 0 s"
@@ -158,8 +232,8 @@ def _drawn(name: str, model: DisturbanceModel, rng: np.random.Generator) -> Draw
 
 
 @dataclass(frozen=True, slots=True)
-class Disturber:
-    """Draws the disturbances of trials, and knows how likely they are.
+class DisturbanceSampler:
+    """Draws the disturbances of trials, and returns their log-likelihood.
 
     In every step, each model begins one around each agent with a probability of rate times step length, whatever else
     is going on.
@@ -167,7 +241,7 @@ class Disturber:
     Args:
         models: by name.
         rates: of each, in 1/s.
-        agents: around whom.
+        agents: the controlled vehicles.
         step_length_s: in s.
         fixed: what every trial has besides, whatever is drawn.
     """
@@ -221,7 +295,7 @@ class Disturber:
             soon: all begin within so many steps after it.
 
         Returns:
-            Of each model around each agent several to choose from: not everywhere is somebody who can err.
+            Several alternatives per model and agent, because not every place has an actor that can be disturbed.
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STRONGEST, after, number)))
         found = []
@@ -250,7 +324,7 @@ class Disturber:
         drawn = _drawn(name, self.models[name], rng)
         strong, long = float(drawn.how_strong), float(drawn.how_long)
         one = Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
-        reason = why_not(one) if one.what in KINDS else None  # of a kind of somebody else's, nobody knows
+        reason = why_not(one) if one.what in KINDS else None  # only built-in kinds can be checked
         if reason is not None:
             raise PluginError(f"the disturbance {name!r} has drawn {drawn}: {reason[0]}", fix=reason[1])
         return one
@@ -261,7 +335,7 @@ class Disturber:
         What is fixed begins anyway, whatever a model draws for that step.
 
         Args:
-            disturbances: as they were drawn; what begins later is left out.
+            disturbances: as they were drawn; later ones are ignored.
             steps: how many there were.
         """
         given = {_key(one) for one in self.fixed if one.step <= steps}
@@ -282,7 +356,7 @@ class Disturber:
     def log_likelihood_of(self, result: TrialResult) -> float | None:
         """Return the logarithm of the probability that just what took place in a trial begins in its steps.
 
-        What was drawn while nobody was there made no difference: a trial without it is the same, and likelier. None
+        A draw without an actor to disturb has no effect: a trial without it is the same, and likelier. None
         where nothing is drawn at all.
         """
         if not self.models:

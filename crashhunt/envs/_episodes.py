@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.errors import SimulatorError, UsageError
-from crashhunt.base.names import one_of
 from crashhunt.base.temporary import TemporaryFolder
+from crashhunt.base.text import one_of
 from crashhunt.episode import Episode, Observer
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, merge_findings
 from crashhunt.plans import disturber
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gymnasium import Space
     from numpy.typing import NDArray
 
-    from crashhunt.disturbances import Disturber
+    from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.scenario import Scenario
     from crashhunt.simulators import Simulator
     from crashhunt.trial import Disturbance, Value
@@ -182,7 +182,7 @@ class _Trail(Observer):
         self.scenes.append(scene)
 
 
-def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> Disturber | None:
+def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> DisturbanceSampler | None:
     made = disturber(scenario, disturb, (agent,))
     if made is not None and max_steps < 1:
         raise UsageError("disturb needs to know how long an episode is", fix="give max_steps")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.names import one_of
+from crashhunt.base.text import one_of
 from crashhunt.envs._episodes import Episodes
 from crashhunt.envs._process import RemoteEpisodes
 

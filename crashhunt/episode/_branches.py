@@ -17,27 +17,27 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, cast
 
-from crashhunt.base.answers import NoAnswer
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.faculties import offers
-from crashhunt.base.forks import NoProcessError
-from crashhunt.base.memory import FREE, free_memory
-from crashhunt.base.plain import finite
+from crashhunt.base.forks import NoAnswer, NoProcessError
+from crashhunt.base.json_types import finite
+from crashhunt.base.resources import FREE, free_memory
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates
-from crashhunt.episode._observer import Observer
+from crashhunt.episode._observers import Observer
 from crashhunt.episode._questions import Questions
-from crashhunt.simulators import Disturbs
+from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import OF_AGENT, Branch, Branches, Disturbance, Outcome, in_turn, steps_of
 from crashhunt.world import approaches, dangers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.base.asleep import Asleep
-    from crashhunt.base.plain import Plain
-    from crashhunt.disturbances import Disturber
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.forks import SuspendedFork
+    from crashhunt.base.json_types import Plain
+    from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.episode._episode import Episode
-    from crashhunt.trial import DisturbanceData, TrialResult
+    from crashhunt.trial import TrialResult
     from crashhunt.world import Frame, Scene
 
 __all__ = ["BRANCHED", "Brancher"]
@@ -62,7 +62,7 @@ _BEGINS = 2  # steps on, at the earliest: what an agent sees late is noticed a s
 @dataclass(frozen=True, slots=True)
 class _Sleeper:
     step: int
-    copy: Asleep
+    copy: SuspendedFork
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class Brancher(Observer):
         self._branches = Branches()
         self._asleep: deque[_Sleeper] = deque()
         self._frames: deque[Frame] = deque()
-        self._disturber: Disturber | None = None
+        self._disturber: DisturbanceSampler | None = None
         self._second = 1  # in steps
         self._draws = 0
         self._rests_until = 0
@@ -178,7 +178,7 @@ class Brancher(Observer):
     def _leave_asleep(self, episode: Episode) -> _Sleeper | None:
         """Leave a copy asleep after the step that has just been taken; None where there can be none now."""
         try:
-            self._asleep.append(_Sleeper(episode.steps, episode.leave_asleep(self._go_on)))
+            self._asleep.append(_Sleeper(episode.steps, episode.suspend_fork(self._go_on)))
         except NoProcessError as error:
             self._questions.miss(NoAnswer(f"could not be made: {error.message}", is_from_outside=True))
             return None
@@ -204,7 +204,7 @@ class Brancher(Observer):
         )
         return replace(result, branches=branches)
 
-    def _draws_of(self, episode: Episode) -> Disturber:
+    def _draws_of(self, episode: Episode) -> DisturbanceSampler:
         names, dt = episode.names, episode.simulator.step_length_s
         if self._disturber is None or (self._disturber.agents, self._disturber.step_length_s) != (names, dt):
             rates, fixed = parse_rates(self._words), parse_fixed(self._words, names)
@@ -312,18 +312,18 @@ class Brancher(Observer):
         outcome, step = str(answer["outcome"]), cast(int, answer["step"])
         if outcome not in self._crashes or outcome == Outcome.SIMULATOR_ERROR:
             return None
-        there = cast("list[DisturbanceData]", answer["there"])
+        there = cast("list[JsonObject]", answer["there"])
         likely = cast("float | None", answer["log_likelihood"])
         return _Crashed(tuple(map(Disturbance.from_json, there)), sleeper.step, outcome, step, likely)
 
-    def _usable(self, episode: Episode, sleeper: _Sleeper) -> Asleep:
+    def _usable(self, episode: Episode, sleeper: _Sleeper) -> SuspendedFork:
         """Return the copy of a step that is asleep; one that was killed is replaced while the trial is at that step."""
         copy = next((one.copy for one in self._asleep if one.step == sleeper.step), sleeper.copy)
         if copy.is_usable or sleeper.step != episode.steps:
             return copy
         copy.end()
         self._asleep = deque(one for one in self._asleep if one.copy is not copy)
-        self._asleep.append(_Sleeper(sleeper.step, episode.leave_asleep(self._go_on)))
+        self._asleep.append(_Sleeper(sleeper.step, episode.suspend_fork(self._go_on)))
         return self._asleep[-1].copy
 
     def _take(self, episode: Episode, found: _Crashed) -> None:
@@ -334,7 +334,7 @@ class Brancher(Observer):
         self._branches = replace(self._branches, crashes=(*self._branches.crashes, branch))
 
     def _go_on(self, copy: Episode, job: Plain) -> Plain:
-        choices = cast("list[list[DisturbanceData]]", job["choices"])
+        choices = cast("list[list[JsonObject]]", job["choices"])
         until, began = cast(int, job["until"]), copy.steps
         chosen = [_choice(copy, list(map(Disturbance.from_json, some))) for some in choices]
         planned = in_turn(one for one in chosen if one is not None)
@@ -363,6 +363,6 @@ class Brancher(Observer):
 def _choice(copy: Episode, some: Sequence[Disturbance]) -> Disturbance | None:
     """The first one for which somebody is there; where there is only one, that."""
     simulator = copy.simulator
-    if len(some) == 1 or not offers(simulator, Disturbs):
+    if len(some) == 1 or not supports(simulator, SupportsDisturbances):
         return some[0]
-    return next((one for one in some if one.what in OF_AGENT or simulator.whom(one)), None)
+    return next((one for one in some if one.what in OF_AGENT or simulator.resolve_target(one)), None)

@@ -5,22 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from crashhunt.base.errors import RecorderError
-from crashhunt.base.faculties import offers
-from crashhunt.base.forks import held, shared_memory
-from crashhunt.episode._ahead import goes_ahead
-from crashhunt.episode._attribution import Attribution
-from crashhunt.episode._copied import Copied
-from crashhunt.episode._disturbed import Disturbed
-from crashhunt.episode._ending import Ending
-from crashhunt.episode._failures import close_agent
-from crashhunt.episode._whereabouts import Whereabouts
-from crashhunt.episode._wiring import agent_seed, options_of, told, unflattener
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import InvalidEpisodeError, RecorderError
+from crashhunt.base.forks import Copy, Held, SuspendedFork, held, shared_memory
+from crashhunt.episode._disturbance_injection import DisturbanceInjector
+from crashhunt.episode._failures import Attribution, Ending, close_agent
+from crashhunt.episode._fast_path import make_fast_path
+from crashhunt.episode._observers import agent_seed, callbacks_for, observation_restorer, options_of
 from crashhunt.native import ANSWERED, ASK, DONE, SIMULATED
 from crashhunt.oracles import Finding, Oracle, SeesMap, TrafficEvents, merge_findings
-from crashhunt.simulators import CountsSetUp, FlattensObservations, HasMap
+from crashhunt.simulators import CountsSetUp, FlattensObservations, HasMap, Reseeds
 from crashhunt.trial import CRASHES, Failure, Outcome, TrialResult, TrialSpec, in_turn
 
 if TYPE_CHECKING:
@@ -31,12 +27,126 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.episode._observer import Observer
+    from crashhunt.base.json_types import Plain
+    from crashhunt.episode._fast_path import FastPath
+    from crashhunt.episode._observers import Observer
     from crashhunt.simulators import Info, Observations, Simulator, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Scene
 
-__all__ = ["Episode", "MakeAgent", "Reset"]
+
+__all__ = ["Episode", "Forkable", "MakeAgent", "Reset", "Whereabouts"]
+
+
+# What can be looked at between two steps of an episode, whoever has taken them.
+
+
+class Whereabouts:
+    """The part of an `Episode` that says where it is. Where the core has gone ahead, it is asked when somebody asks."""
+
+    simulator: Simulator
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._observations: Observations = {}
+        self._rewards: Mapping[str, float] = {}
+        self._terminations: Mapping[str, bool] = {}
+        self._scene: Scene | None = None
+        self._ahead: FastPath | None = None
+        self._take: Callable[[Mapping[str, Agent]], int] | None = None
+        self._is_behind = False  # the core has taken steps of which nothing is known here but their number
+
+    @property
+    def observations(self) -> Observations:
+        """What the agents will be shown in the next step, by name."""
+        self._catch_up()
+        return self._observations
+
+    @property
+    def rewards(self) -> Mapping[str, float]:
+        """Those of the last step, by name, of those that acted in it."""
+        self._catch_up()
+        return self._rewards
+
+    @property
+    def terminations(self) -> Mapping[str, bool]:
+        """Whether those that acted in the last step have arrived or crashed."""
+        self._catch_up()
+        return self._terminations
+
+    @property
+    def scene(self) -> Scene | None:
+        """After the last step; None before the start."""
+        self._catch_up()
+        return self._scene
+
+    def _catch_up(self) -> None:
+        """Be where the core has come to."""
+        if self._is_behind and self._ahead is not None:
+            self._is_behind = False
+            self._observations, self._rewards, self._terminations, *_ = self._ahead.at_once.catch_up()
+            self._scene = self.simulator.scene()
+
+
+# Copies of an episode that goes on: those of its process.
+
+C = TypeVar("C")
+
+
+class Forkable:
+    """The part of an `Episode` that copies are made by."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held = Held()
+        self._on_copied: list[Callable[[], None]] = []
+
+    def _goes_on(self) -> bool:
+        raise NotImplementedError
+
+    def _look_away(self) -> None:
+        raise NotImplementedError
+
+    def fork(self, work: Callable[[Self], Plain], *, observed: bool = True) -> Copy:
+        """Copy this process with the episode in it, between two steps; the copy goes on exactly as this one does.
+
+        Args:
+            work: what is done in the copy, which then is over; it may fork again. What it returns is its answer.
+            observed: whether its observers go on being told. What they record goes elsewhere.
+
+        Raises:
+            CannotForkError: the agents, or whoever has begun before them, have something that has no copy.
+        """
+        return self._copied(Copy, work, observed=observed)
+
+    def suspend_fork(self, work: Callable[..., Plain]) -> SuspendedFork:
+        """Leave a copy asleep here; whenever it is asked, a copy of that one goes on from here, told of to nobody.
+
+        Args:
+            work: what is done with that copy, and with what is asked.
+
+        Raises:
+            CannotForkError: as of `fork`.
+        """
+        return self._copied(SuspendedFork, work, observed=False)
+
+    def _copied(
+        self, make: Callable[[Callable[..., Plain], Held], C], work: Callable[..., Plain], *, observed: bool
+    ) -> C:
+        if not self._goes_on():
+            raise RuntimeError("an episode has copies only while it goes on")
+
+        def go_on(*asked: Plain) -> Plain:
+            for tell in self._on_copied if observed else ():
+                tell()
+            if not observed:
+                self._look_away()
+            return work(self, *asked)
+
+        copy = make(go_on, self._held)
+        self._held = replace(self._held, shared=None)  # looking takes as long as all else, so once has to do
+        return copy
+
 
 MakeAgent = Callable[[str, "Simulator", "Mapping[str, Value]"], "Agent"]
 """Called with agent id, simulator and arguments; returns the agent at the wheel."""
@@ -46,7 +156,7 @@ Reset = Callable[..., "tuple[Observations, Info]"]
 _ASK_ALL: Mapping[str, NDArray[np.generic]] = {}  # nobody writes to it
 
 
-class Episode(Copied, Ending, Whereabouts):
+class Episode(Forkable, Ending, Whereabouts):
     """One trial, a step at a time; between two steps, everything about it can be looked at.
 
     Whatever agent, simulator, oracles or observers raise ends the episode, and is in its result. Of a simulator that
@@ -110,14 +220,15 @@ class Episode(Copied, Ending, Whereabouts):
         self._encoders: list[Callable[[object], NDArray[np.generic]]] = []
         self._unflatten: dict[str, Callable[[NDArray[np.generic]], object]] = {}
         # Only those that want to be told are called: this is done several times a step.
-        self._on_begin: list[Callable[[Episode], None]] = told(observers, "begin")
-        self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = told(observers, "observation")
-        self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = told(observers, "action")
-        self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = told(observers, "scene")
-        self._on_disturbance: list[Callable[[Disturbance], None]] = told(observers, "disturbance")
-        self._on_copied = told(observers, "copied")
-        self._on_end: list[Callable[[TrialResult], TrialResult]] = told(observers[::-1], "end")
-        self._disturbed: Disturbed | None = None
+        self._on_begin: list[Callable[[Episode], None]] = callbacks_for(observers, "begin")
+        self._on_making: list[Callable[[int], None]] = callbacks_for(observers, "making")
+        self._on_observation: list[Callable[[int, NDArray[np.generic]], None]] = callbacks_for(observers, "observation")
+        self._on_action: list[Callable[[int, NDArray[np.generic]], None]] = callbacks_for(observers, "action")
+        self._on_scene: list[Callable[[int, Scene, tuple[float, ...]], None]] = callbacks_for(observers, "scene")
+        self._on_disturbance: list[Callable[[Disturbance], None]] = callbacks_for(observers, "disturbance")
+        self._on_copied = callbacks_for(observers, "copied")
+        self._on_end: list[Callable[[TrialResult], TrialResult]] = callbacks_for(observers[::-1], "end")
+        self._disturbed: DisturbanceInjector | None = None
         self._forks = forks
         self._reset = reset or simulator.reset
         self._observers = tuple(observers)
@@ -238,7 +349,7 @@ class Episode(Copied, Ending, Whereabouts):
         ahead = self._ahead
         assert ahead is not None
         try:
-            come, actions = ahead.go_on_from(come, self.agents)
+            come, actions = ahead.resume_after(come, self.agents)
         except BaseException as error:
             return self._fail_at_once(error)
         if come not in (DONE, ASK):
@@ -289,6 +400,19 @@ class Episode(Copied, Ending, Whereabouts):
         begun = [one for one in self.spec.disturbances if one.step <= self.steps + 1]
         self.spec = replace(self.spec, disturbances=in_turn([*begun, *disturbances]))
 
+    def reseed(self, seed: int) -> TrialResult | None:
+        """Give the simulator's generators another seed from the next step on.
+
+        Returns:
+            None where the next step can be taken, the result where not.
+        """
+        try:
+            assert supports(self.simulator, Reseeds)  # looked at when it was set up
+            self.simulator.reseed(seed)
+        except BaseException as error:
+            return self._fail_in_simulator(error)
+        return None
+
     def takes_place(self, disturbance: Disturbance) -> bool:
         """Whether somebody was there for a disturbance that has begun."""
         return self._disturbed is not None and self._disturbed.took_place(disturbance)
@@ -317,10 +441,12 @@ class Episode(Copied, Ending, Whereabouts):
         spec, simulator = self.spec, self.simulator
         agent = ""
         try:
+            if spec.reseeding is not None:
+                _require_reseeding(simulator)
             try:
                 self._observations, _ = self._reset(seed=spec.seed, options=options_of(spec, simulator))
             finally:
-                self.setup_steps = simulator.setup_steps if offers(simulator, CountsSetUp) else None
+                self.setup_steps = simulator.setup_steps if supports(simulator, CountsSetUp) else None
             self.names = tuple(simulator.agents)
             self._nothing = (0.0,) * len(self.names)
             for tell in self._on_begin:
@@ -328,11 +454,15 @@ class Episode(Copied, Ending, Whereabouts):
             if self._forks:
                 self._held = held(shared_memory())
             if spec.disturbances or self._forks:  # a copy may be disturbed, and then is as it would have been from here
-                self._disturb(Disturbed(spec, simulator, self._on_disturbance))
+                self._disturb(DisturbanceInjector(spec, simulator, self._on_disturbance))
             for number, agent in enumerate(self.names):
+                for tell_making in self._on_making:
+                    tell_making(number)
                 self.agents[agent] = self._make_agent(agent, simulator, spec.arguments.get(agent, {}))
                 self.agents[agent].reset(agent_seed(spec.seed, number))
             agent = ""
+            for tell_making in self._on_making:
+                tell_making(-1)
             self._scene = scene = simulator.scene()
             for show in self._on_scene:
                 show(0, scene, self._nothing)
@@ -344,7 +474,7 @@ class Episode(Copied, Ending, Whereabouts):
             return self._fail(Outcome.INVALID, error, found.agent, found.cause)
         for oracle in self._oracles:
             if isinstance(oracle, SeesMap):
-                oracle.see_map(simulator.lanes() if offers(simulator, HasMap) else ())
+                oracle.see_map(simulator.lanes() if supports(simulator, HasMap) else ())
         self._checks = [oracle.check for oracle in self._oracles]
         finding = self._find(scene)
         if finding is not None:
@@ -354,14 +484,14 @@ class Episode(Copied, Ending, Whereabouts):
             return self._end(Outcome.INVALID, collision=hit, failure=failure)
         self.acting = tuple(range(len(self.names)))
         self._encoders = [simulator.actions[name].encode for name in self.names]
-        if offers(simulator, FlattensObservations):
-            self._unflatten = {name: unflattener(space) for name, space in simulator.shown_spaces.items()}
+        if supports(simulator, FlattensObservations):
+            self._unflatten = {name: observation_restorer(space) for name, space in simulator.shown_spaces.items()}
         if self._disturbed is None:
-            self._ahead = goes_ahead(simulator, self._observers, self._oracles, self._max_steps, self._encoders)
+            self._ahead = make_fast_path(simulator, self._observers, self._oracles, self._max_steps, self._encoders)
             self._take = None if self._ahead is None else self._ahead.at_once.core.take
         return self._end(Outcome.SURVIVED) if spec.max_steps < 1 else None
 
-    def _disturb(self, disturbed: Disturbed) -> None:
+    def _disturb(self, disturbed: DisturbanceInjector) -> None:
         self._disturbed = disturbed
         self._advance, self._observations = disturbed.step, disturbed.first(self._observations)
         self._on_end.insert(0, disturbed.end)
@@ -388,3 +518,15 @@ class Episode(Copied, Ending, Whereabouts):
         if not findings:
             return None
         return merge_findings([finding for finding in findings if finding.outcome in self._crash_on])
+
+
+def _require_reseeding(simulator: Simulator) -> None:
+    """Check that a simulator's generators can get another seed.
+
+    Raises:
+        InvalidEpisodeError: they cannot.
+    """
+    if not supports(simulator, Reseeds):
+        raise InvalidEpisodeError("its simulator offers no way to re-seed its random generators")
+    if simulator.why_no_reseeding:
+        raise InvalidEpisodeError(simulator.why_no_reseeding)

@@ -1,26 +1,51 @@
-"""What is told of an exception, however it is made: an agent's may be of any class and any size."""
+"""How an episode fails: which part of it an exception comes from, what is reported of it, and how the episode ends."""
 
 from __future__ import annotations
 
+import resource
 import sys
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from itertools import islice
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.agents import Closes
-from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, SimulatorError
-from crashhunt.base.exception_text import class_name, format_error, message_of
-from crashhunt.base.faculties import offers
-from crashhunt.base.limits import limit_behind
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import ActionError, EpisodeError, InvalidEpisodeError, RecorderError, SimulatorError
+from crashhunt.base.exceptions import class_name, format_error, is_users, message_of
+from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import blocked_signals
-from crashhunt.trial import Failure
+from crashhunt.scenario import Scenario
+from crashhunt.trial import Failure, Outcome, TrialResult
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from types import FrameType
     from typing import Final
 
     from crashhunt.agents import Agent
+    from crashhunt.episode._fast_path import FastPath
+    from crashhunt.episode._observers import Observer
+    from crashhunt.oracles import Oracle
+    from crashhunt.simulators import Simulator
+    from crashhunt.trial import TrialSpec
+    from crashhunt.world import Scene
 
-__all__ = ["close_agent", "failure_of", "is_emptied", "words_of"]
+
+__all__ = [
+    "Attribution",
+    "Ending",
+    "attribute_error",
+    "close_agent",
+    "failure_of",
+    "is_emptied",
+    "message_of_error",
+    "record_originals",
+]
+
+
+# What is told of an exception, however it is made: an agent's may be of any class and any size.
 
 _MIN_RECURSION_LIMIT: Final = 1000
 _KINDS: tuple[tuple[type[BaseException], str], ...] = (
@@ -41,7 +66,7 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
     with blocked_signals(), _deep_enough():
         # A message of our own says everything; where in our code it was raised is nobody's business.
         text = "" if issubclass(type(error), InvalidEpisodeError) else format_error(error)
-        words = words_of(error)
+        words = message_of_error(error)
         # A class of a user's may have a metaclass of any kind, so nothing is looked up by it.
         kind = next((kind for one, kind in _KINDS if type(error) is one), None) or class_name(error)
     message = words if issubclass(type(error), EpisodeError) else " ".join(words.split())
@@ -72,7 +97,7 @@ def is_emptied() -> bool:
     return __name__ not in sys.modules
 
 
-def words_of(error: BaseException) -> str:
+def message_of_error(error: BaseException) -> str:
     """Return the message of an exception, which may be of a class that cannot even say it; a long one is cut."""
     return message_of(error)
 
@@ -80,8 +105,394 @@ def words_of(error: BaseException) -> str:
 def close_agent(agent: Agent) -> None:
     """Close an agent; whatever comes of that, the episode is over."""
     try:
-        if offers(agent, Closes):
+        if supports(agent, Closes):
             agent.close()
     except BaseException as error:
         with suppress(BaseException):
             sys.stderr.write(format_error(error))
+
+
+# Which agent an exception comes from that was raised while the simulator, an oracle or crashhunt itself was running.
+#
+# Code of an agent runs at such times too: in a signal handler, a finalizer, a callback, or in place of a function that
+# the agent has replaced.
+
+_TRIES: Final = 3
+_MAX_FRAMES: Final = 2_000  # of a traceback, from its outer end; the rest repeats
+_MAX_CAUSES: Final = 8
+_MAX_MODULES: Final = 2_000  # of a user's, that refer to each other
+_MAX_HELD: Final = 200  # objects that a simulator or an agent consists of
+_DEPTH_OF_HELD: Final = 3
+_WATCHED: Final = frozenset({"builtins", "math", "random", "time"})  # of Python's own modules
+_LIMITS: Final = {
+    "RLIMIT_AS": resource.RLIMIT_AS,
+    "RLIMIT_DATA": resource.RLIMIT_DATA,
+    "RLIMIT_NOFILE": resource.RLIMIT_NOFILE,
+    "RLIMIT_FSIZE": resource.RLIMIT_FSIZE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Attribution:
+    """An exception that comes from an agent.
+
+    Args:
+        agent: identifier of the agent; empty where it is one of several.
+        cause: what an agent has done to make another part fail, as a clause; empty where its own code raised.
+    """
+
+    agent: str
+    cause: str = ""
+
+
+@dataclass(slots=True)
+class _Originals:
+    """What code of the process was like before a trial ran."""
+
+    packages: frozenset[str]
+    functions: dict[str, dict[str, object]]
+    classes: dict[type, dict[str, object]]
+    recursion_limit: int
+    limits: dict[str, int]
+
+
+_originals: list[_Originals] = []
+
+
+def record_originals() -> None:
+    """Record the functions of simulators and their libraries, and the limits of this process.
+
+    What an agent replaces later is found by comparison, when something fails. Call it once all code is imported and
+    before a trial runs.
+    """
+    packages = _packages_of_simulators()
+    functions: dict[str, dict[str, object]] = {}
+    classes: dict[type, dict[str, object]] = {}
+    for name, module in list(sys.modules.items()):
+        if not isinstance(module, ModuleType) or (name not in _WATCHED and name.partition(".")[0] not in packages):
+            continue
+        held = {key: value for key, value in vars(module).items() if callable(value)}
+        functions[name] = held
+        for value in held.values():
+            if isinstance(value, type) and value.__module__ == name and value not in classes:
+                classes[value] = {key: one for key, one in vars(value).items() if callable(one)}
+    limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
+    _originals[:] = [_Originals(packages, functions, classes, sys.getrecursionlimit(), limits)]
+
+
+def _packages_of_simulators() -> frozenset[str]:
+    """Return crashhunt and the installed packages that its simulators use, among them NumPy."""
+    found = {"crashhunt"}
+    for name, module in list(sys.modules.items()):
+        if name.startswith("crashhunt.simulators"):
+            found |= {_module_of_value(value).partition(".")[0] for value in vars(module).values()}
+    return frozenset(found - sys.stdlib_module_names - {""})
+
+
+def attribute_error(
+    error: BaseException, agents: Mapping[str, object], simulator: object, observing: Sequence[object] = ()
+) -> Attribution | None:
+    """Return which agent an exception comes from; None where it comes from another part, or that is not known.
+
+    It is an agent's where
+
+    - a function on its traceback, or on that of its cause, is a method of the agent's class, or defined in a module
+      that only the agent uses. A module that environment, oracles or observers use as well counts as theirs.
+    - a function that the traceback refers to has been replaced since `record_originals`.
+    - memory, files or recursion ran out and their limit was lowered since then.
+
+    Args:
+        error: the exception, with its traceback.
+        agents: by identifier; those made so far.
+        simulator: the simulator.
+        observing: oracles and observers of the episode.
+    """
+    for _ in range(_TRIES):
+        try:
+            with blocked_signals():
+                return _attribute(error, agents, simulator, observing)
+        except BaseException:  # an agent may have damaged what this uses, and its signal handlers may raise here too
+            continue
+    return None
+
+
+def _attribute(
+    error: BaseException, agents: Mapping[str, object], simulator: object, observing: Sequence[object]
+) -> Attribution | None:
+    if is_emptied():
+        return Attribution("")
+    others = {module for part in (simulator, *observing) for module, _ in _classes_of(part)}
+    classes = {name: set(_own_classes_of(agent)) for name, agent in agents.items()}
+    for value in _attributes(simulator).values():
+        if isinstance(value, Scenario):
+            others.update(value.modules())
+            for name, setup in value.agents.items():
+                module, colon, attribute = setup.agent.partition(":")
+                classes.setdefault(name, set()).update([(module, attribute)] if colon else [])
+    if not any(classes.values()):
+        return None
+    frames = list(_frames_of(error))
+    others = _with_helpers(others)
+    agent = _agent_on_stack(frames, agents, classes, others)
+    if agent is not None:
+        return Attribution(agent)
+    suspects = [name for name, found in classes.items() if found]
+    cause = _replaced_function(frames, others) or _lowered_limit(error)
+    return Attribution(suspects[0] if len(suspects) == 1 else "", cause) if cause else None
+
+
+def _agent_on_stack(
+    frames: list[FrameType],
+    agents: Mapping[str, object],
+    classes: Mapping[str, set[tuple[str, str]]],
+    others: set[str],
+) -> str | None:
+    """Return the agent whose code is the innermost on a stack; empty where several share it, None where none is."""
+    own = {name: {module for module, _ in found} - others for name, found in classes.items()}
+    helpers = {name: _with_helpers(found) - others for name, found in own.items()}
+    for frame in frames:
+        module, code = frame.f_globals.get("__name__"), frame.f_code
+        if not isinstance(module, str):
+            continue
+        owners = [
+            name
+            for name, found in classes.items()
+            if module in own[name]
+            or (module in helpers[name] and is_users(code.co_filename))
+            or any(module == place and code.co_qualname.startswith(f"{one}.") for place, one in found)
+        ]
+        if len(owners) > 1 and code.co_varnames:
+            first = frame.f_locals.get(code.co_varnames[0])
+            owners = [name for name in owners if agents.get(name) is first] or owners
+        if owners:
+            return owners[0] if len(owners) == 1 else ""
+    return None
+
+
+def _frames_of(error: BaseException) -> Iterator[FrameType]:
+    """Yield the frames that an exception came through, the innermost first, and then those of its causes."""
+    one: BaseException | None = error
+    for _ in range(_MAX_CAUSES):
+        if one is None:
+            return
+        frames: list[FrameType] = []
+        link = one.__traceback__
+        while link is not None and len(frames) < _MAX_FRAMES:
+            frames.append(link.tb_frame)
+            link = link.tb_next
+        yield from reversed(frames)
+        one = one.__cause__
+
+
+def _classes_of(thing: object) -> Iterator[tuple[str, str]]:
+    """Yield module and qualified name of the classes of an object and of what it consists of, but for crashhunt's."""
+    left: list[tuple[object, int]] = [(thing, 0)]
+    seen: set[int] = set()
+    while left and len(seen) < _MAX_HELD:
+        one, depth = left.pop(0)
+        if id(one) in seen:
+            continue
+        seen.add(id(one))
+        for base in type(one).__mro__[:-1]:
+            module = base.__dict__.get("__module__")
+            if isinstance(module, str) and module != "builtins" and not module.startswith("crashhunt."):
+                yield module, base.__qualname__
+        if depth < _DEPTH_OF_HELD:
+            left += ((value, depth + 1) for value in _attributes(one).values() if _is_instance(value))
+
+
+def _own_classes_of(agent: object) -> Iterator[tuple[str, str]]:
+    """Yield module and qualified name of the classes of an agent, without those of libraries that it only uses."""
+    itself = vars(type(agent)).get("__module__")
+    yield from (found for found in _classes_of(agent) if found[0] == itself or _is_users_module(found[0]))
+
+
+def _attributes(thing: object) -> dict[str, object]:
+    # Not by ``vars``, which calls what a user's class has made of ``__dict__``.
+    with suppress(AttributeError, TypeError):
+        found = object.__getattribute__(thing, "__dict__")
+        return dict(islice(found.items(), _MAX_HELD)) if type(found) is dict else {}
+    return {}
+
+
+def _is_instance(value: object) -> bool:
+    """Whether a value is an object of a class with attributes of its own, not a function, class or module."""
+    return not isinstance(value, type | FunctionType | ModuleType) and bool(_attributes(value))
+
+
+def _with_helpers(modules: Iterable[str]) -> set[str]:
+    """Return modules of a user's, and those of the user's that they refer to, directly or by others."""
+    found: set[str] = set()
+    left = list(modules)
+    while left and len(found) < _MAX_MODULES:
+        name = left.pop()
+        module = sys.modules.get(name)
+        if name in found or module is None:
+            continue
+        found.add(name)
+        for value in list(vars(module).values()):
+            other = _module_of_value(value)
+            if other and other not in found and _is_users_module(other):
+                left.append(other)
+    return found
+
+
+def _module_of_value(value: object) -> str:
+    if type(value) is ModuleType:
+        return str(vars(value).get("__name__", ""))
+    if type(value) is FunctionType:
+        return str(value.__module__ or "")
+    if type(value) is type:
+        return str(vars(value).get("__module__", ""))
+    found = vars(type(value)).get("__module__")  # of types in C it is a descriptor
+    return found if isinstance(found, str) else ""
+
+
+def _is_users_module(name: str) -> bool:
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return isinstance(file, str) and is_users(file)
+
+
+def _replaced_function(frames: list[FrameType], others: set[str]) -> str:
+    """Return what an agent has replaced of the functions that frames refer to, as a clause; empty for nothing.
+
+    crashhunt itself, the libraries that are watched, environments and oracles replace functions by some of their own.
+    """
+    if not _originals:
+        return ""
+    used = {name for frame in frames for name in frame.f_code.co_names}
+
+    def is_foreign(value: object, original: object) -> bool:
+        module = "" if value is None else _module_of_value(value)
+        known = module in others or module in _WATCHED or module.partition(".")[0] in _originals[0].packages
+        return value is not original and (not known or module == "builtins")
+
+    replaced: dict[str, str] = {}
+    for module_name, held in _originals[0].functions.items():
+        now = vars(sys.modules[module_name]) if module_name in sys.modules else {}
+        replaced |= {one: f"{module_name}.{one}" for one in used & held.keys() if is_foreign(now.get(one), held[one])}
+    for kind, held in _originals[0].classes.items():
+        place, present = f"{kind.__module__}.{kind.__qualname__}", vars(kind)
+        replaced |= {one: f"{place}.{one}" for one in used & held.keys() if is_foreign(present.get(one), held[one])}
+    for frame in frames:  # the innermost function that refers to one is the one that failed
+        for name in frame.f_code.co_names:
+            if name in replaced:
+                return f"{replaced[name]} has been replaced"
+    return ""
+
+
+def _lowered_limit(error: BaseException) -> str:
+    """Return which limit an agent has lowered that an exception is due to, as a clause; empty for none."""
+    if not _originals:
+        return ""
+    before = _originals[0]
+    kind = type(error)
+    if issubclass(kind, RecursionError) and sys.getrecursionlimit() < before.recursion_limit:
+        return f"the recursion limit has been lowered to {sys.getrecursionlimit()}"
+    if not issubclass(kind, MemoryError | OSError):
+        return ""
+    for name, limit in before.limits.items():
+        now = resource.getrlimit(_LIMITS[name])[0]
+        if now != limit and now != resource.RLIM_INFINITY and (limit == resource.RLIM_INFINITY or now < limit):
+            return f"{name} has been lowered to {now}"
+    return ""
+
+
+# How an episode ends, whoever is to blame.
+
+
+class Ending:
+    """The part of an `Episode` that ends it."""
+
+    spec: TrialSpec
+    simulator: Simulator
+    agents: dict[str, Agent]
+    names: tuple[str, ...]
+    steps: int
+    result: TrialResult | None
+    error: BaseException | None
+    _on_end: list[Callable[[TrialResult], TrialResult]]
+    _ahead: FastPath | None
+    _take: Callable[[Mapping[str, Agent]], int] | None
+    _scene: Scene | None
+    _oracles: tuple[Oracle, ...]
+    _observers: tuple[Observer, ...]
+
+    def _fail(self, outcome: Outcome, error: BaseException, agent: str = "", cause: str = "") -> TrialResult:
+        """End with an exception of an agent's, or of the simulator's."""
+        self.error = error
+        return self._end(outcome, failure=failure_of(error, agent, cause=cause))
+
+    def _fail_in_simulator(self, error: BaseException) -> TrialResult:
+        """End with an exception that was raised while the simulator was running, by itself or by code of an agent.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        found = self._attribute(error)
+        if found is not None:
+            return self._fail(Outcome.AGENT_ERROR, error, found.agent, found.cause)
+        if isinstance(error, RecorderError):
+            raise error
+        return self._fail(Outcome.SIMULATOR_ERROR, error)
+
+    def end_by_agent(self, error: BaseException) -> TrialResult | None:
+        """End with an exception that an agent's code has raised between two steps, as a signal handler may.
+
+        Returns:
+            The result; None where the exception does not come from an agent.
+        """
+        if self.result is not None:
+            return self.result
+        found = self._attribute(error)
+        return None if found is None else self._fail(Outcome.AGENT_ERROR, error, found.agent, found.cause)
+
+    def _attribute(self, error: BaseException) -> Attribution | None:
+        """Return which agent has made something fail; None where none has, as far as is known."""
+        return attribute_error(error, self.agents, self.simulator, (*self._oracles, *self._observers))
+
+    def _end(self, outcome: Outcome, **evidence: Any) -> TrialResult:
+        """End, and let everybody who has looked on add what they have found out."""
+        time_s = self.simulator.scene().time_s if self._scene is not None else 0.0
+        return self._add(TrialResult(self.spec, outcome, steps=self.steps, sim_time_s=time_s, **evidence))
+
+    def _add(self, result: TrialResult) -> TrialResult:
+        self._take = None
+        for tell in self._on_end:
+            result = tell(result)
+        self.result = result
+        return result
+
+    def _break(self, error: BaseException) -> TrialResult:
+        """End where it cannot go on, and neither agent nor simulator has said why.
+
+        An oracle has failed, an observer, or something that the agent has damaged, such as our own files.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        found = self._attribute(error)
+        if found is None and isinstance(error, RecorderError):
+            raise error
+        self.error = error
+        is_agents = found is not None or issubclass(type(error), OSError | MemoryError)
+        found = found or Attribution("")
+        outcome = Outcome.AGENT_ERROR if is_agents else Outcome.SIMULATOR_ERROR
+        failure = failure_of(error, found.agent, cause=found.cause)
+        self.result = TrialResult(self.spec, outcome, steps=self.steps, failure=failure)
+        with suppress(BaseException):
+            self._add(self.result)
+        return self.result
+
+    def _fail_at_once(self, error: BaseException) -> TrialResult:
+        """End with an exception that has come through the core.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        assert self._ahead is not None
+        if self._ahead.cannot_record:
+            return self._break(error)
+        if not self._ahead.at_once.core.simulating:
+            return self._fail(Outcome.AGENT_ERROR, error, self.names[0])
+        return self._fail_in_simulator(error)

@@ -10,17 +10,17 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal, cast
 
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.faculties import offers
 from crashhunt.episode._questions import Questions
-from crashhunt.simulators import Disturbs
+from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Outcome, Stress, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.base.answers import NoAnswer
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.forks import NoAnswer
+    from crashhunt.base.json_types import Plain
     from crashhunt.episode._episode import Episode
     from crashhunt.trial import TrialResult
 
@@ -200,7 +200,7 @@ class Prober:
     def _questions_at(self, episode: Episode) -> list[_Question]:
         """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""
         simulator = episode.simulator
-        kinds = simulator.disturbing_kinds if offers(simulator, Disturbs) else ()
+        kinds = simulator.disturbing_kinds if supports(simulator, SupportsDisturbances) else ()
         every = [
             _Question(kind, who, episode.names[number])
             for kind in PROBED
@@ -213,7 +213,9 @@ class Prober:
         def look(copy: Episode) -> Plain:
             who = [one.kind.disturbance(1.0, one.who, one.agent, copy.steps + 1) for one in others]
             return {
-                "there": [bool(copy.simulator.whom(one)) for one in who] if offers(copy.simulator, Disturbs) else []
+                "there": [bool(copy.simulator.resolve_target(one)) for one in who]
+                if supports(copy.simulator, SupportsDisturbances)
+                else []
             }
 
         there = self._in_copy(episode, look).get("there", []) if others else []

@@ -5,16 +5,20 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from crashhunt.base.answers import NoAnswer
-from crashhunt.base.forks import CannotForkError, NoProcessError
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
 from crashhunt.base.text import encodable, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.json_types import Plain
+    from crashhunt.episode._episode import Episode
+    from crashhunt.trial import TrialResult
 
-__all__ = ["Questions"]
+
+__all__ = ["FirstCopy", "Questions"]
+
 
 _ATTEMPTS: Final = 3  # copies per question, as long as something outside ends them
 _PAUSES_S: Final = (0.05, 0.5)  # wall time before the second and the third, in which memory may become free
@@ -132,3 +136,36 @@ class Questions:
 
 def _shortened(reason: NoAnswer) -> NoAnswer:
     return NoAnswer(encodable(one_line(reason.why[:_MAX_REASON_LENGTH])), reason.is_from_outside)
+
+
+# The first copy of a running episode: after one step it is known whether there can be any.
+
+
+class FirstCopy:
+    """Copies the first episode of a process after its first step, and does nothing with that.
+
+    Args:
+        refused: called with why it could not be copied, in words.
+    """
+
+    def __init__(self, refused: Callable[[str], None]) -> None:
+        self._refused = refused
+        self._tried = False
+
+    def is_due(self, episode: Episode) -> bool:
+        """Whether it has not been tried."""
+        return not self._tried and episode.steps > 0
+
+    def ask(self, episode: Episode) -> None:
+        """Try it."""
+        try:
+            episode.fork(lambda _copy: {}, observed=False).end()
+        except NoProcessError:
+            return  # which says nothing about the trial: the next step tries again
+        except CrashhuntError as error:
+            self._refused(error.message)
+        self._tried = True
+
+    def result(self, result: TrialResult) -> TrialResult:
+        """Return it as it is."""
+        return result

@@ -2,33 +2,59 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import random
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from crashhunt.agents import NeedsLibraries
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.plugins import import_module, locate
+from crashhunt.base.sandbox import confine
+from crashhunt.base.temporary import record_shared_memory
 from crashhunt.episode._episode import Episode
-from crashhunt.episode._nearness import Nearness
-from crashhunt.episode._recorder import Recorder
-from crashhunt.trial import CRASHES
+from crashhunt.episode._failures import record_originals
+from crashhunt.episode._observers import Nearness, Recorder
+from crashhunt.oracles import parse_oracle
+from crashhunt.simulators import FlattensObservations
+from crashhunt.trial import CRASHES, signature_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.agents import Agent
     from crashhunt.episode._branches import Brancher
     from crashhunt.episode._episode import MakeAgent, Reset
-    from crashhunt.episode._first_copy import FirstCopy
-    from crashhunt.episode._observer import Observer
+    from crashhunt.episode._observers import Observer
     from crashhunt.episode._probes import Prober
+    from crashhunt.episode._questions import FirstCopy
+    from crashhunt.episode._settings import WorkerSettings
     from crashhunt.oracles import Oracle
     from crashhunt.recording import BlackBox
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Outcome, TrialResult, TrialSpec
+    from crashhunt.trial import Outcome, TrialResult, TrialSpec, Value
 
-__all__ = ["generators", "run_episode", "seed_everything", "set_generators"]
+
+__all__ = [
+    "MAX_RECURSION_LIMIT",
+    "Parts",
+    "bound_recursion",
+    "generators",
+    "require_origin",
+    "run_episode",
+    "seal",
+    "seed_everything",
+    "set_generators",
+    "stage_of",
+]
 
 
 def run_episode(
@@ -84,6 +110,10 @@ def run_episode(
             result = episode.start()
             try:
                 while result is None:
+                    if spec.reseeding is not None and episode.steps == spec.reseeding.after:
+                        result = episode.reseed(spec.reseeding.seed)
+                        if result is not None:
+                            break
                     result = episode.step()
                     for one in asking:
                         if result is None and one.is_due(episode):
@@ -123,3 +153,153 @@ def set_generators(state: tuple[Any, ...]) -> None:
     np.random.set_state(state[1])  # noqa: NPY002
     if state[2] is not None:
         sys.modules["torch"].set_rng_state(state[2])
+
+
+# A bound on how deep Python may recurse in a process that runs agents.
+
+MAX_RECURSION_LIMIT: Final = 200_000
+"""As deep as this, calls of Python functions take 50 MB and 0.3 s."""
+
+_set_limit = sys.setrecursionlimit
+
+
+def bound_recursion() -> None:
+    """Have `sys.setrecursionlimit` set `MAX_RECURSION_LIMIT` where it is asked for more.
+
+    Python allocates the frames of Python functions on the heap, so endless recursion without a limit fills the memory
+    of the machine in minutes. With the bound it ends in a `RecursionError`.
+    """
+    sys.setrecursionlimit = setrecursionlimit
+
+
+def setrecursionlimit(limit: int, /) -> None:
+    """Set how deep Python may recurse, at most `MAX_RECURSION_LIMIT`."""
+    _set_limit(min(limit, MAX_RECURSION_LIMIT))
+
+
+# What a trial is put together from: simulator, agents and oracles, as the settings name them.
+
+
+class Parts:
+    """Makes the parts of trials in this process, from the code that the settings name.
+
+    Args:
+        settings: of the hunt.
+    """
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        self._settings = settings
+        self._factories: dict[str, tuple[Any, tuple[str, ...]]] = {}
+        if settings.code:
+            # What the snapshot does not have may come from where the hunt was started, as it did then.
+            sys.path[:0] = [*settings.code, str(Path.cwd())]
+        self._oracles = [parse_oracle(text) for text in settings.oracles]
+
+    def oracles(self) -> list[Oracle]:
+        """Make the oracles of a trial; what one remembers of a trial is nobody's business in the next."""
+        return [choice.make() for choice in self._oracles]
+
+    def load(self, report: Callable[[str], None] = lambda _: None) -> None:
+        """Import everything that trials need, always in the same order.
+
+        What modules do when they are imported, such as setting constants of a simulator's classes, is done before the
+        first episode: so it holds in every one of them, whichever comes first.
+
+        Args:
+            report: called before each import with the error if it does not return, as "the module 'm' cannot be
+                imported": an import that hangs or ends the process cannot report that itself.
+
+        Raises:
+            CrashhuntError: something cannot be imported.
+        """
+        record_shared_memory(self._settings.scratch)
+        bound_recursion()  # before a module is imported that recurses
+        # Whatever modules draw when they are imported is the same in every process.
+        seed_everything(0)
+        scenario = self._settings.scenario
+        report(f"the simulator {scenario.simulator!r} cannot be imported")
+        locate("simulators", scenario.simulator)
+        for module in scenario.modules():
+            report(f"the module {module!r} cannot be imported")
+            import_module(module)
+        for agent, setup in scenario.agents.items():
+            report(f"the module {setup.agent.partition(':')[0]!r} of agent {agent} cannot be imported")
+            factory, _ = self._factory(agent)
+            # PyTorch takes longer than a short trial may.
+            for library in factory.libraries if supports(factory, NeedsLibraries) else ():
+                with suppress(ImportError):  # which the agent itself will tell
+                    importlib.import_module(library)
+        # Of which every simulator's spaces are: here, so that workers that are forks of this process have it.
+        report("Gymnasium cannot be imported")
+        importlib.import_module("gymnasium")
+        record_originals()
+
+    def simulator(self) -> Simulator:
+        """Make a simulator, with a folder for files of its own."""
+        stage = stage_of(self._settings.scratch, os.getpid())
+        stage.mkdir(parents=True, exist_ok=True)
+        scenario = self._settings.scenario
+        made: Simulator = locate("simulators", scenario.simulator)(scenario, stage)
+        return made
+
+    def agent(self, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
+        """Make the agent of a vehicle; files that its arguments name come from the snapshot.
+
+        Raises:
+            CrashhuntError: its module comes from elsewhere than the snapshot that has it.
+        """
+        factory, wanted = self._factory(agent)
+        given: dict[str, object] = {}
+        if "observation_space" in wanted:
+            shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
+            given["observation_space"] = shown.get(agent) or simulator.observation_spaces[agent]
+        if "action_space" in wanted:
+            given["action_space"] = simulator.actions[agent].space
+        if "step_length_s" in wanted:
+            given["step_length_s"] = simulator.step_length_s
+        files = self._settings.argument_files
+        values = {
+            name: files.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
+        }
+        made: Agent = factory(**{**given, **values})
+        return made
+
+    def _factory(self, agent: str) -> tuple[Any, tuple[str, ...]]:
+        found = self._factories.get(agent)
+        if found is None:
+            factory = locate("agents", self._settings.scenario.agents[agent].agent)
+            if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
+                require_origin(factory.__module__, self._settings.code)
+            found = self._factories[agent] = factory, signature_of(factory).given
+        return found
+
+
+def stage_of(scratch: Path, pid: int) -> Path:
+    """Return the folder for files of the simulator that a process has made."""
+    return scratch / f"stage-{pid}"
+
+
+def seal(settings: WorkerSettings) -> None:
+    """Confine this process to its scratch folder, if what it runs is a stranger's; it works there from then on."""
+    if settings.sealed is None:
+        return
+    home = settings.scratch / "home"
+    home.mkdir(exist_ok=True)
+    os.chdir(home)  # where SUMO writes what nobody has said where to write
+    os.environ |= {"HOME": str(home), "TMPDIR": str(home)}
+    confine(settings.scratch, [settings.scenario.folder, *settings.sealed])
+
+
+def require_origin(module: str, code: tuple[str, ...]) -> None:
+    """See that a module comes from the snapshot, if it is there at all, and not from where it is developed."""
+    top = module.partition(".")[0]
+    file = getattr(sys.modules[module], "__file__", None)
+    for folder in code:
+        if (Path(folder) / top).is_dir() or (Path(folder) / f"{top}.py").is_file():
+            if file is not None and not Path(file).resolve().is_relative_to(folder):
+                raise CrashhuntError(
+                    f"the module {module!r} was imported from {file}, not from the snapshot",
+                    fix="remove it from PYTHONPATH and from start-up files such as sitecustomize",
+                    where=folder,
+                )
+            return

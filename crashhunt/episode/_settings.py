@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,13 +16,13 @@ from crashhunt.scenario import as_in_file
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.codec import JsonObject
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult
 
-__all__ = ["SettingsData", "WorkerSettings", "answer_file", "scratch_of"]
+__all__ = ["WorkerSettings", "answer_file", "scratch_of"]
 
 
 _TIMEOUT_S = 60.0  # what leaving it out means, whatever the default of the option is some day
@@ -30,28 +30,6 @@ _AUDIT = 1  # apart from what draws the trial itself
 
 
 _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another one
-
-
-class SettingsData(TypedDict):
-    """The plain data of `WorkerSettings`; what may be missing has come since the first version."""
-
-    schema: int
-    requires: NotRequired[list[str]]
-    scenario: Plain
-    oracles: Sequence[str]
-    crash_on: Sequence[str]
-    scratch: str
-    code: NotRequired[Sequence[str]]
-    argument_files: NotRequired[dict[str, str]]
-    timeout_s: NotRequired[float]
-    keep_trials: NotRequired[bool]
-    sealed: NotRequired[Sequence[str] | None]
-    find_escapes: NotRequired[bool]
-    audit: NotRequired[float]
-    hunt_seed: NotRequired[int]
-    warm_copies: NotRequired[int]
-    probe_s: NotRequired[float]
-    branch: NotRequired[Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,13 +81,13 @@ class WorkerSettings:
         draw = np.random.SeedSequence(self.hunt_seed, spawn_key=(result.spec.number, _AUDIT)).generate_state(1)[0]
         return bool(draw < self.audit * 2**32)
 
-    def to_json(self) -> SettingsData:
+    def to_json(self) -> JsonObject:
         """Return plain dicts, strings and numbers."""
         # A replay hands this to the crashhunt of the snapshot, and an older one refuses keys that it does not know:
         # what has come since is written only where it is asked for. For this the defaults may never change.
         scenario = as_in_file(_asked(replace(self.scenario, file=type(self.scenario).file, added={})))
         requires = required_in(self)
-        data: SettingsData = {
+        data: JsonObject = {
             "schema": _SCHEMA,
             "scenario": merged(
                 {**scenario, "schema": self.scenario.schema, "folder": str(self.scenario.folder)}, self.scenario.added
@@ -137,7 +115,7 @@ class WorkerSettings:
         return data
 
     @classmethod
-    def from_json(cls, data: SettingsData) -> WorkerSettings:
+    def from_json(cls, data: Mapping[str, Any]) -> WorkerSettings:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
 
         Raises:

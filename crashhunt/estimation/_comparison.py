@@ -12,8 +12,9 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.base.plain import finite_values
-from crashhunt.hunts import HuntResults, Ledger
+from crashhunt.base.json_types import finite_values
+from crashhunt.hunts import HuntResults
+from crashhunt.ledger import Ledger
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:

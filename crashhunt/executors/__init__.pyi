@@ -1,20 +1,20 @@
 from ._environment import snapshot_environment as snapshot_environment, worker_environment as worker_environment
 from ._fork_server import fork_zygote as fork_zygote
-from ._fresh import FreshProcessExecutor as FreshProcessExecutor
-from ._make import make_executor as make_executor
+from ._fresh import (
+    FreshProcessExecutor as FreshProcessExecutor,
+    SharedExecutors as SharedExecutors,
+    run_alone as run_alone,
+    snapshot_executor as snapshot_executor,
+)
 from ._pool import PoolExecutor as PoolExecutor
+from ._postmortem import read_map as read_map
 from ._protocol import (
     Executor as Executor,
     ExecutorFactory as ExecutorFactory,
     HasNodes as HasNodes,
     NodeFigures as NodeFigures,
     SizesItself as SizesItself,
-)
-from ._remains import read_map as read_map
-from ._snapshot_executor import (
-    SharedExecutors as SharedExecutors,
-    run_alone as run_alone,
-    snapshot_executor as snapshot_executor,
+    make_executor as make_executor,
 )
 from ._supervisor import Supervisor as Supervisor
 from ._trial_process import LEFT_OUT as LEFT_OUT

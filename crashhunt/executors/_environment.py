@@ -13,7 +13,7 @@ from crashhunt.base import layout
 if TYPE_CHECKING:
     from crashhunt.episode import WorkerSettings
 
-__all__ = ["snapshot_environment", "worker_environment"]
+__all__ = ["has_fork_server", "snapshot_environment", "worker_environment"]
 
 _KEPT_SNAPSHOTS = 16  # of which compiled code is kept; some 3 MB each
 
@@ -47,6 +47,12 @@ def snapshot_environment(settings: WorkerSettings) -> dict[str, str]:
     if settings.sealed is None and (compiled := _compiled(settings)) is not None:
         ours |= {"PYTHONPYCACHEPREFIX": str(compiled), "PYTHONDONTWRITEBYTECODE": ""}
     return {**os.environ, **worker_environment(), **ours}
+
+
+def has_fork_server(settings: WorkerSettings) -> bool:
+    """Whether the crashhunt of the settings has a fork server and supervisors: later than 0.1.0, or this one."""
+    package = [Path(folder) / layout.PACKAGE.name for folder in settings.code]
+    return all((found / "executors" / "_fork_server.py").is_file() for found in package if found.is_dir())
 
 
 def _compiled(settings: WorkerSettings) -> Path | None:

@@ -24,15 +24,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from crashhunt.base.codec import prepare
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import WorkerSettings, require_origin, seal
 from crashhunt.executors._supervisor import be_supervisor
+from crashhunt.executors._time_limits import ImportWatch, await_imports, import_died
 from crashhunt.executors._zygote import be_zygote, import_nothing, import_parts
+from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import ErrorData
-    from crashhunt.executors._messages import ForkServerJob, FromForkServer, ToForkServer
+    from crashhunt.base.json_types import ErrorData
+    from crashhunt.executors._protocol import ForkServerJob, FromForkServer, ToForkServer
 
 __all__ = ["fork_zygote", "main"]
 
@@ -59,6 +63,7 @@ def main() -> None:
     except CrashhuntError as error:
         _send(control, error.to_json())
         return
+    prepare(TrialResult)  # here, or each trial's processes do it again: 5 ms
     gc.freeze()
     orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     server, template = os.getpid(), os.fork()
@@ -88,6 +93,7 @@ class _Server:
         self._control, self._orders, self._template, self._settings = control, orders, template, settings
         self._slots: dict[int, int] = {}  # process to slot
         self._ends: dict[int, int] = {}  # process to the descriptor by which the kernel reports its end
+        self._watch = ImportWatch(settings.timeout_s)
 
     def serve(self) -> None:
         """Do what the pool says until it or the template is gone."""
@@ -97,18 +103,36 @@ class _Server:
             ready, _, _ = select.select(watched, [], [], wait_s)
             if self._control.fileno() in ready and not self._obey():
                 return  # the keeper ends every process
-            if self._orders.fileno() in ready:
-                data = self._orders.recv(_MESSAGE)
-                if data:
-                    _send(self._control, _understood(data))
-                else:
-                    self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
+            if self._orders.fileno() in ready and not self._hear_template():
+                self._leave_as(os.waitstatus_to_exitcode(os.waitpid(self._template, 0)[1]))
+            if self._watch.has_hung:
+                _send(self._control, self._watch.hung().to_json())
+                kill(self._template)
+                return
             if self._reap():
                 return
             for pid in (self._template, *self._slots):
                 resume(pid)  # which an agent may have stopped
             # Other children were left behind by a template or a supervisor that died.
             end_descendants(frozenset(self._slots) | {self._template})
+
+    def _hear_template(self) -> bool:
+        """Pass on what the template has said; return whether it is still there."""
+        while True:
+            try:
+                data = self._orders.recv(_MESSAGE, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                return True
+            except OSError:
+                data = b""
+            if not data:
+                return False
+            said = _understood(data)
+            if "importing" in said:
+                self._watch.begin(said["importing"])
+            else:
+                self._watch.begin("")
+                _send(self._control, said)
 
     def _obey(self) -> bool:
         """Do what the pool asks for; return whether it is still there."""
@@ -156,10 +180,15 @@ class _Server:
             if pid in self._slots:
                 _send(self._control, {"slot": self._slots.pop(pid), "pid": pid, "exit_code": code})
             elif pid == self._template:
+                self._hear_template()  # what it said before it ended
                 self._leave_as(code)
 
     def _leave_as(self, code: int) -> NoReturn:
         """End as the template did: who started this process decides what that means."""
+        if self._watch.importing and is_sent_from_outside(code):
+            _send(self._control, {"importing": self._watch.importing})
+        elif self._watch.importing:
+            _send(self._control, import_died(self._watch.importing, code).to_json())
         if code < 0:
             end_descendants()
             signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
@@ -171,7 +200,8 @@ def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool)
     """Import what trials need, and fork a zygote whenever the fork server asks for one."""
     adopt_orphans()
     try:
-        imported = import_nothing(settings) if late else import_parts(settings)
+        report = lambda importing: _send(orders, {"importing": importing})  # noqa: E731
+        imported = import_nothing(settings) if late else import_parts(settings, report)
     except CrashhuntError as error:
         _send(orders, error.to_json())
         return
@@ -217,6 +247,8 @@ def _understood(data: bytes) -> FromForkServer:
             said["unfit"] = True
         elif "ready" in message:
             said["ready"] = int(message["ready"])
+        elif "importing" in message:
+            said["importing"] = str(message["importing"])
     return said
 
 
@@ -226,25 +258,49 @@ def fork_zygote(settings: WorkerSettings, *, late: bool = False) -> socket.socke
     Args:
         settings: of the hunt.
         late: whether each trial imports its agents itself.
+
+    Raises:
+        ImportKilledError: it was ended while it imported, by a signal that may come from outside.
+        CrashhuntError: an import takes too long, or has ended it.
     """
     ours, theirs = socket.socketpair()
+    reports, reported = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     gc.freeze()
     parent, pid = os.getpid(), os.fork()
     if pid == 0:
         try:
             ours.close()
+            reports.close()
             die_with(parent)
-            imported = import_nothing(settings) if late else import_parts(settings)
-            if imported is None:
-                theirs.sendall(json.dumps({"unfit": True}).encode() + b"\n")
-            else:
-                be_zygote(theirs, settings, imported)
-        except CrashhuntError as error:
-            theirs.sendall(json.dumps(error.to_json()).encode() + b"\n")
+            _import_for_zygote(theirs, reported, settings, late=late)
         finally:
             os._exit(1)
     theirs.close()
+    reported.close()
+    with reports:
+        await_imports(reports, pid, settings.timeout_s)
     return ours
+
+
+def _import_for_zygote(
+    control: socket.socket, reported: socket.socket, settings: WorkerSettings, *, late: bool
+) -> None:
+    def report(importing: str) -> None:
+        with suppress(OSError):  # the parent listens until everything has been imported, and no longer
+            reported.send(json.dumps(importing).encode())
+
+    try:
+        imported = import_nothing(settings) if late else import_parts(settings, report)
+    except CrashhuntError as error:
+        control.sendall(json.dumps(error.to_json()).encode() + b"\n")
+        imported = None
+    else:
+        if imported is None:
+            control.sendall(json.dumps({"unfit": True}).encode() + b"\n")
+    report("")
+    reported.close()
+    if imported is not None:
+        be_zygote(control, settings, imported)
 
 
 def _ignore_signals() -> None:

@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.keeper import Kept
+from crashhunt.base.processes import children_of
+from crashhunt.base.reaper import Kept
 from crashhunt.base.signals import describe_death, is_sent_from_outside
-from crashhunt.episode import WorkerSettings, answer_file, require_origin, seal
-from crashhunt.executors._environment import snapshot_environment
-from crashhunt.executors._escapes import with_escape
+from crashhunt.episode import WorkerSettings, answer_file, require_origin, scratch_of, seal
+from crashhunt.executors._environment import has_fork_server, snapshot_environment
 from crashhunt.executors._fork_server import fork_zygote
-from crashhunt.executors._hang import has_hung
-from crashhunt.executors._notes import Notes
-from crashhunt.executors._remains import Attempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError
+from crashhunt.executors._pool import PoolExecutor
+from crashhunt.executors._postmortem import Attempt, damaged, hung, result_of_death, where_it_is
+from crashhunt.executors._protocol import Notes
+from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
+from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from crashhunt.executors._messages import Answer, FreshJob
+    from crashhunt.executors._protocol import Answer, Executor, FreshJob
     from crashhunt.recording import BlackBoxHeader
 
-__all__ = ["FreshProcessExecutor"]
+
+__all__ = ["FreshProcessExecutor", "SharedExecutors", "run_alone", "snapshot_executor"]
+
 
 _LOOK_EVERY_S = 0.01  # starting one takes thirty times as long
 _DAMAGED = 79  # the exit code of a process of crashhunt 0.2 and before whose trial damaged it
@@ -63,6 +71,7 @@ class FreshProcessExecutor:
         self._notes = Notes(settings.scratch)
         self._waiting: deque[Attempt] = deque()
         self._running: dict[int, _Running] = {}
+        self._has_supervisor = has_fork_server(settings)
 
     def submit(self, spec: TrialSpec) -> None:
         """Queue a trial."""
@@ -137,7 +146,14 @@ class FreshProcessExecutor:
         limit_s = self._settings.timeout_s
         if running.answer.exists():  # what is left to do is to find its escape, in trials that have limits of their own
             limit_s = _ESCAPE_S + 2 * limit_s
-        if has_hung(self._settings.scratch, number, given_at=running.began, limit_s=limit_s):
+        header = where_it_is(self._settings.scratch, number)
+        # A supervisor begins the recording before the process of the trial does. It ends that process, or its own
+        # imports, where they hang; so what is left for this one is a supervisor that hangs itself.
+        supervised = self._has_supervisor and (header is None or header.pid in children_of(running.kept.process.pid))
+        begun = header is not None and not supervised
+        limit_s += START_UP_S if supervised else 0.0
+        has_words = partial(_has_words, scratch_of(self._settings.scratch, number) / layout.STACK)
+        if has_hung(header, begun=begun, given_at=running.began, limit_s=limit_s, has_words=has_words):
             running.killed = True
             running.kept.end()
         return None
@@ -173,16 +189,22 @@ class FreshProcessExecutor:
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
         if "lost" in answer:
-            return self._again(running, answer["lost"])
+            return self._again(running, answer["lost"], answer.get("importing", ""))
         result = TrialResult.from_json(answer["result"])
         return replace(result, why_no_escape=why_no_escape) if why_no_escape and result.escape is None else result
 
-    def _again(self, running: _Running, exit_code: int) -> TrialResult | None:
-        """Account for a trial whose process is gone, or run it again."""
+    def _again(self, running: _Running, exit_code: int, importing: str = "") -> TrialResult | None:
+        """Account for a trial whose process is gone, or run it again.
+
+        Raises:
+            CrashhuntError: a module ends its process whenever it is imported.
+        """
         if why := running.attempt.again(self._settings.scratch, exit_code):
             self._notes.add(why)
             self._waiting.appendleft(running.attempt)
             return None
+        if importing:
+            raise import_died(importing, exit_code, times=len(running.attempt.ends))
         return result_of_death(running.attempt, self._settings.scratch, exit_code)
 
     def _job(self, number: int) -> Path:
@@ -192,8 +214,17 @@ class FreshProcessExecutor:
         return self._settings.scratch / f"start-{number:06d}.log"
 
 
+def _has_words(stack: Path) -> bool:
+    try:
+        return stack.stat().st_size > 0
+    except OSError:
+        return False
+
+
 def main() -> None:
     """Run the one trial that a file describes; what comes of it goes into another one."""
+    # A KeyboardInterrupt would end this process, and the forks that import agents, with 1, as if an import had failed.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     job: FreshJob = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     temporary = Path(f"{job['answer']}.part")
 
@@ -226,6 +257,108 @@ def _run(job: FreshJob, answer: Callable[[Answer], None]) -> int:
             answer({"result": found.to_json()})
     except LostTrialError as error:
         answer({"lost": error.exit_code})
+    except ImportKilledError as error:
+        answer({"lost": error.exit_code, "importing": error.importing})
     except CrashhuntError as error:
         answer(error.to_json())
     return 0
+
+
+# Trials run again with the code of a snapshot: in forks of one new Python process, where the snapshot can do that.
+
+_STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
+
+
+def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
+    """Return an executor that runs trials with the code of a snapshot, crashhunt itself included.
+
+    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts Python anew.
+    """
+    if has_fork_server(settings):
+        return PoolExecutor(settings, parallel=parallel, snapshot=True)
+    return FreshProcessExecutor(settings, parallel=parallel)
+
+
+def run_alone(
+    settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
+) -> TrialResult | None:
+    """Run one trial in a new Python process; return what came of it, None where it was stopped.
+
+    Raises:
+        CrashhuntError: it cannot be run.
+    """
+    with closing(FreshProcessExecutor(settings)) as executor:
+        executor.submit(spec)
+        while True:
+            for result in executor.completed(_STOP_CHECK_INTERVAL_S):
+                return result
+            if stopped():
+                return None
+
+
+class SharedExecutors:
+    """Executors for trials of several threads: those whose settings are equal share one.
+
+    Args:
+        scratch: a folder for them.
+        parallel: trials at a time.
+    """
+
+    def __init__(self, scratch: Path, *, parallel: int) -> None:
+        self._scratch = scratch
+        self._parallel = parallel
+        self._lock = threading.Lock()
+        self._shared: dict[str, _Shared] = {}
+
+    def run(
+        self, settings: WorkerSettings, spec: TrialSpec, stopped: Callable[[], bool] = lambda: False
+    ) -> tuple[TrialResult, Path] | None:
+        """Run a trial.
+
+        Returns:
+            What came of it, and the folder in which it was recorded; None where it was stopped.
+
+        Raises:
+            CrashhuntError: it cannot be run.
+        """
+        key = json.dumps(replace(settings, scratch=self._scratch).to_json(), sort_keys=True)
+        with self._lock:
+            shared = self._shared.get(key)
+            if shared is None:
+                scratch = self._scratch / f"shared-{len(self._shared)}"
+                scratch.mkdir(parents=True)
+                executor = snapshot_executor(replace(settings, scratch=scratch), parallel=self._parallel)
+                shared = self._shared[key] = _Shared(executor, scratch)
+        return shared.run(spec, stopped)
+
+    def close(self) -> None:
+        """End every process."""
+        for shared in self._shared.values():
+            shared.executor.close()
+
+
+class _Shared:
+    """An executor of which each thread waits for its own trial.
+
+    A trial that was stopped may still be running when the same one is asked for again, so that each run gets a number
+    of its own, by which its folder is called.
+    """
+
+    def __init__(self, executor: Executor, scratch: Path) -> None:
+        self.executor, self._scratch = executor, scratch
+        self._lock = threading.Lock()
+        self._ended: dict[int, TrialResult] = {}
+        self._numbers = itertools.count()
+
+    def run(self, spec: TrialSpec, stopped: Callable[[], bool]) -> tuple[TrialResult, Path] | None:
+        with self._lock:
+            number = next(self._numbers)
+            self.executor.submit(replace(spec, number=number))
+        while number not in self._ended:
+            if stopped():
+                return None
+            with self._lock:
+                if number not in self._ended:
+                    for result in self.executor.completed(_STOP_CHECK_INTERVAL_S):
+                        self._ended[result.spec.number] = result
+        return replace(self._ended.pop(number), spec=spec), scratch_of(self._scratch, number)

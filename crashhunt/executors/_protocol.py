@@ -2,19 +2,44 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NotRequired, Protocol, TypeAlias, TypedDict, final
 
-from crashhunt.plans import SizesItself
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.exceptions import blamed
+from crashhunt.base.json_types import ErrorData, ErrorWords
+from crashhunt.plans import SizesItself, executor_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.episode import WorkerSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult, TrialSpec
 
-__all__ = ["Executor", "ExecutorFactory", "HasNodes", "NodeFigures", "SizesItself"]
+
+__all__ = [
+    "Answer",
+    "Done",
+    "Executor",
+    "ExecutorFactory",
+    "ForkServerJob",
+    "FreshJob",
+    "FromForkServer",
+    "FromZygote",
+    "HasNodes",
+    "KillTrial",
+    "Lost",
+    "NodeFigures",
+    "Notes",
+    "SizesItself",
+    "ToForkServer",
+    "make_executor",
+]
 
 
 class Executor(Protocol):
@@ -100,3 +125,139 @@ class ExecutorFactory(Protocol):
             parallel: how many trials at a time.
             recycle_after: trials after which a worker is replaced by a fresh one; 0 for never.
         """
+
+
+# The shapes of what a hunt and its processes tell each other, as JSON.
+#
+# A replay talks to the crashhunt of a snapshot, so what earlier versions did not say need not be there.
+
+
+@final
+class Done(TypedDict):
+    """What came of a trial; ``notices`` are for people, ``retires`` says that the supervisor runs no other trial."""
+
+    result: JsonObject
+    notices: NotRequired[list[str]]
+    retires: NotRequired[bool]
+
+
+@final
+class Lost(TypedDict):
+    """A trial that was ended from outside: the exit code of its process, and what failed if it still imported."""
+
+    lost: int
+    importing: NotRequired[str]
+
+
+Answer: TypeAlias = Done | Lost | ErrorData
+"""What a supervisor says at the end of a trial."""
+
+
+class FreshJob(TypedDict):
+    """What a fresh process is to do, and into which file its answer goes."""
+
+    settings: JsonObject
+    spec: JsonObject
+    answer: str
+
+
+class ForkServerJob(TypedDict):
+    """What a fork server needs to know; ``late`` where every trial imports its agents itself.
+
+    ``sys_path`` is empty where crashhunt itself comes from the snapshot, as its environment says.
+    """
+
+    settings: JsonObject
+    sys_path: list[str]
+    late: bool
+
+
+class ToForkServer(TypedDict, total=False):
+    """What the pool asks of its fork server: the supervisor of a slot to be started, or to be killed."""
+
+    slot: int
+    kill: int
+
+
+class FromForkServer(TypedDict, total=False):
+    """What a fork server says: that it is ready, cannot fork, or fails; and which supervisor has ended, and how.
+
+    ``importing`` is what has failed if its template never reports again, in words; empty where that has imported all.
+    """
+
+    importing: str
+    ready: int
+    unfit: bool
+    error: ErrorWords
+    slot: int
+    pid: int
+    exit_code: int
+
+
+class KillTrial(TypedDict):
+    """A supervisor asks its zygote to kill the process of the trial that runs."""
+
+    kill: bool
+
+
+class FromZygote(TypedDict, total=False):
+    """What a zygote says: that it is ready or why it cannot be; how the process of a trial ended.
+
+    ``unfit`` says that files of the simulator have changed, so that no other trial may begin from this zygote.
+    """
+
+    ready: int
+    error: ErrorWords
+    pid: int
+    ended: int
+    unfit: bool
+    notices: list[str]
+
+
+# What people should be told of how trials were run: each thing once.
+
+
+class Notes:
+    """The notes of an executor, and those that its workers leave in the scratch folder.
+
+    Args:
+        scratch: the folder.
+    """
+
+    def __init__(self, scratch: Path) -> None:
+        self._file = scratch / layout.NOTICES
+        self._all: dict[str, None] = {}  # in order
+        self._told = 0
+
+    def add(self, note: str) -> None:
+        """Have something told, unless it was before."""
+        self._all[note] = None
+
+    def fresh(self) -> list[str]:
+        """Return what has not been returned before."""
+        with suppress(OSError):
+            told = self._file.read_text(encoding="utf-8", errors="replace")
+            self._all |= dict.fromkeys(told.splitlines())
+        fresh = list(self._all)[self._told :]
+        self._told += len(fresh)
+        return fresh
+
+
+# The executor that a hunt asks for.
+
+
+def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle_after: int) -> Executor:
+    """Make the executor that ``--executor`` names.
+
+    Raises:
+        PluginError: there is no such executor, or it fails in a way of its own.
+        CrashhuntError: it says why no trial could run.
+    """
+    factory = executor_of(word)
+    try:
+        made: Executor = factory(settings, parallel=parallel, recycle_after=recycle_after)
+    except CrashhuntError:
+        raise
+    except Exception as error:  # somebody's own
+        raise blamed(f"the executor {word!r} cannot be made", error) from error
+    return made

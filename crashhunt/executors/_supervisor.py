@@ -6,6 +6,7 @@ process of a trial leaves behind is evidence, which `check_report` checks.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import secrets
@@ -18,15 +19,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, RecorderError, remedy
+from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError, remedy
 from crashhunt.base.files import whole_file
-from crashhunt.base.limits import limit_behind
 from crashhunt.base.processes import die_with, resume
-from crashhunt.base.signals import is_sent_from_outside
+from crashhunt.base.resources import limit_behind
+from crashhunt.base.signals import describe_death, is_sent_from_outside
 from crashhunt.episode import scratch_of
-from crashhunt.executors._evidence import KEY_BYTES, Report, check_report
-from crashhunt.executors._remains import damaged, died, hung, read_tail
-from crashhunt.recording import BlackBoxFile
+from crashhunt.executors._postmortem import KEY_BYTES, Report, check_report, damaged, died, hung, read_tail
+from crashhunt.executors._time_limits import START_UP_S, has_hung
+from crashhunt.recording import BlackBoxFile, Recording, read_black_box
+from crashhunt.simulators import FullBraking
 from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
@@ -35,16 +37,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.episode import WorkerSettings
-    from crashhunt.executors._messages import Answer, Done, FromZygote, KillTrial
+    from crashhunt.executors._protocol import Answer, Done, FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
     from crashhunt.trial import TrialResult
 
-__all__ = ["Ended", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor"]
 
-START_UP_S = 60.0  # for the simulator to be made, and where trials import their agents themselves, for that
+__all__ = ["Ended", "LostTrialError", "Supervisor", "UnfitZygoteError", "be_supervisor", "with_escape"]
+
+
 _LOOK_EVERY_S = 0.1  # whether a trial hangs
-_LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
-_NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
 _RECEIVED = 1 << 16  # bytes at a time
 _LARGEST_OUTPUT = 64 << 20  # bytes of a run.log that are written again where an agent has removed the file
 
@@ -158,11 +159,18 @@ class Supervisor:
         if code != 0 or not report:
             if is_sent_from_outside(code):
                 raise LostTrialError(code)
-            return Ended(died(spec, scratch, code))
+            return Ended(died(spec, scratch, code, self._modules()))
         found = check_report(report, key=key, spec=spec, header=header, records=box.read_records(header), pid=pid)
         if isinstance(found, str):
             return Ended(self._damaged(spec, f"the process may not be believed: {found}"))
         return self._keep(*found)
+
+    def _modules(self) -> dict[str, str]:
+        """The modules of which only an agent's code comes, by agent."""
+        scenario = self._settings.scenario
+        others = {*scenario.modules()}
+        found = {name: setup.agent.partition(":")[0] for name, setup in scenario.agents.items() if ":" in setup.agent}
+        return {name: module for name, module in found.items() if module not in others}
 
     def _damaged(self, spec: TrialSpec, message: str, *, recorded: bool = True) -> TrialResult:
         """Return the result of a trial that damaged its process or its recording, which only agents do."""
@@ -212,16 +220,10 @@ class Supervisor:
                 self._send({"kill": True})
 
     def _has_hung(self, box: BlackBoxFile, given_at: float) -> bool:
-        header, now = box.header(), time.monotonic()
-        began, allowed_s = given_at, self._settings.timeout_s
-        if header is None or header.pid == os.getpid():  # its own process has not begun
-            allowed_s += START_UP_S
-        elif given_at <= header.started <= now:  # later than it began by what copies of it took
-            began = header.started
-        over_s = now - began - allowed_s
-        if over_s <= _LAST_WORDS_S:
-            return False
-        return os.fstat(self._stack).st_size > 0 or over_s > _NO_WORDS_S
+        header = box.header()
+        begun = header is not None and header.pid != os.getpid()
+        has_words = lambda: os.fstat(self._stack).st_size > 0  # noqa: E731
+        return has_hung(header, begun=begun, given_at=given_at, limit_s=self._settings.timeout_s, has_words=has_words)
 
     def _await_zygote(self) -> None:
         deadline = time.monotonic() + START_UP_S + self._settings.timeout_s
@@ -377,10 +379,57 @@ def _answer(supervisor: Supervisor, settings: WorkerSettings, spec: TrialSpec) -
             f"the trial cannot be kept: {limit or error.strerror}", fix="" if limit else remedy(error),
             where=str(error.filename or ""),
         ).to_json()  # fmt: skip
-    from crashhunt.executors._escapes import with_escape
 
     result = with_escape(supervisor, settings, ended)
     answer: Done = {"result": result.to_json(), "retires": supervisor.retires}
     if ended.notices:
         answer["notices"] = list(ended.notices)
     return answer
+
+
+# Until when braking would have avoided a crash, found out by further trials in the same slot.
+
+_ATTEMPTS = 3  # of a trial whose process is killed from outside
+_FIRST_NUMBER = 1 << 40  # beyond the numbers of a hunt's trials: each trial has a folder by its number
+
+
+def with_escape(supervisor: Supervisor, settings: WorkerSettings, ended: Ended) -> TrialResult:
+    """Return the result of a trial with its last escape, where the settings ask for that and it can be told.
+
+    Args:
+        supervisor: which has run the trial.
+        settings: of the hunt.
+        ended: the trial.
+    """
+    result = ended.result
+    if not settings.find_escapes or result.collision is None or ended.braking is None or supervisor.retires:
+        return result
+    from crashhunt.crashes import find_escape
+
+    how, deceleration = ended.braking["how"], ended.braking["deceleration"]
+    braking = FullBraking(None, str(how), float(deceleration) if isinstance(deceleration, int | float) else None)
+    numbers = itertools.count(_FIRST_NUMBER + (os.getpid() << 16))
+
+    def recording(number: int) -> Recording:
+        return Recording(read_black_box(scratch_of(settings.scratch, number) / layout.BLACK_BOX))
+
+    def run(spec: TrialSpec) -> tuple[TrialResult, Recording]:
+        for left in reversed(range(_ATTEMPTS)):
+            number = next(numbers)
+            try:
+                done = supervisor.run(replace(spec, number=number)).result
+                return done, recording(number)
+            except LostTrialError:
+                if not left:
+                    raise
+            finally:
+                shutil.rmtree(scratch_of(settings.scratch, number), ignore_errors=True)
+        raise AssertionError
+
+    try:
+        return replace(result, escape=find_escape(result, recording(result.spec.number), braking, run))
+    except BundleError:
+        return result
+    except LostTrialError as error:
+        why = f"the process that searched {describe_death(error.exit_code)}, {_ATTEMPTS} times"
+        return replace(result, why_no_escape=why)

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypedDict
 
 from crashhunt.base import layout
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import RecorderError
-from crashhunt.base.faculties import offers
 from crashhunt.base.forks import copying, watchdog
 from crashhunt.base.shared_state import SharedState
 from crashhunt.base.signals import block_signals
@@ -28,23 +28,25 @@ from crashhunt.episode import (
     FirstCopy,
     Parts,
     Prober,
+    TakingOver,
     overruled_agent,
     ready_recorder,
     run_episode,
 )
-from crashhunt.executors._evidence import encode_report
+from crashhunt.executors._postmortem import encode_report
 from crashhunt.recording import BlackBox
 from crashhunt.simulators import BrakesFully, HasMap, LeavesOut, ReadiesProcess, TellsNotices, Tidies
 from crashhunt.trial import Outcome, TrialSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from crashhunt.agents import Agent
+    from crashhunt.base.codec import JsonObject
     from crashhunt.episode import Reset, WorkerSettings
-    from crashhunt.executors._evidence import Report
+    from crashhunt.executors._postmortem import Report
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Overruled, SpecData, TrialResult, Value
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["LEFT_OUT", "Job", "TrialProcess", "loaded"]
 
@@ -63,7 +65,7 @@ class Job(TypedDict):
     ``wants_map`` asks for the map in any case, ``tries_copy`` for whether the trial can be copied.
     """
 
-    spec: SpecData
+    spec: JsonObject
     folder: str
     reserved: int
     key: str
@@ -110,9 +112,9 @@ class TrialProcess:
             self._parts = loaded(self._settings)
         if self._simulator is None:
             self._simulator = self._parts.simulator()
-            if offers(self._simulator, Tidies):
+            if supports(self._simulator, Tidies):
                 self._simulator.tidy()
-            if offers(self._simulator, ReadiesProcess):
+            if supports(self._simulator, ReadiesProcess):
                 self._simulator.ready_process()
                 ready_recorder(self._simulator)
         return self._simulator
@@ -172,7 +174,7 @@ class TrialProcess:
             result = run_episode(
                 spec,
                 simulator=simulator,
-                make_agent=self._parts.agent if spec.overruled is None else partial(self._overrule, spec.overruled),
+                make_agent=partial(self._other_agent, spec) if spec.overruled or spec.handover else self._parts.agent,
                 box=box,
                 oracles=self._parts.oracles(),
                 crash_on=settings.crash_on,
@@ -213,15 +215,15 @@ class TrialProcess:
         data: dict[str, object] = {**result.to_json()}
         del data["spec"]  # which the supervisor knows
         report: Report = {"result": data, "notices": self._notices}
-        report["notices"] += simulator.notices if offers(simulator, TellsNotices) else ()
+        report["notices"] += simulator.notices if supports(simulator, TellsNotices) else ()
         kept = settings.keep_trials or result.outcome in settings.crash_on or result.failure is not None
         kept = kept or settings.is_audited(result)
         wants_map = (kept or job["wants_map"]) and result.outcome is not Outcome.INVALID
-        if wants_map and offers(simulator, HasMap):
+        if wants_map and supports(simulator, HasMap):
             report["map"] = _dumps([[lane.id, lane.width, lane.shape] for lane in simulator.lanes()])
-        if kept and result.spec.only is not None and offers(simulator, LeavesOut):
+        if kept and result.spec.only is not None and supports(simulator, LeavesOut):
             report["entered"] = list(simulator.entered)
-        if settings.find_escapes and result.collision is not None and offers(simulator, BrakesFully):
+        if settings.find_escapes and result.collision is not None and supports(simulator, BrakesFully):
             braking = simulator.full_braking(result.collision.agent)
             said: dict[str, object] | None = None
             if braking is not None:
@@ -258,20 +260,26 @@ class TrialProcess:
         if self._box is not None and not copying():
             self._box.detach()
 
-    def _overrule(
-        self, overruled: Overruled, agent: str, simulator: Simulator, arguments: Mapping[str, Value]
-    ) -> Agent:
+    def _other_agent(self, spec: TrialSpec, agent: str, simulator: Simulator, arguments: Mapping[str, Value]) -> Agent:
         assert self._parts is not None
         made = self._parts.agent(agent, simulator, arguments)
-        return overruled_agent(made, simulator, overruled) if agent == overruled.agent else made
+        if spec.handover is not None and spec.handover.agent == agent:
+            made = TakingOver(made, spec.handover)
+        if spec.overruled is not None and spec.overruled.agent == agent:
+            made = overruled_agent(made, simulator, spec.overruled)
+        return made
 
 
-def loaded(settings: WorkerSettings) -> Parts:
+def loaded(settings: WorkerSettings, report: Callable[[str], None] = lambda _: None) -> Parts:
     """Import everything that trials need.
+
+    Args:
+        settings: of the hunt.
+        report: as of `Parts.load`.
 
     Raises:
         CrashhuntError: something cannot be imported.
     """
     parts = Parts(settings)
-    parts.load()
+    parts.load(report)
     return parts

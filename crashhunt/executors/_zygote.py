@@ -8,30 +8,276 @@ import os
 import select
 import shutil
 import sys
+import time
+from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NoReturn, cast
+from functools import partial
+from typing import TYPE_CHECKING, Final, NoReturn, TypedDict, cast
 
+from crashhunt.base import forks
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.forks import ended
-from crashhunt.base.limits import limit_behind
 from crashhunt.base.plugins import locate, registered
-from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill
-from crashhunt.episode import stage_of, words_of
+from crashhunt.base.processes import adopt_orphans, children_of, die_with, end_descendants, kill
+from crashhunt.base.resources import FREE, free_memory, limit_behind
+from crashhunt.episode import generators, message_of_error, options_of, seed_everything, set_generators, stage_of
 from crashhunt.executors._trial_process import TrialProcess, loaded
-from crashhunt.executors._warm import WarmTraffics
+from crashhunt.simulators import CountsSetUp
+from crashhunt.trial import TrialSpec
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
     from crashhunt.episode import Parts, WorkerSettings
-    from crashhunt.executors._messages import FromZygote, KillTrial
+    from crashhunt.executors._protocol import FromZygote, KillTrial
     from crashhunt.executors._trial_process import Job
+    from crashhunt.simulators import Info, Observations, Simulator
 
-__all__ = ["Imported", "be_zygote", "import_nothing", "import_parts"]
+    Wait = Callable[[int | None, Callable[[], None]], None]
+
+
+__all__ = ["Imported", "WarmTraffics", "be_zygote", "import_nothing", "import_parts"]
+
+
+# Warming up once: forks of a zygote that have reset the simulator, for trials that begin in the same traffic.
+#
+# The zygote of a slot keeps some such processes suspended. A trial with the same seed and scenario arguments runs in a
+# fork of one of them, with the random generators as the reset left them: nothing in its digest shows the difference.
 
 _RECEIVED = 1 << 16  # bytes at a time
+_WORTH_S = 0.02  # a fork of a fork costs some ten milliseconds, half of them for its end
+_STALE = 8  # a copy makes room after this many trials per copy without one in its traffic
+
+# Bound here, before any agent is imported that could replace them.
+_dumps, _loads, _write = json.dumps, json.loads, os.write
+
+
+class _Said(TypedDict, total=False):
+    """What a suspended process reports: how long its reset took, or that it failed; how a trial's process ended."""
+
+    took_s: float
+    unfit: str
+    pid: int
+    ended: int
+
+
+class WarmTraffics:
+    """The suspended processes of a zygote, one for each traffic.
+
+    Args:
+        limit: how many there are at most.
+        notify: called with what people should know.
+        worth_s: wall time of a warm-up from which on a process is kept for it, in s.
+    """
+
+    def __init__(self, limit: int, notify: Callable[[str], None], *, worth_s: float = _WORTH_S) -> None:
+        self._worth_s = worth_s
+        self._limit = limit
+        self._notify = notify
+        self._suspended: OrderedDict[str, _Suspended] = OrderedDict()  # the most recently used is the last
+        self._trials = 0
+        self._trial: TrialProcess | None = None
+        self._simulator: Simulator | None = None
+
+    def prepare(self, trial: TrialProcess, simulator: Simulator) -> None:
+        """Note what trials run with."""
+        self._trial, self._simulator = trial, simulator
+
+    @property
+    def processes(self) -> frozenset[int]:
+        """The suspended processes."""
+        return frozenset(one.pid for one in self._suspended.values())
+
+    def forget(self) -> None:
+        """Close what this process, which runs a trial, has of them."""
+        for one in self._suspended.values():
+            one.close()
+        self._suspended.clear()
+
+    def run(self, job: Job, wait: Wait) -> tuple[int, int] | None:
+        """Run a trial in a fork of the process for its traffic, which is made where there is none.
+
+        Args:
+            job: the trial.
+            wait: waits until a descriptor can be read; its second argument kills what is waited for.
+
+        Returns:
+            The process that ran it and its exit code; None where the trial has to run in a fork of the zygote.
+        """
+        if self._trial is None or self._limit == 0:
+            return None
+        self._trials += 1
+        spec = TrialSpec.from_json(job["spec"])
+        key = _key(spec)
+        found = self._suspended.get(key) or self._make(key, spec, wait)
+        if found is None:
+            return None
+        self._suspended.move_to_end(key)
+        found.used = self._trials
+        said = found.ask(_dumps(job).encode() + b"\n", wait)
+        if said is None:  # it was killed, and the trial with it
+            code = self._drop(key)
+            return found.pid, code or -9
+        if "unfit" in said:
+            self._stop(said["unfit"])
+            self._drop(key)
+            return None
+        return said["pid"], said["ended"]
+
+    def _make(self, key: str, spec: TrialSpec, wait: Wait) -> _Suspended | None:
+        if not self._make_room():
+            return None
+        wakes, ours = os.pipe()
+        theirs, says = os.pipe()
+        assert self._trial is not None
+        assert self._simulator is not None
+        be_suspended = partial(_be_suspended, wakes, says, self._trial, self._simulator, spec)
+        try:
+            pid = forks.fork(be_suspended, forks.held(), keeps=(wakes, says))
+        except forks.CannotForkError as error:
+            self._stop(error.message)
+            os.close(ours)
+            os.close(theirs)
+            return None
+        finally:
+            os.close(wakes)
+            os.close(says)
+        made = self._suspended[key] = _Suspended(pid, ours, theirs, self._trials)
+        said = made.ask(b"", wait)
+        if said is not None and said.get("took_s", 0.0) >= self._worth_s:
+            return made
+        self._drop(key)
+        if said is not None and "took_s" in said:
+            self._limit = 0  # no warm-up here is worth it
+        return None
+
+    def _drop(self, key: str) -> int:
+        return self._suspended.pop(key).end()
+
+    def _stop(self, why: str) -> None:
+        self._limit = 0
+        self._notify(f"trials in the same traffic do not share its warm-up: {why}")
+
+    def _make_room(self) -> bool:
+        if free_memory() < FREE:
+            self._notify(
+                f"less than {FREE:.0%} of the memory is free: fewer warmed-up copies are kept than there might be"
+            )
+            return False
+        if len(self._suspended) < self._limit:
+            return True
+        key, oldest = next(iter(self._suspended.items()))
+        # Where trials take turns in more traffics than there are copies, the oldest one is the next to be used.
+        if self._trials - oldest.used < _STALE * self._limit:
+            return False
+        self._drop(key)
+        return True
+
+
+@dataclass(slots=True, eq=False)
+class _Suspended:
+    """A suspended process, as its zygote knows it.
+
+    Args:
+        pid: of the process.
+        asks: the end of a pipe to it.
+        says: the end of one from it.
+        used: by which trial last.
+    """
+
+    pid: int
+    asks: int
+    says: int
+    used: int
+
+    def ask(self, text: bytes, wait: Wait) -> _Said | None:
+        """Return what it answers; None where it is gone."""
+        try:
+            while text:
+                text = text[_write(self.asks, text) :]
+        except BrokenPipeError:
+            return None
+        received = bytearray()
+        while not received.endswith(b"\n"):
+            wait(self.says, self._kill)
+            data = os.read(self.says, _RECEIVED)
+            if not data:
+                return None
+            received += data
+        said: _Said = _loads(received)
+        return said
+
+    def _kill(self) -> None:
+        """Kill the trial, or the process itself where it is still resetting the simulator."""
+        for pid in children_of(self.pid) or [self.pid]:
+            kill(pid)
+
+    def close(self) -> None:
+        """Close the pipes."""
+        os.close(self.asks)
+        os.close(self.says)
+
+    def end(self) -> int:
+        """Kill the process; return its exit code."""
+        for child in children_of(self.pid):
+            kill(child)
+        kill(self.pid)
+        code = forks.ended(self.pid)
+        self.close()
+        return code
+
+
+def _be_suspended(wakes: int, says: int, trial: TrialProcess, simulator: Simulator, spec: TrialSpec) -> None:
+    """Reset the simulator; then have a fork run each trial that is asked for."""
+    adopt_orphans()
+    began = time.monotonic()
+    try:
+        seed_everything(spec.seed)
+        begun = simulator.reset(seed=spec.seed, options=options_of(spec, simulator))
+    except BaseException:  # the trial itself will report it
+        _say(says, {})
+        return
+    _say(says, {"took_s": time.monotonic() - began})
+    drawn = generators()
+
+    def again(**_given: object) -> tuple[Observations, Info]:
+        set_generators(drawn)
+        return begun
+
+    with os.fdopen(wakes, "rb", closefd=False) as jobs:
+        for line in jobs:
+            try:
+                pid = forks.fork(partial(_run, trial, line, again), forks.held())
+            except forks.CannotForkError as error:
+                _say(says, {"unfit": error.message})
+                continue
+            code = forks.ended(pid)
+            end_descendants()
+            if supports(simulator, CountsSetUp):
+                simulator.setup_steps = 0  # they have been counted, with the first trial
+            _say(says, {"pid": pid, "ended": code})
+
+
+def _run(trial: TrialProcess, line: bytes, again: Callable[..., tuple[Observations, Info]]) -> None:
+    trial.run(_loads(line), again)
+
+
+def _say(says: int, said: _Said) -> None:
+    text = _dumps(said).encode() + b"\n"
+    with suppress(BrokenPipeError):
+        while text:
+            text = text[_write(says, text) :]
+
+
+def _key(spec: TrialSpec) -> str:
+    """What the traffic of a trial follows from."""
+    script = None if spec.script is None else spec.script.to_json()
+    return json.dumps([spec.seed, dict(spec.scenario_arguments), spec.only, script], sort_keys=True)
+
+
 _LOOK_EVERY_S = 0.005  # where the kernel does not report when a process ends
 
 
@@ -51,8 +297,12 @@ class Imported:
 _EACH_ITSELF: Final = Imported(None, makes_simulator=False)
 
 
-def import_parts(settings: WorkerSettings) -> Imported | None:
+def import_parts(settings: WorkerSettings, report: Callable[[str], None]) -> Imported | None:
     """Import what trials need, and find out whether the simulator may be made in a zygote.
+
+    Args:
+        settings: of the hunt.
+        report: as of `Parts.load`; called with nothing at the end.
 
     Returns:
         None where this process cannot be forked any more.
@@ -60,12 +310,13 @@ def import_parts(settings: WorkerSettings) -> Imported | None:
     Raises:
         CrashhuntError: something cannot be imported.
     """
-    parts = loaded(settings)
+    parts = loaded(settings, report)
     if not _can_be_forked():
         return None
-    if settings.scenario.backend.forkable:
-        return Imported(parts, makes_simulator=True)
-    return Imported(parts, makes_simulator=_is_forkable_with(parts))
+    report("the simulator cannot be made")
+    makes_simulator = settings.scenario.backend.forkable or _is_forkable_with(parts)
+    report("")
+    return Imported(parts, makes_simulator=makes_simulator)
 
 
 def import_nothing(settings: WorkerSettings) -> Imported:
@@ -241,5 +492,5 @@ def _why_not(error: BaseException) -> FromZygote:
     full = isinstance(error, OSError) and error.errno in DISK
     fix = limit_behind(error) or ("free some space" if full else "see to what it needs")
     fix = f"{fix}, and run the same command again"
-    said = f"{type(error).__name__}: {words_of(error)}"
+    said = f"{type(error).__name__}: {message_of_error(error)}"
     return {"error": CrashhuntError(f"the simulator cannot be made: {said}", fix=fix).to_json()["error"]}

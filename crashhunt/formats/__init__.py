@@ -1,7 +1,7 @@
 """A crash in formats of others: what was recorded, as a scenario that tools of other people run.
 
 Written as plain XML with what Python brings along. ``scripts/readers`` tests that the libraries of the formats read
-back what was recorded; nobody needs them to write it.
+back what was recorded. Writing does not need them.
 """
 
 import lazy_loader

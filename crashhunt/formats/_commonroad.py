@@ -33,10 +33,10 @@ def write_commonroad(bundle: Bundle, target: Path, *, with_agents: bool = False)
     """Write a crash as a CommonRoad scenario of version 2020a, all of it or nothing.
 
     Lengths are in m, angles in rad, speeds in m/s, times in steps of ``timeStepSize`` s; step 0 is before the first.
-    A position is the middle of a vehicle. Each lane that the agent came near is a lanelet; which follows which is told
-    from the shapes. Everybody else is a dynamic obstacle from the step in which it was first seen. Each agent is a
-    planning problem: where and how it started, with the goal of still driving when the recording ends, wherever that
-    is. It is solved by whoever avoids the crash. Its yaw rate is that of the first step, its slip angle unknown and 0.
+    A position is the middle of a vehicle. Each lane that the agent came near is a lanelet; the order of lanelets
+    follows from the shapes. Every other actor is a dynamic obstacle from the step in which it was first seen. Each
+    agent is a planning problem: its start, with the goal of still driving at the end of the recording.
+    A planner that avoids the crash solves it. Its yaw rate is that of the first step, its slip angle unknown and 0.
 
     Args:
         bundle: the crash.

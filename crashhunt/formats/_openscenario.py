@@ -6,8 +6,9 @@ import time
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
 from crashhunt.base.version import __version__
-from crashhunt.formats._opendrive import opendrive_of
 from crashhunt.formats._recorded import recorded_of
 from crashhunt.formats._xml import add, number, plain_text, write_xml
 from crashhunt.world import is_person
@@ -16,28 +17,89 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.crashes import Bundle
-    from crashhunt.formats._recorded import Pose, Recorded, Way
+    from crashhunt.formats._recorded import Pose, Recorded, Road, Way
 
-__all__ = ["write_openscenario"]
+
+__all__ = ["opendrive_of", "write_openscenario"]
+
+
+# The lanes of a crash as a road network in OpenDRIVE 1.6.
+
+_FLAT = {"b": "0", "c": "0", "d": "0"}  # of a polynomial that is a constant
+
+
+def opendrive_of(recorded: Recorded) -> ET.Element:
+    """Return the road network: each lane as a road with one lane, along its centre line, of straight pieces.
+
+    Lengths are in m, headings in rad. A road is linked with its only successor, if that has no other
+    predecessor. Several successors would be a junction; the file has none. The ground is flat.
+    """
+    root = ET.Element("OpenDRIVE")
+    points = np.concatenate([road.centre for road in recorded.roads])
+    (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
+    bounds = {"north": north, "south": south, "east": east, "west": west}
+    add(
+        root, "header", revMajor="1", revMinor="6", name=plain_text(recorded.title), version="1.00",
+        date=time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime()), vendor="crashhunt",
+        **{side: number(value) for side, value in bounds.items()},
+    )  # fmt: skip
+    for index in range(len(recorded.roads)):
+        _add_road(root, index, recorded.roads)
+    return root
+
+
+def _add_road(root: ET.Element, index: int, roads: tuple[Road, ...]) -> None:
+    road = roads[index]
+    centre = road.centre
+    along = np.diff(centre, axis=0)
+    lengths = np.hypot(along[:, 0], along[:, 1])
+    begins = np.concatenate([[0.0], np.cumsum(lengths)])
+    element = add(root, "road", id=str(index + 1), name="", junction="-1", length=number(begins[-1]))
+    after = [other for other in road.after if roads[other].before == (index,)] if len(road.after) == 1 else []
+    before = [other for other in road.before if roads[other].after == (index,)] if len(road.before) == 1 else []
+    link = add(element, "link")
+    for tag, others, point in (("predecessor", before, "end"), ("successor", after, "start")):
+        for other in others:
+            add(link, tag, elementType="road", elementId=str(other + 1), contactPoint=point)
+    view = add(element, "planView")
+    headings = np.arctan2(along[:, 1], along[:, 0])
+    for (x, y), s, heading, length in zip(centre[:-1].tolist(), begins, headings, lengths, strict=False):
+        place = {"x": x, "y": y, "s": s, "hdg": heading, "length": length}
+        add(add(view, "geometry", **{name: number(value) for name, value in place.items()}), "line")
+    _add_lane(add(element, "lanes"), road, before=bool(before), after=bool(after))
+
+
+def _add_lane(lanes: ET.Element, road: Road, *, before: bool, after: bool) -> None:
+    """Add the one lane, which lies to the right of a line half its width to the left."""
+    add(lanes, "laneOffset", s="0", a=number(road.width / 2), **_FLAT)
+    section = add(lanes, "laneSection", s="0")
+    add(add(section, "center"), "lane", id="0", type="none", level="false")
+    lane = add(add(section, "right"), "lane", id="-1", type="driving", level="false")
+    link = add(lane, "link")
+    for tag, there in (("predecessor", before), ("successor", after)):
+        if there:
+            add(link, tag, id="-1")
+    add(lane, "width", sOffset="0", a=number(road.width), **_FLAT)
+
 
 _CATEGORIES = {
     "bus": "bus", "coach": "bus", "truck": "truck", "trailer": "semitrailer", "delivery": "van", "tram": "tram",
     "bicycle": "bicycle", "motorcycle": "motorbike", "moped": "motorbike", "rail": "train", "rail_urban": "train",
     "rail_electric": "train", "rail_fast": "train", "subway": "train",
 }  # fmt: skip
-_NO_LIMIT = "100"  # of speed and acceleration, which the format wants: nobody is to be held back on a recorded way
+_NO_LIMIT = "100"  # of speed and acceleration, which the format wants: no limit may slow an actor on its recorded way
 _HEIGHT_M = 1.5  # where none was recorded
 _AXLES = 0.6  # of the length, from one axle to the other
 
 
 def write_openscenario(bundle: Bundle, target: Path, *, with_agents: bool = False) -> dict[str, list[str]]:
-    """Write a crash in OpenSCENARIO 1.0, and beside it its roads in OpenDRIVE 1.6, each all of it or nothing.
+    """Write a crash in OpenSCENARIO 1.0, and its roads in OpenDRIVE 1.6; each file is complete or absent.
 
-    Lengths are in m, angles in rad, speeds in m/s, times in s, 0 before the first recorded step. Everybody follows the
-    recorded way, a vertex for each step at its time, from when it was first seen until it was last seen. The reference
-    point of a vehicle is its middle, and there its rear axle is said to be: nobody has recorded where that is, and an
-    axle behind the point of reference has esmini shift the vehicle ahead. Performance, axles and a height that was not
-    recorded are made up.
+    Lengths are in m, angles in rad, speeds in m/s, times in s, 0 before the first recorded step. Every actor follows
+    its recorded way, with a vertex per step, from when it was first seen until it was last seen. The reference
+    point of a vehicle is its middle, and the file places its rear axle there. The real place was not recorded, and
+    esmini shifts a vehicle ahead if its axle is behind the reference point. Performance, axles and missing heights are
+    invented.
 
     Args:
         bundle: the crash.
@@ -113,7 +175,7 @@ def _add_entity(entities: ET.Element, way: Way) -> None:
         for tag, ahead in (
             ("FrontAxle", _AXLES),
             ("RearAxle", 0.0),
-        ):  # whoever reads it takes the rear one for the middle
+        ):  # readers use the rear axle as the middle
             add(
                 axles, tag, maxSteering="0.5", wheelDiameter="0.6", trackWidth=number(actor.width),
                 positionX=number(ahead * actor.length), positionZ="0.3",
@@ -123,7 +185,7 @@ def _add_entity(entities: ET.Element, way: Way) -> None:
 
 def _add_start(actions: ET.Element, way: Way) -> None:
     first = way.poses[0]
-    if way.path.first:  # whoever comes later is not there yet
+    if way.path.first:  # an actor that appears later is absent at first
         add(add(add(actions, "GlobalAction"), "EntityAction", entityRef=way.name), "DeleteEntityAction")
         return
     private = add(actions, "Private", entityRef=way.name)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Pose", "Recorded", "Road", "Way", "recorded_of"]
 
-_SAME_PLACE_M = 1e-3  # a lane goes on where another begins: maps give such points to the centimetre, or better
+_SAME_PLACE_M = 1e-3  # a lane continues where another begins: maps give such points to the centimetre, or better
 _SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only crosses there is another's
 
 
@@ -83,7 +83,7 @@ class Road:
     Args:
         right: its right border, shape (n, 2), in m.
         left: its left one, with as many points.
-        after: which ones begin where it ends, by their number: told from the shapes, since no recording says.
+        after: numbers of the lanes that begin where it ends, derived from shapes, because recordings lack them.
         before: which ones end where it begins.
     """
 
@@ -189,7 +189,7 @@ def _roads(lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> 
         near = np.flatnonzero(np.hypot(*(starts - line[-1]).T) <= _SAME_PLACE_M)
         out_of = _direction(line[-2], line[-1])
         straight = (abs(math.remainder(into[other] - out_of, math.tau)) <= _SAME_WAY_RAD for other in near)
-        after.append(tuple(int(other) for other, goes_on in zip(near, straight, strict=True) if goes_on))
+        after.append(tuple(int(other) for other, is_straight in zip(near, straight, strict=True) if is_straight))
     before = [tuple(one for one, found in enumerate(after) if number in found) for number in range(len(lines))]
     return tuple(Road(*pair, *ends) for pair, *ends in zip(borders, after, before, strict=True))
 

@@ -1,10 +1,7 @@
-"""The guide: pages of Markdown, and those parts of them that are made from the code when somebody reads them."""
+"""The guide: Markdown pages, with parts that are generated from the code when a page is read."""
 
-from crashhunt.guide._api import describe_api
-from crashhunt.guide._commands import describe_commands
-from crashhunt.guide._keys import describe_keys
-from crashhunt.guide._modules import describe_modules
 from crashhunt.guide._pages import SECTIONS, Page, completed, find_page, for_terminal, list_pages, pages_folder
+from crashhunt.guide._reference import describe_api, describe_commands, describe_keys, describe_modules
 
 __all__ = [
     "SECTIONS",

@@ -8,11 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.names import one_of
-from crashhunt.guide._api import describe_api
-from crashhunt.guide._commands import describe_commands
-from crashhunt.guide._keys import describe_keys
-from crashhunt.guide._modules import describe_modules
+from crashhunt.base.text import one_of
+from crashhunt.guide._reference import describe_api, describe_commands, describe_keys, describe_modules
 
 if TYPE_CHECKING:
     import argparse
@@ -20,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
 
 SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference", "": "More"}
-"""The folders of the guide, in the order in which somebody needs them, and what they are called."""
+"""The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
@@ -29,7 +26,7 @@ _ORDER = [
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip
-"""What somebody needs first; what is not named here comes after it."""
+"""Topics in reading order; all other topics follow them."""
 
 _MADE = re.compile(r"^<!-- made from the code: (\w+) -->\n", re.MULTILINE)
 _COMMENT = re.compile(r"<!--.*?-->\n*", re.DOTALL)
@@ -43,10 +40,10 @@ class Page:
     """A page of the guide.
 
     Args:
-        topic: the word by which somebody asks for it; no two pages have the same.
+        topic: its unique name on the command line.
         section: the folder that it is in; empty for the top one.
         title: its heading.
-        file: the Markdown, in which some comments stand for what is made from the code.
+        file: the Markdown, in which some comments are placeholders for generated parts.
     """
 
     topic: str
@@ -90,11 +87,11 @@ def find_page(topic: str) -> Page:
 
 
 def completed(text: str, parser: argparse.ArgumentParser) -> str:
-    """Return the text of a page with what is made from the code in its place.
+    """Return the text of a page with its generated parts.
 
     Args:
-        text: Markdown, in which ``<!-- made from the code: commands -->``, ``api``, ``keys`` or ``modules`` stands for
-            it.
+        text: Markdown, in which ``<!-- made from the code: commands -->`` is a placeholder, as are ``api``,
+            ``keys`` and ``modules``.
         parser: of the command line.
     """
     makers = {
@@ -103,7 +100,7 @@ def completed(text: str, parser: argparse.ArgumentParser) -> str:
         "keys": describe_keys,
         "modules": describe_modules,
     }
-    # What stands there for whoever reads the file as it is, up to the next blank line, goes.
+    # Remove the text that follows a placeholder for readers of the raw file, up to the next blank line.
     return re.sub(_MADE.pattern + r"(?:.+\n)*", lambda found: makers[found[1]](), text, flags=re.MULTILINE)
 
 

@@ -1,24 +1,34 @@
-from ._check import Checked as Checked, check as check
-from ._copies import BranchSums as BranchSums, ProbeSums as ProbeSums
-from ._directory import HuntDirectory as HuntDirectory
+from ._check import Checked as Checked, check as check, salvage as salvage
 from ._hunt import Hunt as Hunt
-from ._ledger import Ledger as Ledger, Turn as Turn, has_begun as has_begun
-from ._logs import LogKind as LogKind, LogReader as LogReader
 from ._next_trials import Trials as Trials, spec_of as spec_of
-from ._preflight import Preflight as Preflight
-from ._progress import HuntStatus as HuntStatus
-from ._report import HuntReport as HuntReport
+from ._preflight import Preflight as Preflight, TrafficSurveyor as TrafficSurveyor
+from ._progress import (
+    HuntReport as HuntReport,
+    HuntStatus as HuntStatus,
+    SearchStatus as SearchStatus,
+    StrategyStatus as StrategyStatus,
+)
 from ._results import (
+    FACTS as FACTS,
+    Cell as Cell,
     HuntResults as HuntResults,
     SuiteResults as SuiteResults,
+    TrialRow as TrialRow,
     UnfinishedWarning as UnfinishedWarning,
     columns_of as columns_of,
     load as load,
+    write_parquet as write_parquet,
+    write_text as write_text,
 )
-from ._row import FACTS as FACTS, Cell as Cell, TrialRow as TrialRow
-from ._salvage import salvage as salvage
-from ._searching import SearchStatus as SearchStatus, StrategyStatus as StrategyStatus
-from ._state import HuntState as HuntState, find_hunts as find_hunts, hunt_state as hunt_state, is_hunt as is_hunt
-from ._surplus import dropped_crashes as dropped_crashes
-from ._tables import write_parquet as write_parquet, write_text as write_text
-from ._traffic_survey import TrafficSurveyor as TrafficSurveyor
+from ._retention import dropped_crashes as dropped_crashes
+from ._state import (
+    BranchSums as BranchSums,
+    HuntDirectory as HuntDirectory,
+    HuntState as HuntState,
+    LogKind as LogKind,
+    LogReader as LogReader,
+    ProbeSums as ProbeSums,
+    find_hunts as find_hunts,
+    hunt_state as hunt_state,
+    is_hunt as is_hunt,
+)

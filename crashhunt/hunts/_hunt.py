@@ -9,32 +9,20 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
-from crashhunt.base.shared_memory import release_shared_memory
 from crashhunt.base.signals import stop_requests
-from crashhunt.base.temporary import remove_scratch
+from crashhunt.base.temporary import release_shared_memory, remove_scratch
 from crashhunt.base.text import encodable
 from crashhunt.crashes import list_bundles, write_bundle, write_trial
 from crashhunt.episode import scratch_of
 from crashhunt.executors import SharedExecutors, make_executor, read_map
-from crashhunt.hunts._again import RunsAgain
-from crashhunt.hunts._audit import Audit
-from crashhunt.hunts._confirmation import Confirmation
-from crashhunt.hunts._copied_crashes import CopiedCrashes
-from crashhunt.hunts._copies import copies_to_come
-from crashhunt.hunts._directory import HuntDirectory
-from crashhunt.hunts._from_the_start import FromTheStart
-from crashhunt.hunts._late_audits import AuditsLeft
-from crashhunt.hunts._ledger import Ledger
-from crashhunt.hunts._look_at_copies import look_at_copies
-from crashhunt.hunts._near_misses import keep_near_misses
-from crashhunt.hunts._next_trials import LAG, Trials
+from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results
+from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
-from crashhunt.hunts._progress import HuntStatus, Progress
-from crashhunt.hunts._report import HuntReport, StoppedBecause
-from crashhunt.hunts._state import HEARTBEAT_S, draws_independently, this_process
-from crashhunt.hunts._surplus import give_up_surplus
-from crashhunt.hunts._unanswered import Unanswered
-from crashhunt.hunts._workers import settings_of_workers
+from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.hunts._retention import keep_near_misses, prune_bundles
+from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
+from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
+from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
@@ -44,7 +32,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.executors import Executor
-    from crashhunt.hunts._data import Facts
+    from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
@@ -157,7 +145,7 @@ class Hunt:
         trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
         ledger.enter(
             "running",
-            owner=this_process(),
+            owner=ledger_owner(),
             began=time.time(),
             done_before=len(finished),
             heartbeat=time.time(),
@@ -172,7 +160,7 @@ class Hunt:
             audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
-        runs_again = RunsAgain(
+        runs_again = TrialReruns(
             self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
             SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
             taken=snapshot.digest,
@@ -184,7 +172,7 @@ class Hunt:
 
     def _run_with(
         self,
-        runs_again: RunsAgain,
+        runs_again: TrialReruns,
         ledger: Ledger,
         trials: Trials,
         snapshot: Snapshot,
@@ -193,21 +181,21 @@ class Hunt:
         watch: Callable[[HuntStatus], None],
     ) -> HuntReport:
         settings = self.settings
-        copies = FromTheStart(runs_again, self._disturber)
+        copies = VerificationRuns(runs_again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
         stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
         if not progress.is_done:
             stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
-        give_up_surplus(ledger, progress, settings.run)
+        prune_bundles(ledger, progress, settings.run)
         watch(self._status(progress, "confirming"))
         progress.replace(runs_again.confirm(progress.crashes))
         if self._audits_left.numbers:
             watch(self._status(progress, "auditing"))
             self._audits_left.finish(runs_again, progress)
-        near, (probes, branches) = keep_near_misses(runs_again), look_at_copies(copies)
+        near, (probes, branches) = keep_near_misses(runs_again), verify_fork_results(copies)
         watch(self._status(progress, "done"))
-        self._see_to(ledger, progress)
+        self._restore_ledger(ledger, progress)
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
         reason = why_invalid(invalid, self.scenario) if invalid is not None else ""
         # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
@@ -224,7 +212,7 @@ class Hunt:
 
     def _hunt(
         self,
-        runs_again: RunsAgain,
+        runs_again: TrialReruns,
         ledger: Ledger,
         trials: Trials,
         snapshot: Snapshot,
@@ -257,7 +245,7 @@ class Hunt:
                 with ledger.together():
                     for result in executor.completed(_TICK_S):
                         in_flight.discard(result.spec.number)
-                        for known in preflight.sift(audit.add(result)):
+                        for known in preflight.filter_setup_failures(audit.add(result)):
                             self._take(known, ledger, snapshot, trials, progress)
                         if progress.last_wanted is not None:
                             in_flight = self._cancelled(executor, in_flight, progress.last_wanted)
@@ -273,9 +261,9 @@ class Hunt:
                 confirmation.look(progress)
                 if time.monotonic() - heartbeat > HEARTBEAT_S:
                     heartbeat = time.monotonic()
-                    self._see_to(ledger, progress)
+                    self._restore_ledger(ledger, progress)
                     release_shared_memory(self._place.scratch, of_ended=True)
-                    give_up_surplus(ledger, progress, run)
+                    prune_bundles(ledger, progress, run)
                     ledger.note(**progress.noted())
                 watch(self._status(progress, "hunting", executor.where()))
             executor.cancel()
@@ -330,7 +318,7 @@ class Hunt:
         if self.settings.run.audit > 0:
             self._audits_left.note(audit, progress)
 
-    def _see_to(self, ledger: Ledger, progress: Progress) -> None:
+    def _restore_ledger(self, ledger: Ledger, progress: Progress) -> None:
         """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
 
         Raises:

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from dataclasses import replace
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.hunts._ledger_reader import Turn
-from crashhunt.trial import TrialSpec
+from crashhunt.episode import WorkerSettings
+from crashhunt.ledger import Turn
+from crashhunt.plans import with_settings
+from crashhunt.trial import KILLED, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
-    from crashhunt.disturbances import Disturber
-    from crashhunt.hunts._ledger import Ledger
+    from crashhunt.disturbances import DisturbanceSampler
+    from crashhunt.hunts._progress import Progress
+    from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
+    from crashhunt.snapshots import Snapshot
     from crashhunt.trial import TrialResult, Value
 
-__all__ = ["LAG", "Trials", "spec_of"]
+
+__all__ = ["LAG", "Trials", "Unanswered", "find_unanswered", "settings_again", "settings_of_workers", "spec_of"]
+
 
 _TRAFFIC = 0x74726166  # apart from what else is drawn of the hunt's seed
 LAG = 32
@@ -57,7 +65,7 @@ class Trials:
         finished: set[int],
         *,
         lag: int,
-        disturber: Disturber | None = None,
+        disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
     ) -> None:
         self._settings = settings
@@ -162,7 +170,7 @@ class Trials:
 
 
 def spec_of(
-    number: int, settings: HuntSettings, sampler: NamedSampler, disturber: Disturber | None = None
+    number: int, settings: HuntSettings, sampler: NamedSampler, disturber: DisturbanceSampler | None = None
 ) -> TrialSpec:
     """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
 
@@ -198,3 +206,102 @@ def spec_of(
         origin=proposal.origin,
         disturbances=disturber.draw(seed, settings.max_steps) if disturber is not None else (),
     )
+
+
+# What the workers of a hunt need to know.
+
+
+def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
+    """Return what workers of a hunt are told.
+
+    The trials run from the snapshot: what is saved is what ran, even if somebody edits the code meanwhile.
+    """
+    run = settings.run
+    return replace(
+        _settings(settings, snapshot, scratch),
+        keep_trials=run.keep_trials,
+        warm_copies=run.warm_copies if settings.seeds else 0,
+        audit=run.audit,
+        hunt_seed=settings.seed,
+        probe_s=settings.probe_s,
+        branch=tuple(settings.disturb) if settings.branch else (),
+    )
+
+
+def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
+    """Return what processes are told that run single trials of a hunt again, for their recordings."""
+    return replace(_settings(settings, snapshot, scratch), keep_trials=True)
+
+
+def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
+    """What both have in common: all that a trial is."""
+    return WorkerSettings(
+        scenario=with_settings(snapshot.scenario(), settings),
+        oracles=settings.oracles,
+        crash_on=settings.crash_on,
+        scratch=scratch,
+        code=snapshot.code,
+        argument_files=snapshot.argument_files,
+        timeout_s=settings.run.timeout_s,
+    )
+
+
+# Trials that a resumed hunt runs again: something outside of them, such as a kill, kept answers from it.
+
+# Searching the text of a row takes a tenth of the time of parsing it. A few rows too many do no harm.
+_KILLED = f"""(outcome = 'invalid' AND instr(result, '"kind": "{KILLED}"') > 0)"""
+_UNASKED = """instr(result, '"may_be_asked_again": true') > 0"""
+
+
+def find_unanswered(ledger: Ledger) -> list[TrialResult]:
+    """Return the trials that are to run again, as the ledger of a hunt has them.
+
+    Raises:
+        HuntDirectoryError: one of them is not as it was written.
+    """
+    where = _KILLED if not ledger.facts().get("copies") else f"{_KILLED} OR {_UNASKED}"  # the latter reads every row
+    return [result for result in ledger.results_where(where) if result.is_to_be_run_again]
+
+
+class Unanswered:
+    """The trials of a hunt that run again. Their rows stay in the ledger until what comes of it replaces them.
+
+    Args:
+        ledger: of the hunt.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        self._ledger = ledger
+        self._before = {result.spec.number: result for result in find_unanswered(ledger)}
+        self._open: set[int] = set()  # of this run of the hunt
+
+    def __len__(self) -> int:
+        """How many are still to run again, in this run of the hunt or the next."""
+        return len(self._open | self._before.keys())
+
+    @property
+    def specs(self) -> list[TrialSpec]:
+        """Which trials run again, in order of their numbers."""
+        return [result.spec for result in self._before.values()]
+
+    def account(self, result: TrialResult, progress: Progress) -> bool:
+        """Take note of any trial that has ended; return whether its result is to be recorded.
+
+        Args:
+            result: of the trial.
+            progress: of the hunt, which has counted the trial before if it runs again.
+        """
+        if result.is_to_be_run_again:
+            self._open.add(result.spec.number)
+        before = self._before.pop(result.spec.number, None)
+        if before is None:
+            return True
+        if result.was_killed_from_outside:
+            return False  # the ledger has an answer that is as good, or better
+        progress.outcomes -= Counter([str(before.outcome)])
+        if before.digest and before.digest != result.digest:
+            again = f"trial {result.spec.number} was run again for the answers of its copies"
+            note = f"{again}, and is another one: it is not determined by its specification"
+            self._ledger.remark(note)
+            progress.notes.append(note)
+        return True

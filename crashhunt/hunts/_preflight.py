@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import signal
+import subprocess
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from crashhunt.base.errors import ArgumentError, UsageError
-from crashhunt.executors import LEFT_OUT
+from crashhunt.base import layout
+from crashhunt.base.errors import ArgumentError, CrashhuntError, SimulatorError, UsageError
+from crashhunt.base.reaper import Kept
+from crashhunt.base.signals import is_sent_from_outside, stop_requests
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.executors import LEFT_OUT, worker_environment
+from crashhunt.plans import read_settings
+from crashhunt.scenario import as_plain_data, scenario_digest
+from crashhunt.snapshots import latest_snapshot
 from crashhunt.trial import Constant, Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from crashhunt.base.json_types import Json
     from crashhunt.executors import Executor
-    from crashhunt.plans import HuntSettings
-    from crashhunt.scenario import Scenario
+    from crashhunt.plans import HuntSettings, Request
+    from crashhunt.scenario import RunToSurvey, Scenario, SurveyJob
     from crashhunt.trial import TrialResult
 
-__all__ = ["Heard", "Preflight", "is_hopeless", "why_invalid"]
+
+__all__ = ["Heard", "Preflight", "TrafficSurveyor", "is_hopeless", "why_invalid"]
+
 
 _INVALID_BEFORE_GIVING_UP = 10  # trials; if none of so many could begin, the setup is wrong, not the seed
 _ENOUGH = 4
@@ -50,7 +68,7 @@ class Preflight:
         self._passed = False
         self._listen = listen
 
-    def sift(self, result: TrialResult) -> list[TrialResult]:
+    def filter_setup_failures(self, result: TrialResult) -> list[TrialResult]:
         """Return what is to be accounted for now: nothing yet, or this result with those that were held back.
 
         Raises:
@@ -170,3 +188,169 @@ def why_invalid(result: TrialResult, scenario: Scenario) -> str:
     said = result.failure.last_output.strip().splitlines() if result.failure else []
     last = next((line for line in reversed(said) if line.strip() and not line.startswith("Warning")), "")
     return f"{result.summary}\n  last output: {last}" if last else result.summary
+
+
+# Before the first trial of ``--ego any``: simulate the plain traffic, to draw among vehicles that enter.
+
+SURVEY_SEEDS = (1, 2)
+"""Fixed, so that every hunt in a scenario draws from the same vehicles. With one run, a vehicle of a random flow that
+enters by chance would be a candidate."""
+MAX_PROCESSOR_TIME_S = 60.0
+"""Of all runs. The bound on simulated steps ends a run sooner on all but very large networks."""
+MAX_WALL_TIME_S = 600.0
+"""After which the process is taken to hang. It is ten times as long, as other processes may keep the machine busy."""
+MAX_ATTEMPTS = 3
+"""As many processes as simulate the plain traffic while each is killed from outside. The kernel may kill each of them
+where memory is short, so the number is bounded."""
+POLL_S = 0.02
+OUTPUT = "output.log"
+
+
+class TrafficSurveyor:
+    """Replaces the candidates that route files promise with the vehicles that do enter.
+
+    Args:
+        directory: of the hunt. A hunt that is there keeps its candidates.
+        overwrite: whether that hunt is to be removed.
+    """
+
+    def __init__(self, directory: Path, *, overwrite: bool) -> None:
+        self._directory = directory
+        self._overwrite = overwrite
+
+    def __call__(self, scenario: Scenario, request: Request, settings: HuntSettings) -> Scenario:
+        """Return the scenario with its candidates, or the same scenario where there is nothing to find out.
+
+        Args:
+            scenario: as it was loaded.
+            request: what was asked.
+            settings: what follows from it without a survey.
+
+        Raises:
+            ScenarioError: no trial can be valid.
+        """
+        survey = scenario.backend.survey
+        if survey is None or request.ego not in ("", "any") or Path(scenario.file).suffix == ".toml":
+            return scenario
+        drawn = {setup.replaces for setup in scenario.agents.values() if setup.replaces}
+        if drawn & {name.removeprefix("scenario.") for name in request.scenario_arguments}:
+            return scenario  # the user has chosen
+        if not self._overwrite and (self._directory / layout.HUNT).exists():
+            kept = self._kept()
+            restored = survey.restore(scenario, kept) if kept is not None else None
+            if restored is not None:
+                return restored
+        try:
+            answer = _survey_despite_kills(scenario, _runs(settings, drawn))
+        except (SimulatorError, OSError) as error:
+            # The hunt goes on: where SUMO refuses its input, the first trial reports which file and line.
+            why = f"the survey cannot run: {error}" if isinstance(error, OSError) else str(error)
+            note = f"warning: candidates are the vehicles that the route files list, entering or not: {why}"
+            return replace(scenario, notes=(scenario.notes[0], note, *scenario.notes[1:]))
+        refined = survey.refine(scenario, answer)
+        if self._has_begun_with(settings) and scenario_digest(refined) != settings.scenario_digest:
+            return scenario
+        return refined
+
+    def _has_begun_with(self, settings: HuntSettings) -> bool:
+        """Return whether the hunt that is there has the candidates of the route files, because its survey failed."""
+        if self._overwrite:
+            return False
+        with suppress(CrashhuntError, OSError):
+            return read_settings(self._directory / layout.HUNT).scenario_digest == settings.scenario_digest
+        return False
+
+    def _kept(self) -> Scenario | None:
+        with suppress(CrashhuntError, OSError):
+            snapshot = latest_snapshot(self._directory)
+            return snapshot.scenario() if snapshot is not None else None
+        return None
+
+
+def _runs(settings: HuntSettings, drawn: set[str]) -> list[RunToSurvey]:
+    """Return a run with the scenario's arguments at the low ends of their ranges, and one with the high ends."""
+    shares = [index / (len(SURVEY_SEEDS) - 1) for index in range(len(SURVEY_SEEDS))]
+    return [
+        {
+            "seed": seed,
+            "values": {
+                name: spec.distribution.quantile(share)
+                for name, spec in settings.scenario_arguments.items()
+                if name not in drawn
+            },
+        }
+        for seed, share in zip(SURVEY_SEEDS, shares, strict=True)
+    ]
+
+
+class _SurveyKilledError(SimulatorError):
+    """Another process, or the kernel, ended the process that simulates the plain traffic."""
+
+
+def _survey_despite_kills(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
+    """Return the completed runs, of another process where one was killed from outside.
+
+    Raises:
+        SimulatorError: the process failed or took too long, or each process was killed.
+    """
+    for _ in range(MAX_ATTEMPTS - 1):
+        with suppress(_SurveyKilledError):
+            return _survey(scenario, runs)
+    return _survey(scenario, runs)
+
+
+def _survey(scenario: Scenario, runs: list[RunToSurvey]) -> Json:
+    """Return the completed runs.
+
+    Raises:
+        _SurveyKilledError: the process was killed from outside.
+        SimulatorError: the process failed or took too long.
+    """
+    survey = scenario.backend.survey
+    assert survey is not None
+    number = 0
+    with temporary_folder("survey") as folder, stop_requests() as stops:
+        answer = folder / layout.ANSWER
+        job: SurveyJob = {
+            "scenario": as_plain_data(scenario),
+            "folder": str(scenario.folder.resolve()),
+            "stage": str(folder / "stage"),
+            "answer": str(answer),
+            "processor_time_limit_s": MAX_PROCESSOR_TIME_S,
+            "runs": runs,
+        }
+        (folder / layout.JOB).write_text(json.dumps(job), encoding="utf-8")
+        with (folder / OUTPUT).open("wb") as log:
+            kept = Kept(
+                survey.module,
+                [str(folder / layout.JOB)],
+                environment={**os.environ, **worker_environment()},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        deadline = time.monotonic() + MAX_WALL_TIME_S
+        try:
+            while kept.process.poll() is None and not stops and time.monotonic() < deadline:
+                time.sleep(POLL_S)
+        finally:
+            kept.end()
+        if stops:
+            number = stops[0]
+        elif answer.exists():
+            found: Json = json.loads(answer.read_text(encoding="utf-8"))
+            return found
+        elif time.monotonic() >= deadline:
+            raise SimulatorError(f"simulating the plain traffic took over {MAX_WALL_TIME_S:g} s of wall time")
+        else:
+            said = (folder / OUTPUT).read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            errors = [line for line in said if line.startswith("Error")] or said or [_ending(kept.process.returncode)]
+            kind = _SurveyKilledError if is_sent_from_outside(kept.process.returncode) else SimulatorError
+            raise kind(f"simulating the plain traffic failed: {errors[-1].strip()}")
+    # The process and its folder are gone: the signal goes to the handler that was there before.
+    signal.raise_signal(number)
+    raise KeyboardInterrupt
+
+
+def _ending(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"

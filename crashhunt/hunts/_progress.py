@@ -6,24 +6,254 @@ import math
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from crashhunt.base.faculties import offers
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import BundleError
+from crashhunt.crashes import Group, fault_of, groups_of, signature_of
 from crashhunt.executors import HasNodes
-from crashhunt.hunts._kinds import Kinds, kind_data
-from crashhunt.hunts._searching import Searching, SearchStatus
 
 if TYPE_CHECKING:
-    from crashhunt.crashes import Bundle
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._audit import AuditReport
-    from crashhunt.hunts._data import Facts, Noted
-    from crashhunt.plans import RunSettings
+    from crashhunt.hunts._fork_results import BranchReport, ProbeReport
+    from crashhunt.hunts._verification import AuditReport
+    from crashhunt.ledger import Facts, KindData, Noted
+    from crashhunt.plans import HuntSettings, RunSettings
     from crashhunt.recording import BlackBoxHeader
-    from crashhunt.triage import Group
     from crashhunt.trial import TrialResult
 
-__all__ = ["HuntStatus", "Progress"]
+
+__all__ = [
+    "HuntReport",
+    "HuntStatus",
+    "Kinds",
+    "Progress",
+    "SearchStatus",
+    "Searching",
+    "StoppedBecause",
+    "StrategyStatus",
+    "kind_data",
+]
+
+
+# Which kinds of crashes a hunt has found, while it runs.
+
+
+def kind_data(group: Group) -> KindData:
+    """Return a group in few words, with the ids of its crashes."""
+    return {
+        "words": str(group.signature),
+        "count": group.count,
+        "first": group.first.id,
+        "shortest": group.shortest.id,
+    }
+
+
+class Kinds:
+    """The kinds of the crashes that a hunt has saved.
+
+    Args:
+        wanted: how many kinds are enough; 0 for never.
+        crashes: that were saved before.
+        newest: when the last new kind came, in s since the epoch; None where nobody knows.
+        only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
+        dropped: of each kind, in words, the trials whose bundles were given up before.
+    """
+
+    def __init__(
+        self,
+        wanted: int,
+        crashes: Sequence[Bundle] = (),
+        newest: float | None = None,
+        *,
+        only_at_fault: bool = False,
+        dropped: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        self._only_at_fault = only_at_fault
+        self._at_fault: set[int] = set()
+        self._wanted = wanted
+        self._signed: dict[int, tuple[Signature, Bundle]] = {}  # by the number of the trial
+        self._seen: set[Signature] = set()
+        self._first: dict[Signature, int] = {}  # of each kind that counts, its trial of the least number
+        self._groups: tuple[Group, ...] | None = None
+        self.newest = newest
+        self.newest_trial: int | None = None
+        there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
+        self.dropped = {
+            words: [number for number in numbers if number not in there] for words, numbers in (dropped or {}).items()
+        }
+        for bundle in crashes:
+            self._sign(bundle)
+
+    def add(self, bundle: Bundle, ended: int) -> None:
+        """Take in a crash that has been saved.
+
+        Args:
+            bundle: the crash.
+            ended: how many trials have ended by now.
+        """
+        if self._sign(bundle):
+            self.newest, self.newest_trial = time.time(), ended
+
+    def groups(self) -> tuple[Group, ...]:
+        """Return what there is, the most frequent kind first, each with its crashes in the order of their trials."""
+        if self._groups is None:  # a screen asks ten times a second
+            dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
+            self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
+        return self._groups
+
+    def surplus(self, keep: int) -> list[Bundle]:
+        """Return the crashes of which there are so many of the same kind that are shorter, and give them up.
+
+        They count on, and are no members any more.
+        """
+        found = []
+        for group in groups_of(self._signed.values()):
+            for bundle in sorted(group.bundles, key=self._worth)[keep:]:
+                number = bundle.result.spec.number
+                del self._signed[number]
+                self._at_fault.discard(number)
+                self.dropped.setdefault(str(group.signature), []).append(number)
+                found.append(bundle)
+        if found:
+            self._groups = None
+        return found
+
+    def _worth(self, bundle: Bundle) -> tuple[bool, int, int]:
+        """What is kept first: what was hunted for, and of that the shortest."""
+        result = bundle.result
+        return self._only_at_fault and result.spec.number not in self._at_fault, result.steps, result.spec.number
+
+    @property
+    def until(self) -> int | None:
+        """The least number of a trial up to which there are enough kinds; None where there are not."""
+        firsts = sorted(self._first.values())
+        return firsts[self._wanted - 1] if 0 < self._wanted <= len(firsts) else None
+
+    @property
+    def at_fault(self) -> tuple[int, ...] | None:
+        """The trials whose crashes are the agent's own fault; None where that was not asked."""
+        return tuple(sorted(self._at_fault)) if self._only_at_fault else None
+
+    def refresh(self, crashes: Sequence[Bundle]) -> None:
+        """Take the crashes as they are now: they have been confirmed."""
+        for bundle in crashes:
+            number = bundle.result.spec.number
+            if number in self._signed:
+                self._signed[number] = self._signed[number][0], bundle
+        self._groups = None
+
+    def _sign(self, bundle: Bundle) -> bool:
+        """Take in a crash; return whether it is of a kind that has not been there."""
+        number = bundle.result.spec.number
+        try:
+            # Both look at it, and reading a log takes longer than looking.
+            recording = bundle.recording() if self._only_at_fault and bundle.result.collision is not None else None
+            signature = signature_of(bundle, recording)
+            if self._only_at_fault and fault_of(bundle, recording).is_egos:
+                self._at_fault.add(number)
+        except BundleError:
+            return False  # it is of no kind, and crashhunt check tells of it
+        is_new = signature not in self._seen
+        self._seen.add(signature)
+        self._signed[number] = signature, bundle
+        self._groups = None
+        if number in self._at_fault or not self._only_at_fault:
+            self._first[signature] = min(number, self._first.get(signature, number))
+        return is_new
+
+
+# What a hunt's sampler has tried in this run, strategy by strategy, and what came of it.
+
+
+@dataclass(frozen=True, slots=True)
+class StrategyStatus:
+    """One of the origins of trials.
+
+    Args:
+        name: of the strategy.
+        trials: that it proposed and that have ended.
+        share: of all that have ended, 0 to 1.
+        danger: mean of its trials, 0 to 1, a crash counting as 1; None where none of them has one.
+        crashes: among its trials.
+    """
+
+    name: str
+    trials: int
+    share: float
+    danger: float | None
+    crashes: int
+
+
+@dataclass(frozen=True, slots=True)
+class SearchStatus:
+    """How a search is going, for people who watch.
+
+    Args:
+        strategies: those that have had trials, the most frequent first; empty where a sampler names none.
+        grown_trials: how many trials have ended since the greatest danger grew; None where it has not in this run.
+        grown_s: how long ago that was, in s of wall time; None likewise.
+    """
+
+    strategies: tuple[StrategyStatus, ...] = ()
+    grown_trials: int | None = None
+    grown_s: float | None = None
+
+
+@dataclass(slots=True)
+class _Tally:
+    trials: int = 0
+    measured: int = 0
+    danger: float = 0.0
+    crashes: int = 0
+
+
+@dataclass(slots=True)
+class Searching:
+    """Keeps account of the trials of this run."""
+
+    ended: int = 0
+    _tallies: dict[str, _Tally] = field(default_factory=dict)
+    _grown: tuple[int, float] | None = None  # after how many trials, and when
+
+    def take(self, result: TrialResult, *, crashed: bool) -> None:
+        """Count a trial that has ended."""
+        self.ended += 1
+        if not result.spec.origin:
+            return
+        tally = self._tallies.setdefault(result.spec.origin, _Tally())
+        tally.trials += 1
+        tally.crashes += crashed
+        danger = 1.0 if crashed else result.danger
+        if danger is not None:
+            tally.measured += 1
+            tally.danger += danger
+
+    def grow(self) -> None:
+        """Take note that the trial which was counted last is the most dangerous one without a crash."""
+        self._grown = self.ended, time.monotonic()
+
+    def status(self) -> SearchStatus:
+        """Return how it is going."""
+        strategies = [
+            StrategyStatus(
+                name,
+                tally.trials,
+                tally.trials / self.ended,
+                tally.danger / tally.measured if tally.measured else None,
+                tally.crashes,
+            )
+            for name, tally in sorted(self._tallies.items(), key=lambda entry: (-entry[1].trials, entry[0]))
+        ]
+        if self._grown is None:
+            return SearchStatus(tuple(strategies))
+        trials, moment = self._grown
+        return SearchStatus(tuple(strategies), self.ended - trials, time.monotonic() - moment)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +421,7 @@ class Progress:
 
     def look_at(self, executor: Executor) -> None:
         """Take note of where trials run."""
-        self.nodes = tuple(executor.nodes()) if offers(executor, HasNodes) else None
+        self.nodes = tuple(executor.nodes()) if supports(executor, HasNodes) else None
 
     def noted(self) -> Noted:
         """Return what the ledger is to say about now."""
@@ -211,3 +441,87 @@ class Progress:
         newest, trial = self.kinds.newest, self.kinds.newest_trial
         since = None if newest is None else max(0.0, time.time() - newest)
         return self.kinds.groups(), since, None if trial is None else self.ended_here - trial
+
+
+# What came of a hunt: what `Hunt.run` returns, and ``run --json`` prints.
+
+StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time"]
+
+
+@dataclass(frozen=True, slots=True)
+class HuntReport:
+    """What came of a hunt.
+
+    Args:
+        directory: of the hunt.
+        settings: what was asked.
+        stopped_because: why it ended.
+        outcomes: how the trials ended.
+        trial_steps: how many steps trials have taken.
+        steps_total: how many were simulated in all: theirs, those before their first, such as of traffic that warms up,
+            those of their copies, and those of runs that were to confirm something and ended otherwise.
+        wall_s: wall time of this run.
+        crashes: what was found, the one with the fewest steps first.
+        reason: in words, where not one trial was valid.
+        notes: what people should know about how it went, such as trials that were run again.
+        events: traffic events of all trials: kind to how many, and in how many trials.
+        audit: what came of running trials without a crash again; None where nobody asked for it.
+        kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
+        near_misses: that were kept, the most dangerous first.
+        probes: what came of asking copies of trials; None where nobody did.
+        at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
+        branches: what came of copies that went on with other disturbances; None where there were to be none.
+        copied: what a copy found, where that ended the hunt: it came again from the start.
+        unanswered: how many trials the same command runs again, as they or copies of them were killed from outside.
+    """
+
+    directory: Path
+    settings: HuntSettings
+    stopped_because: StoppedBecause
+    outcomes: dict[str, int]
+    trial_steps: int
+    steps_total: int
+    wall_s: float
+    crashes: tuple[Bundle, ...]
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+    events: dict[str, tuple[int, int]] = field(default_factory=dict)
+    audit: AuditReport | None = None
+    kinds: tuple[Group, ...] | None = None
+    near_misses: tuple[Bundle, ...] = ()
+    probes: ProbeReport | None = None
+    at_fault: tuple[int, ...] | None = None
+    branches: BranchReport | None = None
+    copied: Bundle | None = None
+    unanswered: int = 0
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        found: JsonObject = {
+            "dir": str(self.directory),
+            "hunt_seed": self.settings.seed,
+            "trials_planned": self.settings.trials,
+            "trials_run": sum(self.outcomes.values()),
+            "outcomes": self.outcomes,
+            "stopped_because": self.stopped_because,
+            "wall_s": round(self.wall_s, 3),
+            "steps_total": self.steps_total,
+            "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
+            "crashes": [bundle.summary() for bundle in self.crashes],
+            "notes": list(self.notes),
+            "audit": self.audit.to_json() if self.audit is not None else None,
+            "unanswered": self.unanswered,
+        }
+        if self.probes is not None:
+            found["probes"] = self.probes.to_json()
+        if self.branches is not None:
+            found["branches"] = self.branches.to_json()
+        if self.kinds is not None:
+            found["kinds"] = list(map(kind_data, self.kinds))
+        if self.settings.run.near_misses:
+            found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
+        if self.at_fault is not None:
+            found["at_fault"] = list(self.at_fault)
+        if self.copied is not None:
+            found["copied"] = str(self.copied.path)
+        return found

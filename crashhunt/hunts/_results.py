@@ -2,39 +2,206 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import warnings
 from contextlib import closing
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import HuntDirectoryError, UntrustedError, UsageError
-from crashhunt.base.names import one_of
-from crashhunt.base.temporary import temporary_folder
+from crashhunt.base.files import whole_file
+from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
+from crashhunt.base.text import one_of
 from crashhunt.crashes import Bundle, describe_code, is_hunt_trusted, list_bundles
 from crashhunt.episode import Parts, WorkerSettings
-from crashhunt.hunts._ledger import Ledger, has_begun
-from crashhunt.hunts._row import BRANCHES, DISTURBANCES, FACTS, ORIGINS, STRESS, TrialRow
 from crashhunt.hunts._state import HuntState, draws_independently, find_hunts, hunt_state
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import HuntSettings, read_settings, with_settings
 from crashhunt.snapshots import Snapshot, latest_snapshot
+from crashhunt.trial import EVENTS, Branches, Stress, outcome_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
     from pandas import DataFrame
 
     from crashhunt.agents import Agent
-    from crashhunt.hunts._row import Cell
+    from crashhunt.base.codec import JsonObject
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import TrialResult
+    from crashhunt.trial import Outcome, TrialResult, Value
 
-__all__ = ["HuntResults", "SuiteResults", "UnfinishedWarning", "columns_of", "load"]
+
+__all__ = [
+    "BRANCHES",
+    "DISTURBANCES",
+    "FACTS",
+    "ORIGINS",
+    "STRESS",
+    "Cell",
+    "HuntResults",
+    "SuiteResults",
+    "TrialRow",
+    "UnfinishedWarning",
+    "columns_of",
+    "load",
+    "write_parquet",
+    "write_text",
+]
+
+
+# What is told of a trial wherever trials are listed: the one projection of a result that tables and pages share.
+
+FACTS = (
+    "number", "seed", "outcome", "steps", "sim_time_s", "danger", "time_to_collision_s", "gap_m",
+    "required_deceleration", "wall_s", "digest", *map(str, EVENTS),
+)  # fmt: skip
+"""The columns that every table of trials begins with."""
+
+ORIGINS = ("parent", "origin")
+"""Further ones, of trials that a sampler made of others, or by one of several strategies."""
+
+DISTURBANCES = ("disturbances", "log_likelihood")
+"""Further ones, of hunts with disturbances: how many took place, and how likely all of it was."""
+
+STRESS = ("stress_margin", "stress_asked", "stress_margin_upper_bound")
+"""Further ones, of hunts with probes: how little it would have taken, 0 to 1; at how many moments that was asked; and
+what the margin is at most where that was not all of them."""
+
+BRANCHES = ("branches", "branch_crashes", "branches_asked")
+"""Further ones, of hunts with branches: how many there were, how many crashed, and how many of all have an answer."""
+
+Cell: TypeAlias = "Value | None"
+"""What a table has in one place; None where a trial has no such value."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRow:
+    """One trial of many.
+
+    What an earlier version did not write is missing here. It is made of plain data, as ledgers yield them: a table has
+    a million trials, and a `TrialResult` takes three times as long.
+
+    Args:
+        data: of the trial.
+    """
+
+    data: JsonObject
+
+    @property
+    def number(self) -> int:
+        """Its place in the hunt."""
+        return int(self.data["spec"]["number"])
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return outcome_of(self.data)
+
+    @property
+    def time_to_collision_s(self) -> float | None:
+        """The least; None where no course ever crossed."""
+        return _closest(self.data).get("time_to_collision_s")
+
+    @property
+    def danger(self) -> float | None:
+        """How near to a crash it came, 0 to 1; None where nobody measured it."""
+        return self.data.get("danger")
+
+    @property
+    def origin(self) -> str:
+        """Which strategy of a sampler proposed it; empty where none did."""
+        return str(self.data["spec"].get("origin", ""))
+
+    @property
+    def parent(self) -> int | None:
+        """The number of the trial that it was made from; None where there is none."""
+        found: int | None = self.data["spec"].get("parent")
+        return found
+
+    @property
+    def stress_margin(self) -> float | None:
+        """How little it would have taken, 0 to 1; None where that was not asked, or not fully."""
+        stress = self.data.get("stress")
+        return stress.get("margin") if stress else None
+
+    @property
+    def is_fully_asked(self) -> bool:
+        """Whether every question to its copies has an answer; also where there were to be none."""
+        stress, branches = self.data.get("stress"), self.data.get("branches")
+        return not (stress and stress.get("margin") is None) and not (branches and branches.get("unanswered"))
+
+    @property
+    def arguments(self) -> Mapping[str, Mapping[str, Value]]:
+        """What its agents were given, by agent and name."""
+        found: Mapping[str, Mapping[str, Value]] = self.data["spec"].get("arguments", {})
+        return found
+
+    @property
+    def scenario_arguments(self) -> Mapping[str, Value]:
+        """What its scenario was given, by name."""
+        found: Mapping[str, Value] = self.data["spec"].get("scenario_arguments", {})
+        return found
+
+    def cells(self, columns: Sequence[str]) -> dict[str, Cell]:
+        """Return it as a row of a table that has some columns.
+
+        Args:
+            columns: some of `FACTS`, `DISTURBANCES`, `STRESS`, `BRANCHES` and `ORIGINS`, ``AGENT.ARGUMENT`` and
+                ``scenario.ARGUMENT``.
+        """
+        data = self.data
+        spec, closest, events = data["spec"], _closest(data), data.get("events")
+        found: dict[str, Cell] = {
+            "number": spec["number"],
+            "seed": spec["seed"],
+            "outcome": data["outcome"],
+            "steps": data["steps"],
+            "sim_time_s": data.get("sim_time_s"),
+            "danger": data.get("danger"),
+            "time_to_collision_s": closest.get("time_to_collision_s"),
+            "gap_m": closest.get("gap_m"),
+            "required_deceleration": closest.get("required_deceleration"),
+            "wall_s": data.get("wall_s"),
+            "digest": data.get("digest"),
+            "parent": self.parent,
+            "origin": self.origin,
+            "disturbances": len(data.get("disturbances", ())),
+            "log_likelihood": data.get("log_likelihood"),
+            "stress_margin": self.stress_margin,
+        }
+        if stress := data.get("stress"):
+            found["stress_margin_upper_bound"] = stress.get("margin_upper_bound")
+            if stress.get("moments"):  # which earlier versions did not count
+                found["stress_asked"] = Stress.from_json(stress).extent
+        branches = data.get("branches")
+        if branches is not None:
+            found |= {
+                "branches": branches.get("asked"),
+                "branch_crashes": len(branches.get("crashes", ())),
+                "branches_asked": Branches.from_json(branches).extent,
+            }
+        if events is not None:  # somebody has looked for them
+            found |= dict.fromkeys(EVENTS, 0)
+            found |= events
+        for agent, given in self.arguments.items():
+            for name, value in given.items():
+                found[f"{agent}.{name}"] = value
+        for name, value in self.scenario_arguments.items():
+            found[f"scenario.{name}"] = value
+        return {name: found.get(name) for name in columns}
+
+
+def _closest(data: JsonObject) -> JsonObject:
+    return data.get("closest") or {}
 
 
 class UnfinishedWarning(UserWarning):
@@ -261,3 +428,86 @@ def _column(values: list[Cell]) -> NDArray[np.generic]:
     if all(value is None or isinstance(value, int | float) for value in values):
         return np.array([np.nan if value is None else value for value in values], float)
     return np.array(["" if value is None else str(value) for value in values])
+
+
+# Trials as tables in files: CSV, JSON, JSON lines and Parquet, written row by row.
+
+_LOOKED_AT = 1000  # rows, to find out the type of an argument of which nobody says it
+
+
+def write_text(hunt: HuntResults, out: IO[str], form: str, *, outcomes: Sequence[str] = ()) -> int:
+    """Write the trials of a hunt as text; return how many.
+
+    Args:
+        hunt: whose.
+        out: where.
+        form: ``csv``, ``json`` (one array) or ``jsonl`` (an object per line).
+        outcomes: only those; empty for all.
+    """
+    names = hunt.columns
+    count = 0
+    if form == "csv":
+        writer = csv.writer(out)
+        writer.writerow(names)
+        for row in hunt.rows(outcomes=outcomes):
+            writer.writerow([_cell(value) for value in row.values()])
+            count += 1
+        return count
+    opening, between, closing = ("[\n", ",\n", "\n]\n") if form == "json" else ("", "\n", "\n")
+    out.write(opening)
+    for row in hunt.rows(outcomes=outcomes):
+        out.write((between if count else "") + json.dumps(row))
+        count += 1
+    out.write(closing if count or form == "json" else "")
+    return count
+
+
+def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()) -> int:
+    """Write the trials of a hunt as a Parquet file; return how many.
+
+    Raises:
+        UsageError: polars is not installed.
+    """
+    try:
+        # Not pyarrow: libsumo brings an Arrow of its own along, and warns of every other in the same environment.
+        import polars as pl
+    except ImportError:
+        raise UsageError("Parquet needs polars", fix="pip install 'crashhunt[parquet]', or give csv") from None
+    kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _LOOKED_AT)))
+    schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
+    with (
+        whole_file(path) as temporary,
+        temporary_beside(path, name=temporary_name(path, ".csv")) as plain,
+        plain.open("w", encoding="utf-8", newline="") as table,
+    ):
+        count = write_text(hunt, table, "csv", outcomes=outcomes)
+        table.flush()
+        pl.scan_csv(plain, schema=schema).sink_parquet(temporary)
+    return count
+
+
+def _kinds(hunt: HuntResults, batch: list[dict[str, Cell]]) -> dict[str, str]:
+    """The type of each column, which a row group cannot find out by itself."""
+    settings = hunt.settings
+    specs = {f"scenario.{name}": spec for name, spec in settings.scenario_arguments.items()}
+    for agent, chosen in settings.agents.items():
+        specs |= {f"{agent}.{name}": spec for name, spec in chosen.arguments.items()}
+    known = {"int": "Int64", "float": "Float64", "bool": "Boolean", "str": "String"}
+    kinds = {"number": "Int64", "seed": "Int64", "steps": "Int64", "outcome": "String", "digest": "String"}
+    kinds |= dict.fromkeys(EVENTS, "Int64")
+    kinds |= {"parent": "Int64", "origin": "String", "disturbances": "Int64"}
+    kinds |= {"stress_asked": "String", "branches_asked": "String"}
+    columns = hunt.columns
+    for name in columns:
+        kind = specs[name].kind if name in specs else "float"
+        if kind is None:  # the agent does not say; what was tried first does
+            numeric = all(isinstance(row[name], int | float | None) for row in batch)
+            kind = "float" if numeric else "str"
+        kinds.setdefault(name, known[kind])
+    return {name: kinds[name] for name in columns}
+
+
+def _cell(value: Cell) -> Cell:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else value

@@ -2,42 +2,169 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
+import shutil
 import socket
 import time
-from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.base.integrity import read_object
-from crashhunt.base.names import near_path
-from crashhunt.crashes import crash_folders
-from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
-from crashhunt.hunts._ledger import Ledger, has_begun
-from crashhunt.hunts._ledger_file import damaged
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable, written_if
+from crashhunt.base.errors import BusyError, HuntDirectoryError
+from crashhunt.base.integrity import changed_file, read_object
+from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside, this_process
+from crashhunt.base.text import near_path
+from crashhunt.crashes import crash_folders, files_of
+from crashhunt.ledger import KindData, Ledger, damaged, has_begun
+from crashhunt.plans import HuntSettings, read_settings, write_settings
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
-    from crashhunt.hunts._copies import BranchSums, ProbeSums
-    from crashhunt.hunts._data import Facts, Owner
-    from crashhunt.hunts._kinds import KindData
-    from crashhunt.plans import HuntSettings
+    from collections.abc import Iterator
+
+    from crashhunt.base.integrity import FileEntry
+    from crashhunt.ledger import Facts, Owner
+
 
 __all__ = [
+    "BRANCHES",
     "HEARTBEAT_S",
+    "PROBES",
+    "BranchSums",
+    "HuntDirectory",
     "HuntState",
+    "LogKind",
+    "LogReader",
+    "ProbeSums",
     "State",
+    "copies_to_come",
     "draws_independently",
     "find_hunts",
     "hunt_state",
     "is_hunt",
-    "this_process",
+    "ledger_owner",
+    "sums_of_branches",
+    "sums_of_probes",
 ]
+
+
+# What has come of the copies of a hunt's trials so far, as its ledger sums it up.
+
+PROBES, BRANCHES = "probes", "branches"
+
+
+class ProbeSums(TypedDict):
+    """What ``status --json`` says of the probes of a hunt.
+
+    Args:
+        trials: of how many trials copies were asked all that was to be asked.
+        not_fully_asked: of how many further trials a question has no answer.
+        least: the least stress margin of the former; None where there is none.
+        trial: the number of the trial that has it.
+        probes: how many copies were asked.
+        steps: how many steps they took.
+        left_out: how many questions were left out, because copies had taken enough steps.
+        crashed_trials: how many trials a probe made crash that did not crash by themselves.
+        run_again: how many of the mildest were run from the start; None until the hunt has come to that.
+        confirmed: how many of these crashed there as well.
+    """
+
+    trials: int
+    not_fully_asked: int
+    least: float | None
+    trial: int | None
+    probes: int
+    steps: int
+    left_out: int
+    crashed_trials: int
+    run_again: int | None
+    confirmed: int | None
+
+
+class BranchSums(TypedDict):
+    """What ``status --json`` says of the branches of a hunt, as `ProbeSums`.
+
+    Args:
+        trials: of how many trials there might have been some.
+        moments: from how many copies went on.
+        branches: how many there were.
+        steps: how many steps they took.
+        left_out: how many were left out, because branches had taken enough steps.
+        crashed: how many crashed.
+        crashed_trials: of how many trials.
+        not_fully_asked: of how many of the trials a branch has no answer.
+        run_again: how many of the likeliest were run from the start; None until the hunt has come to that.
+        confirmed: how many of these crashed there as well.
+    """
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    left_out: int
+    crashed: int
+    crashed_trials: int
+    not_fully_asked: int
+    run_again: int | None
+    confirmed: int | None
+
+
+def copies_to_come(settings: HuntSettings) -> list[str] | None:
+    """Return which copies a hunt has of its trials; None where it has none."""
+    return [name for name, wanted in ((PROBES, settings.probe), (BRANCHES, settings.branch)) if wanted] or None
+
+
+def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
+    """Return what came of the probes of a hunt so far; None where it has none."""
+    if PROBES not in (facts.get("copies") or ()):
+        return None
+    (row,) = ledger.summed(
+        # Of a query with one min(), SQLite takes what stands bare from the row that has it.
+        "count(margin), min(margin), number, total(probes), total(steps), total(left_out), total(crashed), "
+        "count(probes)",
+        "SELECT number, {stress.margin} AS margin, {stress.probes} AS probes, {stress.steps} AS steps, "
+        "{stress.left_out} AS left_out, {stress.disturbance} IS NOT NULL AS crashed",
+    )
+    trials, least, trial, probes, steps, left_out, crashed, asked = row
+    again, confirmed = _confirmed(facts, PROBES)
+    return {
+        "trials": trials, "not_fully_asked": asked - trials, "least": least, "trial": trial if trials else None,
+        "probes": int(probes), "steps": int(steps), "left_out": int(left_out), "crashed_trials": int(crashed),
+        "run_again": again, "confirmed": confirmed,
+    }  # fmt: skip
+
+
+def sums_of_branches(ledger: Ledger, facts: Facts) -> BranchSums | None:
+    """Return what came of the branches of a hunt so far; None where it has none."""
+    if BRANCHES not in (facts.get("copies") or ()):
+        return None
+    (row,) = ledger.summed(
+        "count(asked), total(moments), total(asked), total(steps), total(left_out), total(crashed), "
+        "total(crashed > 0), total(unanswered > 0)",
+        "SELECT {branches.moments} AS moments, {branches.asked} AS asked, {branches.steps} AS steps, "
+        "{branches.left_out} AS left_out, {branches.unanswered} AS unanswered, "
+        "json_array_length(data, '$.branches.crashes') AS crashed",
+    )
+    trials, moments, branches, steps, left_out, crashed, crashed_trials, not_fully_asked = map(int, row)
+    again, confirmed = _confirmed(facts, BRANCHES)
+    return {
+        "trials": trials, "moments": moments, "branches": branches, "steps": steps, "left_out": left_out,
+        "crashed": crashed, "crashed_trials": crashed_trials, "not_fully_asked": not_fully_asked,
+        "run_again": again, "confirmed": confirmed,
+    }  # fmt: skip
+
+
+def _confirmed(facts: Facts, name: str) -> tuple[int | None, int | None]:
+    """How many were run from the start, and how many of them crashed there as well."""
+    found = None if facts.get("state") == "running" else (facts.get("confirmed") or {}).get(name)  # of an earlier run
+    return (found[0], found[1]) if found else (None, None)
+
 
 State = Literal["queued", "running", "finished", "crashed", "error", "interrupted", "killed"]
 
@@ -52,7 +179,7 @@ _ENDED: dict[str, State] = {
 
 
 @dataclass(frozen=True, slots=True)
-class HuntState:
+class HuntState(Serializable):
     """Where a hunt stands.
 
     Args:
@@ -90,28 +217,18 @@ class HuntState:
     seconds_left: float | None = None
     owner_alive: bool = False
     damaged: bool = False
-    disturbed: int | None = None
-    core: str | None = None
-    nodes: list[dict[str, Any]] | None = None
-    kinds: list[KindData] | None = None
-    newest_kind_s: float | None = None
-    probes: ProbeSums | None = None
-    branches: BranchSums | None = None
+    disturbed: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    core: str | None = field(default=None, metadata=OMIT_DEFAULT)
+    nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    kinds: list[KindData] | None = field(default=None, metadata=OMIT_DEFAULT)
+    newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
+    probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
 
     @property
     def failed(self) -> bool:
         """Whether it ended without having done what was asked."""
         return self.state in ("error", "interrupted", "killed")
-
-    def to_json(self) -> dict[str, object]:
-        """Return the shape of one hunt in ``status --json``."""
-        data = asdict(self)
-        for name in ("disturbed", "core", "nodes", "probes", "branches"):
-            if data[name] is None:
-                del data[name]
-        if self.kinds is None:
-            del data["kinds"], data["newest_kind_s"]
-        return data
 
 
 def is_hunt(directory: Path) -> bool:
@@ -236,7 +353,7 @@ def draws_independently(facts: Facts, settings: HuntSettings) -> bool:
     return bool(facts.get("independent", settings.sampler == "random")) and not settings.seeds
 
 
-def this_process() -> Owner:
+def ledger_owner() -> Owner:
     """Return what tells this process from every other, so that anybody can see later whether it is still there."""
     return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
 
@@ -274,3 +391,215 @@ def _started(pid: int) -> int:
 def _in_order(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Runs by number: 2 before 10."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in path.parts)
+
+
+# The directory of a hunt: whose it is, and that nobody else hunts in it meanwhile.
+
+_DIFFERENCES_SHOWN = 4
+# What a hunt writes, `hunt.toml` last: without it the folder is not a hunt's.
+_OWN = (
+    "snapshots",
+    "crashes",
+    *layout.BESIDE,
+    "trials",
+    layout.LEDGER,
+    "ledger.sqlite-wal",
+    "ledger.sqlite-shm",
+    layout.HUNT,
+)
+_SCRATCH = ".scratch"
+_BEFORE = (".lock", _SCRATCH, ".hunt.")  # what may be there before: of a hunt that could not begin
+
+
+class HuntDirectory:
+    """A directory to hunt in.
+
+    Args:
+        path: of it; it is made where it does not exist, its parents are not.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def scratch(self) -> Path:
+        """Where running trials write, wherever their process goes meanwhile.
+
+        A hunt that resumes has another folder: processes of one that was killed may still be writing for a moment.
+        """
+        return self.path.absolute() / f"{_SCRATCH}-{this_process().token}"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other hunts out, by a lock that dies with this process.
+
+        Raises:
+            HuntDirectoryError: the directory is busy, foreign or unwritable.
+        """
+        try:
+            self.path.mkdir(exist_ok=True)
+            if not (self.path / ".lock").exists():  # nothing is left behind in a folder of somebody else's
+                self._refuse_foreign()
+            lock = (self.path / ".lock").open("a+")
+        except OSError as error:
+            raise self._unusable(error) from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.seek(0)
+                raise BusyError(
+                    f"another hunt is running there (process {lock.read().strip() or '?'})",
+                    fix="wait for it, stop it, or choose another directory",
+                    where=str(self.path),
+                ) from None
+            self._refuse_foreign()
+            lock.truncate(0)
+            lock.write(str(os.getpid()))
+            lock.flush()
+            with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
+                yield
+
+    def claim(self, settings: HuntSettings, command: list[str], *, overwrite: bool, seed_given: bool) -> HuntSettings:
+        """Make the directory this hunt's, or see that it is already; return the settings that hold.
+
+        Args:
+            settings: what was asked.
+            command: the command line, as a comment in ``hunt.toml``.
+            overwrite: begin anew, whatever is there.
+            seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
+
+        Raises:
+            HuntDirectoryError: the hunt that is there makes other trials, or the directory is unwritable.
+        """
+        if overwrite:
+            for name in _OWN:
+                if (self.path / name).is_dir():
+                    shutil.rmtree(self.path / name, ignore_errors=True)
+                else:
+                    (self.path / name).unlink(missing_ok=True)
+        file = self.path / layout.HUNT
+        if file.exists():
+            before = read_settings(file)
+            if not seed_given:
+                settings = replace(settings, seed=before.seed)
+            differences = before.differences(settings)
+            if differences:
+                more = len(differences) - _DIFFERENCES_SHOWN
+                shown = "; ".join(differences[:_DIFFERENCES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+                raise HuntDirectoryError(
+                    f"another hunt is there: {shown}",
+                    fix="give the same settings to go on with it, another directory, or --overwrite to begin anew",
+                    where=str(self.path),
+                )
+        for left in self.path.glob(f"{_SCRATCH}*"):  # with the lock of the hunt, no other hunt uses it
+            remove_scratch(left)
+        for folder in (self.path, *(self.path / name for name in (layout.CRASHES, *layout.BESIDE))):
+            remove_ended(folder)
+        try:
+            self.scratch.mkdir()
+            write_settings(file, settings, command)
+        except OSError as error:
+            raise self._unusable(error) from error
+        return settings
+
+    def _refuse_foreign(self) -> None:
+        try:
+            foreign = sorted(path.name for path in self.path.iterdir() if not path.name.startswith(_BEFORE))
+        except OSError as error:
+            raise self._unusable(error) from error
+        if foreign and not is_hunt(self.path):
+            raise HuntDirectoryError(
+                f"the folder is not empty and not a hunt: it has {foreign[0]!r}",
+                fix="give an empty or a new folder",
+                where=str(self.path),
+            )
+
+    def _unusable(self, error: OSError) -> HuntDirectoryError:
+        if isinstance(error, FileExistsError):
+            return HuntDirectoryError(f"{str(self.path)!r} is a file", fix="give a new or an empty folder")
+        return HuntDirectoryError(
+            f"the directory cannot be used: {error.strerror}",
+            fix="choose one below a folder that exists and is writable",
+            where=str(error.filename or self.path),
+        )
+
+
+# ``crashhunt logs``: finds and reads what hunts and trials have printed, wherever it was kept.
+
+LogKind = Literal["run", "error", "state"]
+
+_MOST = 1_000_000  # bytes of one file, from its end
+
+
+class LogReader:
+    """Reads the logs of a hunt and its trials, each time what is new.
+
+    Args:
+        hunt: its directory.
+        kinds: what of it.
+        trial: only of this one.
+    """
+
+    def __init__(self, hunt: Path, kinds: tuple[LogKind, ...], *, trial: int | None = None) -> None:
+        self._hunt = hunt
+        self._kinds = kinds
+        self._trial = trial
+        self._read: dict[Path, int] = {}
+        self._files: dict[Path, dict[str, FileEntry]] = {}
+        self._told = 0
+
+    def fresh(self) -> Iterator[tuple[str, str]]:
+        """Yield title and text of what has come since the last time."""
+        if self._trial is None:
+            if "state" in self._kinds:
+                yield from self._states()
+            yield from self._texts(self._hunt, "")
+        places = (layout.CRASHES, *layout.BESIDE, layout.TRIALS)
+        folders = [folder for place in places for folder in (self._hunt / place).glob(layout.SHOWN)]
+        for folder in sorted(folders, key=lambda folder: folder.name):
+            number = folder.name.partition("-")[0]
+            if number.isdecimal() and self._trial in (None, int(number)):
+                yield from self._texts(folder, f"trial {int(number)}, ")
+
+    def _states(self) -> Iterator[tuple[str, str]]:
+        if not has_begun(self._hunt / layout.LEDGER):
+            if is_hunt(self._hunt) and (state := hunt_state(self._hunt)).damaged:
+                raise HuntDirectoryError(state.detail)
+            return
+        with closing(Ledger(self._hunt / layout.LEDGER)) as ledger:
+            events = ledger.events()[self._told :]
+        self._told += len(events)
+        lines = [
+            f"{time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(at))}  {state}{f'  {why}' if why else ''}"
+            for at, state, why in events
+        ]
+        if lines:
+            yield "state", "\n".join(lines)
+
+    def _texts(self, folder: Path, title: str) -> Iterator[tuple[str, str]]:
+        for kind in ("run", "error"):
+            path = folder / f"{kind}.log"
+            if kind not in self._kinds:
+                continue
+            try:
+                with path.open("rb") as file:
+                    size = file.seek(0, os.SEEK_END)
+                    begin = self._read.get(path, max(0, size - _MOST))
+                    if size <= begin:
+                        continue
+                    file.seek(begin)
+                    text = file.read(size - begin).decode("utf-8", "replace")
+            except OSError:
+                continue
+            self._read[path] = size
+            if text.strip():
+                changed = "" if self._as_written(path) else ", which has changed since it was written"
+                yield f"{title}{kind}{changed}", text
+
+    def _as_written(self, path: Path) -> bool:
+        """Whether a file beside a crash is what that says; those of a hunt itself, and of early ones, nobody says."""
+        if path.parent not in self._files:
+            self._files[path.parent] = files_of(path.parent)
+        entry = self._files[path.parent].get(path.name)
+        return entry is None or not changed_file(path, entry)

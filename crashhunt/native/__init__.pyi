@@ -12,8 +12,5 @@ from ._core import (
     core_for as core_for,
     why_not as why_not,
 )
-from ._link_order import (
-    LinkOrder as LinkOrder,
-    link_order as link_order,
-    why_no_link_order as why_no_link_order,
-)
+from ._generators import reseed_generators as reseed_generators, why_no_reseeding as why_no_reseeding
+from ._link_order import LinkOrder as LinkOrder, link_order as link_order, why_no_link_order as why_no_link_order

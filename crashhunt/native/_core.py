@@ -32,8 +32,14 @@ _CHECKED = ("1.28.0",)
 """The versions of libsumo of whose functions the core knows how they are called."""
 
 DONE, ASK, REFUSED, ANSWERED, SIMULATED = range(5)
-"""What `UsualSteps.take` comes to: the step is complete; it is, and somebody has to be asked about it; nothing was
-done; the agent was shown something and has answered; it was simulated as well, and all the rest is still to be done."""
+"""Results of `UsualSteps.take`, in this order:
+
+- the step is complete,
+- the step is complete, and the oracles must evaluate it,
+- nothing was done,
+- the agent has answered an observation,
+- the step was simulated as well, and all the rest remains to be done.
+"""
 
 Points = list[tuple[float, float]]
 Part = tuple[object, int, list[float], list[float], list[int]]
@@ -58,42 +64,42 @@ class Vehicles(Protocol):
     """Some vehicles of the running simulation, and the sizes of all who are with them in a scene."""
 
     def read(self) -> Columns | None:
-        """Return where they are; None where libsumo refuses, as its getters will."""
+        """Return their positions; None where libsumo refuses, as its getters will."""
 
     def look(self, controlled: Vehicles, squared: float, /) -> Columns | tuple[str, ...] | None:
-        """Return where they are; None where somebody has come, gone, collided, or is on foot.
+        """Return their positions; None where a vehicle has entered, left or collided, or a person is present.
 
         Args:
-            controlled: those around whom these vehicles are.
-            squared: where it is not 0 and others are nearer to them than its root, the ids of these, in m².
+            controlled: the vehicles in the centre of this group.
+            squared: a distance, squared, in m². If it is not 0 and other vehicles are nearer, their ids are returned.
         """
 
 
 class UsualSteps(Protocol):
-    """Steps of an episode with one agent in which nothing happens, each in one call.
+    """Steps of an episode with one agent and without any event, each in one call.
 
-    What it does is what `Episode.step` does with a recorder, SUMO and the oracles that come with crashhunt, in the same
-    order. As soon as anything happens it does no more.
+    A step does the same as `Episode.step` does with a recorder, SUMO and crashhunt's own oracles, in the same order.
+    After the first event it takes no more steps.
     """
 
     answer: object
-    """What the agent answered last; handed over, and not there afterwards."""
+    """The last answer of the agent; reading it removes it."""
     step: int
     """The number of the step that is complete."""
     simulating: bool
-    """Whether the last call had come as far as the simulator; else the agent was asked."""
+    """Whether the last call reached the simulator; otherwise it stopped at the agent."""
 
     def take(self, agents: Mapping[str, object], /) -> int:
-        """Take a step; return what has come of it, such as `DONE`. Whatever agent and simulator raise is raised."""
+        """Take a step; return its result, such as `DONE`. Exceptions of agent and simulator pass through."""
 
     def note(self, action: object, /) -> bool:
-        """Record an action after `ANSWERED`; return whether that could be done."""
+        """Record an action after `ANSWERED`; return whether that was possible."""
 
     def go_on(self, quiet: bool, /) -> int:
-        """Simulate after `ANSWERED`, and look where nothing has happened yet; return what has come of it."""
+        """Simulate after `ANSWERED`, and read the scene if there was no event; return the result."""
 
     def heed(self, limits: dict[str, float], limit: float, stood: dict[str, int], standstill: int, /) -> None:
-        """Take what is counted besides: of hard braking (m/s², 0 for each vehicle's own), of standing (steps)."""
+        """Set the limits of events: hard braking (m/s², 0 for each vehicle's own), standing (steps)."""
 
     def listen(
         self,
@@ -101,22 +107,22 @@ class UsualSteps(Protocol):
         record_roster: Callable[[], object],
         /,
     ) -> None:
-        """Take who is called where others than before are in sight.
+        """Set the callbacks for a change of the visible vehicles.
 
         Args:
-            enter: with their ids; returns who they are, as `resume` takes it, or None where that is not all about them.
-            record_roster: when they are recorded: then it borrows anew.
+            enter: receives their ids, and returns the vehicles as `resume` takes them, or None for an incomplete scene.
+            record_roster: called when they are recorded; it borrows a buffer again.
         """
 
     def judge(self, overlaps: bool, hardest: float, always: bool, last: int, now_and_then: int, /) -> None:
-        """Take when somebody has to be asked about a step.
+        """Set the conditions under which oracles evaluate a step.
 
         Args:
-            overlaps: where the oracle of this name may find something.
-            hardest: what nobody has braked with more, in m/s².
-            always: about each step.
-            last: and about all from this one on.
-            now_and_then: and about each so many.
+            overlaps: whether the oracle ``overlap`` may find a contact.
+            hardest: upper bound of braking, in m/s².
+            always: every step.
+            last: and all steps from this one on.
+            now_and_then: and one of so many steps.
         """
 
     def resume(
@@ -131,16 +137,16 @@ class UsualSteps(Protocol):
         step: int,
         /,
     ) -> None:
-        """Go on from a step that is complete.
+        """Resume after a complete step.
 
         Args:
-            who: the vehicles of its scene, their ids, the row of the agent, who is controlled.
-            observation: what the agent is shown next.
+            who: the vehicles of its scene, their ids, the row of the agent, the controlled vehicles.
+            observation: the next observation of the agent.
             columns: of the scene.
             time_s: of the scene.
-            lanes: of everybody in it, a line each, or nothing.
+            lanes: of all vehicles in it, one per line, or an empty text.
             where: the agent's edge, the number of its lane, the name of that, how far from the left this is (m).
-            follower: who is behind the agent.
+            follower: the vehicle behind the agent.
             step: its number.
         """
 
@@ -151,10 +157,10 @@ class UsualSteps(Protocol):
         """Record no more; return where the records end, which step is complete, where the numbers of each begin."""
 
     def pause(self) -> None:
-        """Take no steps until `resume`, and tell nothing: somebody else takes one."""
+        """Take no steps and report nothing until `resume`, while other code takes a step."""
 
     def stop(self) -> None:
-        """Take no further steps; what has been done is still told."""
+        """Take no further steps; complete steps are still reported."""
 
     def told(
         self,
@@ -173,7 +179,7 @@ _UsualSteps = UsualSteps
 
 
 class Core(Protocol):
-    """The compiled module. A function that cannot do what the Python beside its use does returns None."""
+    """The compiled module. A function returns None where only the equivalent Python code can do the work."""
 
     INTERFACE: int
 
@@ -228,8 +234,8 @@ class Core(Protocol):
         """Return the ids of all vehicles near some, and where these are; None where libsumo refuses.
 
         Args:
-            controlled: those that are not there are left out.
-            squared: the distance below which somebody is near, squared, in m².
+            controlled: the centres; absent vehicles are ignored.
+            squared: the distance below which a vehicle is near, squared, in m².
         """
 
     def observe(
@@ -245,9 +251,9 @@ class Core(Protocol):
         Args:
             columns: of a scene.
             earlier: of the same actors, in the scene before.
-            row: whom they may touch.
+            row: the actor that they may touch.
             step_s: the time between the two, in s.
-            hardest: what nobody has braked with more, in m/s².
+            hardest: upper bound of braking, in m/s².
         """
 
     def may_be_near(
@@ -262,11 +268,11 @@ class Core(Protocol):
             parts: of an episode, in order.
             gap: what is further apart does not count, in m.
             horizon: what touches later does not count, in s.
-            gap_so_far: who is further apart may be left out, in m.
-            time_so_far: who touches later may be left out, in s,
+            gap_so_far: pairs further apart may be skipped, in m.
+            time_so_far: pairs that touch later may be skipped, in s,
             braking_so_far: if that takes less braking than this as well, in m/s².
-            only_best: whether whoever is further away, touches later and takes less braking than others may be left
-                out too.
+            only_best: whether a pair may be skipped that is further apart, touches later and needs less braking
+                than another pair.
 
         Returns:
             Columns one after another, float64 and int64: x, y, heading, speed, half the length, half the width; the
@@ -282,8 +288,8 @@ class Core(Protocol):
             parts: of an episode, in order.
             every: of how many scenes one is looked at.
             within: how near, between fronts and without the lengths of both, in m.
-            ahead: where it is not 0, those are left out who do not touch the way of the agent up to here, in m,
-            behind: nor back to here, in m.
+            ahead: if it is not 0, actors off the agent's way up to this distance are skipped, in m,
+            behind: the same backwards, in m.
             unknown: how far straight on its way is taken to go at its end, in m.
 
         Returns:
@@ -293,7 +299,7 @@ class Core(Protocol):
         """
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
-        """Return the least change of speed (m/s) between two scenes; 0 where nobody is there."""
+        """Return the least change of speed (m/s) between two scenes; 0 in an empty scene."""
 
     def write_step(
         self, buffer: object, offset: int, tag: int, step: int, time_s: float, rewards: tuple[float, ...],

@@ -100,5 +100,5 @@ def _interface() -> int:
     """Return the interface of the library that is installed; 0 where it has none."""
     try:
         return int(ctypes.CDLL(str(_installed())).crashhunt_link_order_interface())
-    except (OSError, AttributeError):  # a damaged file, or a library of somebody else
+    except (OSError, AttributeError):  # a damaged file, or a foreign library
         return 0

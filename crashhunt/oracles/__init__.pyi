@@ -7,12 +7,7 @@ from ._choice import (
     outcomes_brought as outcomes_brought,
     parse_oracle as parse_oracle,
 )
-from ._crashes import (
-    HARDEST as HARDEST,
-    OffRoad as OffRoad,
-    Overlap as Overlap,
-    ReportedCollision as ReportedCollision,
-)
+from ._crashes import HARDEST as HARDEST, OffRoad as OffRoad, Overlap as Overlap, ReportedCollision as ReportedCollision
 from ._protocol import (
     BringsOutcomes as BringsOutcomes,
     Finding as Finding,
@@ -20,11 +15,11 @@ from ._protocol import (
     SeesMap as SeesMap,
     merge_findings as merge_findings,
 )
-from ._too_close import TooClose as TooClose
-from ._traffic_events import (
+from ._traffic import (
     OffRoute as OffRoute,
     RedLight as RedLight,
     Teleport as Teleport,
+    TooClose as TooClose,
     TrafficEvents as TrafficEvents,
     WrongWay as WrongWay,
 )

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from crashhunt.base.blame import blamed
 from crashhunt.base.errors import ArgumentError, CrashhuntError, UsageError
+from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate
 from crashhunt.oracles._protocol import BringsOutcomes
 from crashhunt.trial import Constant, Outcome, parse_spec, signature_of
@@ -38,12 +38,12 @@ _CHOICE = re.compile(r"(?P<name>.+?)(?::(?P<arguments>[A-Za-z_]\w*=.*))?")
 
 @dataclass(frozen=True, slots=True)
 class OracleChoice:
-    """Which oracle, and what it is given.
+    """An oracle with its arguments.
 
     Args:
         name: of a registered one, or ``module:attribute``.
         arguments: by name.
-        factory: what the name stands for; every trial makes an oracle, and to look a name up takes milliseconds.
+        factory: the object of that name, kept because each trial makes an oracle and a lookup takes milliseconds.
     """
 
     name: str
@@ -63,7 +63,7 @@ class OracleChoice:
                     Outcome.own(name, category)
         except CrashhuntError:
             raise
-        except Exception as error:  # somebody's own
+        except Exception as error:  # of user code
             fix = "mend it, or what it is given"
             raise blamed(f"the oracle {self.name!r} cannot be made", error, fix=fix) from error
         return made
@@ -119,18 +119,18 @@ def parse_oracle(text: str) -> OracleChoice:
 
 
 def chosen_oracles(asked: Sequence[str]) -> tuple[str, ...]:
-    """Return who looks at a hunt, in the order in which they are asked: the default ones, then those that are chosen.
+    """Return the oracles of a hunt in the order of their checks: the default ones, then the chosen ones.
 
     Args:
         asked: what ``--oracle`` was given, as often as it was; ``none`` drops the default ones.
 
     Raises:
-        CrashhuntError: one of them cannot be had, or nobody is left.
+        CrashhuntError: an oracle cannot be made, or none is chosen.
     """
     added = [text for text in asked if text != _NONE]
     found = tuple(dict.fromkeys([*(() if _NONE in asked else DEFAULT_ORACLES), *added]))
     if not found:
-        raise UsageError("--oracle none leaves nobody to look for crashes", fix="choose another one as well")
+        raise UsageError("--oracle none leaves no oracle to detect crashes", fix="add another --oracle")
     for text in added:
         parse_oracle(text).make()
     return found

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 __all__ = ["HARDEST", "OffRoad", "Overlap", "ReportedCollision"]
 
 HARDEST = 10.0
-"""In m/s²; nobody has been faster in the previous scene than this explains."""
+"""Upper bound of braking, in m/s²: it bounds the speed of an actor in the previous scene."""
 
 
 class ReportedCollision:
     """Believes the simulator's own list of collisions, where a controlled vehicle takes part.
 
-    Who drove into whom, and when, is decided by the outlines, where these say so: after a long step the simulator may
-    have the two in the wrong order.
+    Outlines decide the collider and the time, where they overlap. After a long step the simulator may report the
+    two vehicles in the wrong order.
     """
 
     name = "reported"
@@ -67,8 +67,8 @@ class ReportedCollision:
 class Overlap:
     """Sees a collision where the outlines of a controlled vehicle and another actor overlap, or did within the step.
 
-    Simulators miss some: SUMO compares vehicles of one lane only. Whoever has the other in front of it when they first
-    touch is the collider.
+    Simulators miss some: SUMO compares vehicles of one lane only. The collider is the vehicle that
+    has the other in front of it at the first touch.
     """
 
     name = "overlap"
@@ -112,7 +112,7 @@ class OffRoad:
 
 
 def _within_reach(scene: Scene, previous: Scene | None, row: int) -> list[int]:
-    """Everybody who may touch an actor, or have touched it since the previous scene; nearest first, usually nobody.
+    """Return the rows of actors that may have touched an actor since the previous scene, nearest first; mostly none.
 
     Who is further away than the two have got relative to each other has not been there. This looks at every vehicle
     nearby in every step, and so spares what it can.

@@ -32,10 +32,10 @@ class Finding:
 class Oracle(Protocol):
     """Looks at scenes and says when one is a crash. It draws no random numbers and keeps no clock.
 
-    Contract: it is made anew for every trial, with the arguments that ``--oracle NAME:key=value`` gives, so what it
-    remembers is of this trial only. `check` is called once a step, in order, with the scene before the first step too;
-    ``scene.previous`` is the scene one step before, None at the start. What it finds ends the trial where
-    ``--crash-on`` has the outcome, and is forgotten otherwise. What it raises is a fault of the oracle.
+    Contract: a new oracle is made for every trial, with the arguments of ``--oracle NAME:key=value``. Its state
+    therefore belongs to this trial only. `check` is called once a step, in order, also with the
+    scene before the first step. ``scene.previous`` is the scene one step before, None at the start. A finding ends the
+    trial if ``--crash-on`` has its outcome, and is discarded otherwise. An exception counts as a fault of the oracle.
     """
 
     name: str
@@ -55,7 +55,7 @@ class SeesMap(Protocol):
 
 @runtime_checkable
 class BringsOutcomes(Protocol):
-    """Offered by an oracle whose findings have outcomes of its own, or are no crash unless somebody asks for them."""
+    """Implemented by oracles with outcomes of their own, or with findings that are crashes only on request."""
 
     outcomes: Mapping[str, Category]
     """Name to ``traffic crash`` or ``traffic event``. A hunt that chooses the oracle stops on them, unless

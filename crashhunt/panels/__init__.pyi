@@ -1,5 +1,4 @@
-from ._draw import FAINT as FAINT, INK as INK, as_array as as_array, font as font
-from ._nest import labelled as labelled, scope as scope
+from ._painting import FAINT as FAINT, INK as INK, as_array as as_array, font as font
 from ._panels import (
     Action as Action,
     ActionDistribution as ActionDistribution,
@@ -11,4 +10,6 @@ from ._panels import (
     Panel as Panel,
     Picture as Picture,
     Text as Text,
+    labelled as labelled,
+    scope as scope,
 )

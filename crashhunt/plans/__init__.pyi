@@ -1,12 +1,4 @@
-from ._declaration import Given as Given, HuntOption as HuntOption
-from ._duration import seconds_of as seconds_of
-from ._executor import SizesItself as SizesItself, executor_of as executor_of, parallel_here as parallel_here
-from ._load_order import (
-    FIXED as FIXED,
-    load_order_change as load_order_change,
-    load_order_of as load_order_of,
-    with_recorded_load_order as with_recorded_load_order,
-)
+from ._declaration import Given as Given, HuntOption as HuntOption, seconds_of as seconds_of
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,
@@ -16,20 +8,30 @@ from ._options import (
     hunt_options as hunt_options,
 )
 from ._plan import (
+    FIXED as FIXED,
+    Owners as Owners,
+    Takes as Takes,
+    agent_of as agent_of,
     core_of as core_of,
     disturber as disturber,
+    load_order_change as load_order_change,
+    load_order_of as load_order_of,
     parse_crash_on as parse_crash_on,
     plan as plan,
     sampler_of as sampler_of,
+    takes_of as takes_of,
+    with_recorded_load_order as with_recorded_load_order,
     with_settings as with_settings,
 )
 from ._request import (
     Request as Request,
+    SizesItself as SizesItself,
+    executor_of as executor_of,
     fields_of as fields_of,
+    parallel_here as parallel_here,
     request_of as request_of,
     spec_words as spec_words,
 )
-from ._scope import Owners as Owners, Takes as Takes, takes_of as takes_of
 from ._settings import (
     AgentSettings as AgentSettings,
     ArgumentSpec as ArgumentSpec,

@@ -17,8 +17,17 @@ from pathlib import Path
 from typing import Self
 
 from crashhunt.base.errors import UsageError
-from crashhunt.plans._declaration import HuntOption, above_zero, at_least, declared, declared_options, option, within
-from crashhunt.plans._duration import check_duration, check_probe
+from crashhunt.plans._declaration import (
+    HuntOption,
+    above_zero,
+    at_least,
+    check_duration,
+    check_probe,
+    declared,
+    declared_options,
+    option,
+    within,
+)
 from crashhunt.trial import CRASHES
 
 __all__ = [

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import secrets
+import subprocess
 import sys
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ArgumentError, CrashhuntError, ScenarioError, UsageError
-from crashhunt.base.names import one_of
-from crashhunt.base.plugins import locate
+from crashhunt.base.plugins import locate, registered
+from crashhunt.base.text import did_you_mean, listed, one_of
 from crashhunt.disturbances import disturber_of, parse_fixed, parse_rates, word_of
 from crashhunt.oracles import chosen_oracles, outcomes_brought
-from crashhunt.plans._load_order import FIXED, load_order_of
 from crashhunt.plans._options import TrialOptions
 from crashhunt.plans._request import fields_of, sized
-from crashhunt.plans._scope import Owners, Takes, agent_of
 from crashhunt.plans._settings import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import HuntFacts, NamedSampler, varies_only_asked
 from crashhunt.scenario import Scenario, backend_of, load_scenario, scenario_digest, titles, with_action
@@ -25,15 +27,227 @@ from crashhunt.trial import CRASHES, EVENTS, Argument, Constant, Outcome, parse_
 from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-    from crashhunt.disturbances import Disturber
+    from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.plans._request import Request
     from crashhunt.trial import Signature
 
     Surveyor = Callable[[Scenario, Request, HuntSettings], Scenario]
 
-__all__ = ["disturber", "parse_crash_on", "plan", "sampler_of", "with_settings"]
+
+__all__ = [
+    "FIXED",
+    "Owners",
+    "Takes",
+    "agent_of",
+    "disturber",
+    "load_order_change",
+    "load_order_of",
+    "parse_crash_on",
+    "plan",
+    "sampler_of",
+    "takes_of",
+    "with_recorded_load_order",
+    "with_settings",
+]
+
+
+# The order in which a simulator processes a scenario at load: whether it is fixed, and as it was for a recorded crash.
+#
+# ``environment.json`` of a snapshot holds it (``load_order``). Snapshots of earlier versions lack it: it was not fixed.
+
+FIXED = "fixed"
+
+
+def load_order_of(scenario: Scenario) -> str | None:
+    """Return ``fixed`` or ``not fixed: REASON``; None where the simulator's results do not depend on an order."""
+    order = scenario.backend.load_order
+    if order is None:
+        return None
+    why_not = order.why_not(scenario)
+    return f"not fixed: {why_not}" if why_not else FIXED
+
+
+def with_recorded_load_order(scenario: Scenario, recorded: str | None) -> Scenario:
+    """Return the scenario with the load order of a recorded crash: fixed, or the simulator's own.
+
+    Args:
+        scenario: what is run again.
+        recorded: ``load_order`` of the snapshot; None where it has none.
+    """
+    order = scenario.backend.load_order
+    return scenario if order is None or recorded == FIXED else order.keep(scenario)
+
+
+def load_order_change(scenario: Scenario, recorded: str | None) -> str:
+    """Return how the load order here differs from the recorded one, as a clause; empty where it does not.
+
+    An order that was not fixed is kept by `with_recorded_load_order`, so only a fixed one can be missing here.
+
+    Args:
+        scenario: what is run again.
+        recorded: ``load_order`` of the snapshot; None where it has none.
+    """
+    order, now = scenario.backend.load_order, load_order_of(scenario)
+    if order is None or recorded != FIXED or now == FIXED:
+        return ""
+    return f"the order of {order.what} was fixed and is {now}"
+
+
+# ``NAME`` and ``AGENT.NAME``: whose argument is meant, the same wherever somebody may write one.
+
+SCENARIO = "scenario"  # before a name that is the scenario's, where an agent has it too
+_ASK_S = 60.0
+# Whatever the module prints when it is imported is not the answer. No crashhunt is needed: it may be an older one.
+_ASK = """
+import importlib, inspect, json, os, sys
+answer = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+module, _, attribute = sys.argv[1].partition(":")
+found = importlib.import_module(module)
+for part in attribute.split("."):
+    found = getattr(found, part)
+try:
+    parameters = inspect.signature(found).parameters.values()
+except (TypeError, ValueError):
+    names, is_open = [], True
+else:
+    given = ("observation_space", "action_space", "step_length_s")
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    names = [known.name for known in parameters if known.kind in kinds and known.name not in given]
+    is_open = any(known.kind is known.VAR_KEYWORD for known in parameters)
+json.dump([names, is_open], answer)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Takes:
+    """Which arguments an agent takes.
+
+    Args:
+        names: of those that it declares.
+        open: whether it takes any other as well (``**kwargs``).
+    """
+
+    names: Collection[str] = ()
+    open: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Owners:
+    """Who has which arguments.
+
+    ``AGENT.NAME`` is that agent's, and ``scenario.NAME`` the scenario's. A bare ``NAME`` is whose it is where that is
+    one only: of the agents that declare it and the scenario, or else of the agents that take any. Where there are
+    several, it is nobody's.
+
+    Args:
+        agents: what each takes.
+        scenario: the names of the scenario's.
+    """
+
+    agents: Mapping[str, Takes]
+    scenario: Collection[str] = field(default=())
+
+    def of(self, word: str, *, option: str) -> tuple[str, str] | None:
+        """Return the agent (empty for the scenario) and the name that are meant; None where nobody has it.
+
+        Args:
+            word: as it was written.
+            option: in which, for the error.
+
+        Raises:
+            ArgumentError: several have it.
+        """
+        agent = agent_of(word, self.agents)
+        if agent:
+            name = word.removeprefix(f"{agent}.")
+            takes = self.agents[agent]
+            return (agent, name) if name in takes.names or takes.open else None
+        bare = word.removeprefix(f"{SCENARIO}.") if SCENARIO not in self.agents else word
+        if bare != word or (word in self.scenario and not self._declaring(word)):
+            return ("", bare) if bare in self.scenario else None
+        takers = self._declaring(word) if word in self.scenario else self._taking(word)
+        several = [*takers, *([SCENARIO] if word in self.scenario else [])]
+        if len(several) > 1:
+            who = "several agents take it" if SCENARIO not in several else f"{' and '.join(several)} have it"
+            fix = " or ".join(f"{option} {owner}.{word}=…" for owner in several)
+            raise ArgumentError(f"{option} {word}: {who}", fix=f"write {fix}")
+        return (takers[0], word) if takers else None
+
+    def of_record(self, word: str, ask: Callable[[str], Takes] | None, *, option: str) -> tuple[str, str] | None:
+        """Return the same where these are of a record, which lacks arguments that have no plain default.
+
+        Args:
+            word: as it was written.
+            ask: returns what an agent takes by its code, which is asked only where the record does not know; None where
+                that code may not run.
+            option: in which the word was, for the error.
+
+        Raises:
+            ArgumentError: several have it.
+        """
+        owner = self.of(word, option=option)
+        if owner is not None or ask is None or word.startswith(f"{SCENARIO}."):
+            return owner
+        agent = agent_of(word, self.agents)
+        agents = dict(self.agents)
+        for name in [agent] if agent else self.agents:
+            asked = ask(name)
+            agents[name] = Takes((*agents[name].names, *asked.names), asked.open)
+        return Owners(agents, self.scenario).of(word, option=option)
+
+    def unknown(self, word: str, *, option: str, whose: str) -> ArgumentError:
+        """Return the error for a name that nobody has, with what was probably meant."""
+        bare = {name: name for name in self.scenario}
+        bare |= {f"{agent}.{name}": name for agent, takes in self.agents.items() for name in takes.names}
+        near = (f"did you mean {whole!r}?" for whole, part in bare.items() if did_you_mean(word, [part]))
+        hint = did_you_mean(word, bare) or next(near, "")
+        return ArgumentError(
+            f"{option}: {whose} has no argument {word!r}", fix=f"{hint} it has {listed(bare)}".lstrip()
+        )
+
+    def _declaring(self, name: str) -> list[str]:
+        return [agent for agent, takes in self.agents.items() if name in takes.names]
+
+    def _taking(self, name: str) -> list[str]:
+        return [agent for agent, takes in self.agents.items() if name in takes.names or takes.open]
+
+
+def agent_of(word: str, agents: Collection[str]) -> str:
+    """Return the agent whose id a word begins with, and a dot; empty where it is a bare name.
+
+    Ids may have dots themselves, and one may be the beginning of another: the longest is meant.
+    """
+    return next((agent for agent in sorted(agents, key=len, reverse=True) if word.startswith(f"{agent}.")), "")
+
+
+def takes_of(locator: str, code: Sequence[str] = (), folder: Path | None = None) -> Takes:
+    """Ask the code of an agent what it takes, in a process of its own, as that code may be of a snapshot.
+
+    Args:
+        locator: of the agent.
+        code: folders whose modules win over installed ones.
+        folder: from where it is imported otherwise; by default the current one.
+
+    Returns:
+        What it takes; anything, where it cannot be asked, as whoever runs it will say why.
+    """
+    points = registered("agents")
+    target = points[locator].value if locator in points else locator
+    home = str(folder or Path.cwd())
+    paths = os.pathsep.join(filter(None, (*code, home, os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", _ASK, target], env=environment, cwd=home, stdin=subprocess.DEVNULL,
+            capture_output=True, timeout=_ASK_S, check=True,
+        )  # fmt: skip
+        names, is_open = json.loads(done.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return Takes(open=True)
+    return Takes(tuple(names), bool(is_open))
 
 
 def plan(request: Request, *, survey: Surveyor | None = None) -> tuple[Scenario, HuntSettings]:
@@ -147,7 +361,7 @@ def _acting(scenario: Scenario, actions: Mapping[str, str]) -> Scenario:
     return scenario
 
 
-def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str]) -> Disturber | None:
+def disturber(scenario: Scenario, disturb: Sequence[str], agents: Sequence[str]) -> DisturbanceSampler | None:
     """Return what draws the disturbances of trials; None where there are none.
 
     Args:

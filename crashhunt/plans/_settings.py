@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
-from crashhunt.base.names import near_path
+from crashhunt.base.text import near_path
 from crashhunt.base.tolerance import known_part, merged, slip
 from crashhunt.oracles import DEFAULT_ORACLES
-from crashhunt.plans._duration import seconds_of
+from crashhunt.plans._declaration import seconds_of
 from crashhunt.plans._options import RunOptions, TrialOptions
 from crashhunt.trial import CRASHES, Distribution, Kind, Outcome, parse_spec
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import Plain
+    from crashhunt.base.json_types import Plain
     from crashhunt.samplers import Space
 
 __all__ = ["AgentSettings", "ArgumentSpec", "HuntSettings", "RunSettings", "read_settings", "write_settings"]

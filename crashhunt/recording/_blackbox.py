@@ -11,6 +11,7 @@ no record: it belongs neither to the digest nor to the log.
 
 from __future__ import annotations
 
+import hashlib
 import mmap
 import os
 import struct
@@ -24,8 +25,9 @@ import numpy as np
 
 from crashhunt.base.errors import DISK, BundleError, RecorderError
 from crashhunt.base.forks import MEMORY
-from crashhunt.recording._digest import is_evidence
-from crashhunt.recording.records import action, lanes, notes, observation, prologue, step as steps
+from crashhunt.recording.records._agents import ACTION, OBSERVATION, PROLOGUE
+from crashhunt.recording.records._events import NOTES
+from crashhunt.recording.records._scene import LANES, STEP
 from crashhunt.world import joined_frame
 
 if TYPE_CHECKING:
@@ -37,9 +39,11 @@ if TYPE_CHECKING:
     from crashhunt.native import Core, UsualSteps
     from crashhunt.world import Frame, Roster, Scene
 
+
 __all__ = [
     "CHUNK",
     "FIRST",
+    "FIRST_ASIDE",
     "HEADER",
     "MAGIC",
     "MAPPED",
@@ -48,15 +52,39 @@ __all__ = [
     "REPORT_OFFSET",
     "UNREPORTABLE",
     "BlackBox",
+    "BlackBoxFile",
     "BlackBoxHeader",
     "Phase",
     "Record",
     "cannot_record",
     "decode_header",
+    "digest_of",
+    "is_evidence",
     "read_black_box",
     "read_header",
     "readable_bytes",
 ]
+
+
+# The digest of a trial: what belongs to it, and how it is computed.
+
+FIRST_ASIDE = 128
+"""Tags from here on are of records that are no evidence: whoever does not know a type knows what the digest is of."""
+_NOTES = 11  # the only type of the first eleven that is no evidence, from before there was that rule
+
+
+def is_evidence(tag: int) -> bool:
+    """Whether records with this tag belong to the digest of the trial."""
+    return tag < FIRST_ASIDE and tag != _NOTES
+
+
+def digest_of(*records: bytes | memoryview) -> str:
+    """Return the trace digest of encoded records: BLAKE2b of 16 bytes, in hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    for part in records:
+        digest.update(part)
+    return digest.hexdigest()
+
 
 MAGIC = b"CRASHBB1"
 HEADER = struct.Struct("<8sIIQdQqiI")  # magic, pid, set-up, trial, started, committed, step, phase, agent
@@ -74,7 +102,10 @@ MAPPED = 64 << 20  # bytes of addresses, not of memory: mapping again moves ever
 
 
 class Phase(IntEnum):
-    """What the process was doing."""
+    """What the process was doing.
+
+    ``ACT`` before the scene of step 0 means that the agent is being made.
+    """
 
     SETUP = 0
     ACT = 1
@@ -83,8 +114,8 @@ class Phase(IntEnum):
 
 
 # Attributes of modules, and members of an enum, are looked up at every use; these are used in every step.
-_STEP, _OBSERVATION, _ACTION = steps.TYPE.tag, observation.TYPE.tag, action.TYPE.tag
-_LENT = _OBSERVATION, _ACTION, _STEP, lanes.TYPE.tag  # what somebody else records
+_STEP, _OBSERVATION, _ACTION = STEP.tag, OBSERVATION.tag, ACTION.tag
+_LENT = _OBSERVATION, _ACTION, _STEP, LANES.tag  # what somebody else records
 _ACT, _SIMULATE = int(Phase.ACT), int(Phase.SIMULATE)
 
 
@@ -171,7 +202,7 @@ class BlackBox:
         """Record what the trial consists of; ``agents`` is how many rewards each step has."""
         self._agents = agents
         self._steps = {}
-        self.append(prologue.TYPE.tag, 0, payload)
+        self.append(PROLOGUE.tag, 0, payload)
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
         """Record something rare, of any type."""
@@ -206,7 +237,7 @@ class BlackBox:
 
     def note(self, payload: bytes) -> None:
         """Record what is no part of the digest."""
-        self.append(notes.TYPE.tag, 0, payload)
+        self.append(NOTES.tag, 0, payload)
 
     def observation(self, agent: int, array: NDArray[np.generic]) -> None:
         """Record what an agent is about to be shown."""
@@ -434,3 +465,117 @@ def decode_records(data: bytes | memoryview) -> Iterator[Record]:
             return
         yield Record(tag, aux, bytes(data[start : start + length]))
         offset = start + length + (-length % 8)
+
+
+# A black box as a file: what the process sees of it that supervises a trial, and does not run it.
+
+
+class BlackBoxFile:
+    """The file of a black box, for a process that neither runs nor trusts the trial that writes it.
+
+    It never maps the file: where the trial truncates it, reading a mapped page would kill this process as well.
+
+    Args:
+        path: the file to create.
+
+    Raises:
+        RecorderError: the disk is full.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._reserved = 0
+        try:
+            self.require_room()
+            os.ftruncate(self._file, MAPPED)
+        except BaseException:
+            os.close(self._file)
+            raise
+
+    @property
+    def reserved(self) -> int:
+        """How many bytes of the file have space on the disk."""
+        return self._reserved
+
+    @property
+    def identity(self) -> os.stat_result:
+        """What the file system says of the file."""
+        return os.fstat(self._file)
+
+    def require_room(self) -> None:
+        """Reserve some more of the disk.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
+        try:
+            _write_all(self._file, bytes(CHUNK), self._reserved)
+        except OSError as error:
+            if error.errno in DISK:
+                raise cannot_record(error, self._path) from error
+            raise
+        self._reserved += CHUNK
+
+    def begin(self, *, trial: int, started: float) -> None:
+        """Forget the previous trial and open the next; its process writes its own number at its start."""
+        header = HEADER.pack(MAGIC, os.getpid(), 0, trial, started, FIRST, 0, Phase.SETUP, 0)
+        os.pwrite(self._file, header + REPORT.pack(0), 0)
+
+    def header(self) -> BlackBoxHeader | None:
+        """Return the header; None where it is damaged."""
+        return decode_header(os.pread(self._file, HEADER.size, 0))
+
+    def has(self, header: BlackBoxHeader) -> bool:
+        """Whether the file can have as many records as its header claims."""
+        return FIRST <= header.committed <= readable_bytes(os.fstat(self._file))
+
+    def read_records(self, header: BlackBoxHeader) -> bytes:
+        """Return the bytes of all committed records, or fewer where the file ends before."""
+        return self._read(FIRST, max(0, header.committed - FIRST))
+
+    def read_report(self, header: BlackBoxHeader) -> bytes | None:
+        """Return the report; empty where there is none, None where the process announced that it cannot report."""
+        size = self._announced()
+        if size == UNREPORTABLE:
+            return None
+        return b"" if size == NO_ROOM else self._read(header.committed, size)
+
+    @property
+    def had_no_room(self) -> bool:
+        """Whether the process announced that the disk had no room for the recording."""
+        return self._announced() == NO_ROOM
+
+    def _announced(self) -> int:
+        found = os.pread(self._file, REPORT.size, REPORT_OFFSET).ljust(REPORT.size, b"\0")
+        size: int = REPORT.unpack(found)[0]
+        return size
+
+    def copy_to(self, path: Path) -> None:
+        """Write the content to another file, up to the end of the records and the report."""
+        header = self.header()
+        content = self._read(0, self._reserved if header is None else max(FIRST, header.committed))
+        path.write_bytes(content)
+
+    def is_reusable(self) -> bool:
+        """Whether the next trial can be recorded here: the file still has its size. Notes how much of it there is."""
+        found = os.fstat(self._file)
+        self._reserved = max(self._reserved, min(found.st_blocks * 512 // CHUNK * CHUNK, found.st_size))
+        return found.st_size >= MAPPED
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _read(self, offset: int, size: int) -> bytes:
+        found, end = bytearray(), min(offset + size, readable_bytes(os.fstat(self._file)))
+        while offset < end and (data := os.pread(self._file, end - offset, offset)):
+            found += data
+            offset += len(data)
+        return bytes(found)
+
+
+def _write_all(file: int, data: bytes, offset: int) -> None:
+    while data:
+        written = os.pwrite(file, data, offset)
+        data, offset = data[written:], offset + written

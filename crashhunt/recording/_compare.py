@@ -9,8 +9,8 @@ from crashhunt.recording.records import RECORD_TYPES
 
 if TYPE_CHECKING:
     from crashhunt.recording._recording import Recording
+    from crashhunt.recording.records._agents import AgentChannel
     from crashhunt.recording.records._type import Difference
-    from crashhunt.recording.records.prologue import AgentChannel
 
 __all__ = ["first_divergence", "values_around"]
 

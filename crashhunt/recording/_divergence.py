@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from crashhunt.base.plain import Json
+    from crashhunt.base.json_types import Json
 
 __all__ = ["Divergence", "DivergenceData", "first_difference"]
 

@@ -19,8 +19,7 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 
 from crashhunt.base.errors import BundleError
-from crashhunt.recording._schemas import MESSAGES
-from crashhunt.recording._writer import LogWriter, to_ns
+from crashhunt.recording._mcap import MESSAGES, LogWriter, to_ns
 from crashhunt.world import approaches, is_person, levels, outlines
 
 if TYPE_CHECKING:

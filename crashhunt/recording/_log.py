@@ -20,12 +20,12 @@ from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
 from crashhunt.recording._blackbox import Record
 from crashhunt.recording._foxglove import write_views
+from crashhunt.recording._mcap import MESSAGES, NAMESPACE, LogWriter, to_ns
 from crashhunt.recording._recording import Recording
-from crashhunt.recording._schemas import MESSAGES, NAMESPACE
-from crashhunt.recording._writer import LogWriter, to_ns
-from crashhunt.recording.records import RECORD_TYPES, step
+from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._agents import Prologue
+from crashhunt.recording.records._scene import STEP, time_of
 from crashhunt.recording.records._type import BytesForm, TextForm
-from crashhunt.recording.records.prologue import Prologue
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -148,8 +148,8 @@ def _write_evidence(log: LogWriter, recording: Recording) -> None:
         channel = channels.get((tag, aux))
         if channel is None:
             channel = channels[tag, aux] = _channel(tag, aux, prologue)
-        if tag == step.TYPE.tag:
-            time_ns = to_ns(step.time_of(payload))
+        if tag == STEP.tag:
+            time_ns = to_ns(time_of(payload))
         name, fields = channel.form.to_message(payload, prologue, aux)
         kind = MESSAGES[name]
         metadata = None if tag <= _KNOWN_BY_TOPIC else {"tag": str(tag), "aux": str(aux)}

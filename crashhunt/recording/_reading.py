@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from crashhunt.recording.records.prologue import Prologue
+    from crashhunt.recording.records._agents import Prologue
     from crashhunt.world import Actor, Contact, Event, Scene, Spine
 
 __all__ = ["Reading", "SceneParts", "StepRecord"]

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.base.errors import BundleError
-from crashhunt.base.names import one_of
-from crashhunt.recording._digest import digest_of, is_evidence
+from crashhunt.base.text import one_of
+from crashhunt.recording._blackbox import digest_of, is_evidence
 from crashhunt.recording._reading import Reading
-from crashhunt.recording.records import RECORD_TYPES, prologue
+from crashhunt.recording.records import RECORD_TYPES
+from crashhunt.recording.records._agents import PROLOGUE, Prologue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from crashhunt.recording._blackbox import Record
     from crashhunt.recording._reading import StepRecord
-    from crashhunt.recording.records.prologue import AgentChannel, Prologue
+    from crashhunt.recording.records._agents import AgentChannel
     from crashhunt.trial import Disturbance
     from crashhunt.world import Actor, Scene
 
@@ -39,7 +40,7 @@ class Recording:
 
     def __init__(self, records: Iterable[Record]) -> None:
         self.records = tuple(records)
-        if not self.records or self.records[0].tag != prologue.TYPE.tag:
+        if not self.records or self.records[0].tag != PROLOGUE.tag:
             raise BundleError("the recording has no beginning", fix="it was cut short or is not a recording")
         try:
             reading = _read(self.records)
@@ -107,7 +108,7 @@ class Recording:
 
 
 def _read(records: tuple[Record, ...]) -> Reading:
-    reading = Reading(prologue.Prologue.decode(records[0].payload))
+    reading = Reading(Prologue.decode(records[0].payload))
     readers = {tag: kind.read for tag, kind in RECORD_TYPES.items()}
     for tag, aux, payload in records[1:]:
         read = readers.get(tag)

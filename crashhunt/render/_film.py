@@ -1,8 +1,10 @@
-"""Films of crashes: the scene, the panels beside it, and where they are written."""
+"""Films of crashes: the scene, the panels next to it, and the output formats."""
 
 from __future__ import annotations
 
+import json
 import math
+import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,7 @@ from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.watching import watched
 from crashhunt.crashes import Encounter
-from crashhunt.panels import Action, Curve
+from crashhunt.panels import Action, Curve, Text
 from crashhunt.render._scene import SceneView
 from crashhunt.world import approaches
 
@@ -28,17 +30,24 @@ if TYPE_CHECKING:
     from crashhunt.panels import Panel
     from crashhunt.recording import Recording
 
+
 __all__ = [
     "FilmOptions",
     "Layout",
     "Shot",
     "check_places",
+    "explanation",
     "frames",
+    "load_meanings",
+    "load_panels",
+    "save_meanings",
+    "save_panels",
     "shown_steps",
     "write_frames",
     "write_gif",
     "write_video",
 ]
+
 
 _PANEL = (240, 160)
 _PAPER = 255
@@ -56,8 +65,8 @@ class FilmOptions:
     Args:
         fps: pictures a second; as many as there are steps by default, so that it runs in real time.
         size: of the scene, in pixels.
-        last_s: only the last so many seconds, and of a near miss those around the moment when it was nearest; 0 for all
-            of a crash and 10 s of a near miss.
+        last_s: length of the film, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
+            shows all of a crash and 10 s of a near miss.
         last_step_repeats: how often the last picture is shown again.
         blank_frames: between two crashes.
         panels: whether to show panels at all.
@@ -90,11 +99,11 @@ class Shot:
     Args:
         recording: what to show.
         lanes: of its map.
-        agent: whom to follow.
+        agent: the vehicle in the centre of the picture.
         other: the one it crashed with.
         crash_step: where the crash is.
         panels: step to the agent's own panels, by label, as pictures.
-        meanings: what the numbers of its discrete actions stand for, where that is known.
+        meanings: names of its discrete actions, where they are known.
         nearest: of a near miss, the step that the film is about; -1 of a crash, whose film ends with it.
     """
 
@@ -109,7 +118,7 @@ class Shot:
 
 
 class Layout:
-    """Where panels go: beside the scene or below it, whichever makes the smaller picture; decided once.
+    """Positions of panels: next to the scene or below it, whichever makes the smaller picture; decided once.
 
     Args:
         frame: width and height of the scene.
@@ -122,11 +131,11 @@ class Layout:
         count = len(labels)
         rows = max(1, height // panel[1])
         columns = max(1, width // panel[0])
-        beside = width + math.ceil(count / rows) * panel[0], max(height, min(rows, count) * panel[1])
+        next_to = width + math.ceil(count / rows) * panel[0], max(height, min(rows, count) * panel[1])
         below = max(width, min(columns, count) * panel[0]), height + math.ceil(count / columns) * panel[1]
         self.places: dict[str, tuple[int, int]] = {}
-        if beside[0] * beside[1] <= below[0] * below[1]:
-            self.size = beside
+        if next_to[0] * next_to[1] <= below[0] * below[1]:
+            self.size = next_to
             for number, label in enumerate(labels):
                 self.places[label] = width + number // rows * panel[0], number % rows * panel[1]
         else:
@@ -371,3 +380,63 @@ def _steps(shot: Shot, options: FilmOptions) -> list[int]:
     count = math.floor((last - first) * dt * fps + 1e-6) + 1
     steps = [min(last, first + int(number / fps / dt + 1e-6)) for number in range(count)]
     return steps if steps[-1] == last else [*steps, last]
+
+
+# Drawn panels on their way from the process of the agent to the one that makes the film.
+
+_SHAPE = (160, 240, 3)  # what a panel draws unless asked for another size
+_LINE = 34  # characters that fit
+
+
+def explanation(error: Exception) -> Text:
+    """Return what stands where a panel cannot be."""
+    return Text("\n".join(textwrap.wrap(f"cannot be drawn: {type(error).__name__}: {error}", _LINE)[:9]))
+
+
+def save_panels(folder: Path, step: int, panels: Sequence[tuple[str, Panel]]) -> None:
+    """Draw and add the panels of one agent and step; one that cannot be drawn says why."""
+    from PIL import Image
+
+    with (folder / "index.jsonl").open("a", encoding="utf-8") as index:
+        for number, (label, panel) in enumerate(panels):
+            name = f"{step:06d}-{index.tell()}-{number}.png"
+            try:
+                picture = panel.draw(label=label)
+                if picture.shape != _SHAPE or picture.dtype != np.uint8:
+                    raise ValueError(f"{picture.dtype}, shape {picture.shape}, not uint8, shape {_SHAPE}")
+            except Exception as error:  # an agent may put anything into its panels
+                picture = explanation(error).draw(label=label)
+            Image.fromarray(picture).save(folder / name, compress_level=1)
+            index.write(json.dumps([step, label, name]) + "\n")
+
+
+def save_meanings(folder: Path, agent: str, meanings: Sequence[str]) -> None:
+    """Write the names of an agent's discrete actions to a file; no file where there are no names."""
+    if meanings:
+        with (folder / "meanings.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps([agent, list(map(str, meanings))]) + "\n")
+
+
+def load_meanings(folder: Path) -> dict[str, tuple[str, ...]]:
+    """Return agent to what `save_meanings` was given."""
+    try:
+        lines = (folder / "meanings.jsonl").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    return {agent: tuple(meanings) for agent, meanings in map(json.loads, lines)}
+
+
+def load_panels(folder: Path) -> dict[int, dict[str, NDArray[np.uint8]]]:
+    """Return step to label to picture, uint8, shape (height, width, 3)."""
+    from PIL import Image
+
+    found: dict[int, dict[str, NDArray[np.uint8]]] = {}
+    try:
+        lines = (folder / "index.jsonl").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return found
+    for line in lines:
+        step, label, name = json.loads(line)
+        with Image.open(folder / name) as image:
+            found.setdefault(step, {})[label] = np.asarray(image.convert("RGB"))
+    return found

@@ -36,7 +36,7 @@ class SceneView:
     Args:
         recording: of the episode.
         lanes: the right and left border of each, shape (n, 2), in m.
-        agent: whom to follow.
+        agent: the vehicle in the centre of the picture.
         other: the one it crashed with; empty for none.
         width: in pixels.
         height: in pixels.
@@ -152,12 +152,12 @@ class SceneView:
         draw.polygon(np.array(glass).ravel().tolist(), fill=dark)
 
     def _going(self, step: int) -> list[Disturbance]:
-        """The disturbances that go on, of those for which somebody was there."""
+        """Return the active disturbances that affect an actor."""
         step_length_s = self._recording.prologue.step_length_s
         return [one for one in self._recording.disturbances if one.vehicle and one.goes_on(step, step_length_s)]
 
     def _ring(self, draw: ImageDraw.ImageDraw, scene: Scene, name: str) -> None:
-        """Mark an actor that errs, or that is not seen."""
+        """Mark an actor that is disturbed, or that the agent does not see."""
         row = scene.roster.index.get(name)
         if row is None:
             return

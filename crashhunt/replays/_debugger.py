@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import builtins
+import fcntl
 import json
 import os
 import pdb
+import random
+import signal
+import stat
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict, cast, final
+from typing import TYPE_CHECKING, NoReturn, TypedDict, cast, final
 
 from crashhunt.agents import DrawsPanels
 from crashhunt.base import layout
+from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.faculties import offers
-from crashhunt.base.keeper import Kept
+from crashhunt.base.forks import threads
+from crashhunt.base.processes import die_with
+from crashhunt.base.reaper import Kept
+from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.episode import Observer, Parts, WorkerSettings, run_episode, seal
 from crashhunt.executors import snapshot_environment
 from crashhunt.panels import labelled, scope
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.render import explanation, save_meanings, save_panels
-from crashhunt.replays._backwards import Backwards, OneLine
 from crashhunt.simulators import HasMeanings, HasWindow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
@@ -35,16 +42,123 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.agents import Agent
-    from crashhunt.base.plain import ErrorData
-    from crashhunt.episode import Episode, SettingsData
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import ErrorData
+    from crashhunt.episode import Episode
     from crashhunt.replays._prepare import Rerun
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import ResultData, SpecData
     from crashhunt.world import Scene
 
-__all__ = ["Look", "debug", "main"]
+
+__all__ = ["Backwards", "Look", "OneLine", "debug", "main"]
+
+
+# Backwards in the debugger: before each of the last steps, a copy of the process waits for somebody to come back.
+#
+# The process goes on in a fork, and waits for its end; it has the terminal again when that ends to go back. So whoever
+# goes back finds everything as it was, and nothing of what came after.
+
+_MOST = 50  # steps; what has changed since is kept for each
+_BACK = 78  # exit code
+_TARGET = "back"
+
+
+class Backwards(Observer):
+    """Leaves a copy behind before each of the last steps before the debugger stops; it comes before what stops.
+
+    Args:
+        stop: what stops.
+        step: in which it does; 0 for none.
+        folder: where the copies tell each other how far to go back.
+    """
+
+    def __init__(self, stop: _Stop, step: int, folder: Path) -> None:
+        self._stop = stop
+        self._last = step
+        self._file = folder / _TARGET
+        self._first = 0  # step to which somebody may go back; 0 for none
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        if max(1, self._last - _MOST) <= step + 1 < self._last:
+            self._leave_behind(step + 1)
+
+    def go(self, step: int) -> str:
+        """Go back to a step; return why not, where that cannot be."""
+        if not self._first or step < self._first:
+            how = f"to step {self._first} at most" if self._first else "nowhere from here"
+            return f"it goes back {how}"
+        self._file.write_text(str(step), encoding="ascii")
+        sys.stdout.flush()
+        os._exit(_BACK)
+
+    def _leave_behind(self, step: int) -> None:
+        """Go on in a copy of this process; come back from here only if somebody goes back to this step."""
+        torch = sys.modules.get("torch")
+        if len(threads()) > 1 or (torch is not None and torch.cuda.is_initialized()):
+            self._first = 0  # they have no copy, and what was left behind before is not missed by anybody
+            return
+        places, drawn, here = _places(), random.getstate(), os.getpid()
+        sys.stdout.flush()
+        pid = os.fork()
+        if pid == 0:
+            random.setstate(drawn)  # Python seeds it anew in whatever is forked
+            die_with(here)
+            self._first = self._first or step
+            return
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever has the terminal
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        signal.signal(signal.SIGINT, before)
+        if code != _BACK:
+            _end_with(code)
+        target = int(self._file.read_text(encoding="ascii"))
+        if target != step:
+            os._exit(_BACK)
+        for descriptor, place in places.items():  # which the copy has read further
+            with suppress(OSError):
+                os.lseek(descriptor, place, os.SEEK_SET)
+        self._stop.stop_at(step)
+        self._last = step
+
+
+class OneLine:
+    """Standard input that is read a line at a time, so that the rest is there for whoever has it next."""
+
+    encoding = "utf-8"
+
+    def readline(self) -> str:
+        """Return the next line; nothing at the end."""
+        line = b""
+        while not line.endswith(b"\n") and (byte := os.read(0, 1)):
+            line += byte
+        return line.decode("utf-8", "replace")
+
+
+def _places() -> dict[int, int]:
+    """Where this process is in the files that it reads."""
+    found = {}
+    for name in os.listdir("/proc/self/fd") if sys.platform == "linux" else ():  # noqa: PTH208 - names are enough
+        with suppress(OSError):
+            read = fcntl.fcntl(int(name), fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+            if int(name) > 2 and read and stat.S_ISREG(os.fstat(int(name)).st_mode):
+                found[int(name)] = os.lseek(int(name), 0, os.SEEK_CUR)
+    return found
+
+
+def _end_with(code: int) -> NoReturn:
+    """End as the copy did."""
+    if code < 0:
+        with suppress(OSError, ValueError):
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code)
+
 
 _LEFT = 77  # exit code
+_MAX_ATTEMPTS = 3  # of a replay that is killed from outside
+
+
+class _ReplayKilledError(CrashhuntError):
+    """Another process, or the kernel, ended the process of a replay."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +196,24 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
     """
     if look.window is not None and sys.platform == "linux" and not os.environ.get("DISPLAY"):
         raise UsageError("a window needs a display, and DISPLAY is not set", fix="log in with ssh -X, or give --video")
+    # A user who sits at the debugger or at a window may have killed it, and begins again on purpose only.
+    attempts = 1 if look.stop_at or look.window is not None else _MAX_ATTEMPTS
+    for _ in range(attempts - 1):
+        try:
+            return _run_once(rerun, look)
+        except _ReplayKilledError as error:
+            print(f"{error.message}; crashhunt runs it again", file=sys.stderr, flush=True)
+    return _run_once(rerun, look)
+
+
+def _run_once(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
+    """Run the first steps of a crash in a fresh process.
+
+    Raises:
+        _ReplayKilledError: the process was killed from outside.
+        CrashhuntError: it could not be run.
+        KeyboardInterrupt: the debugger was left, or the window closed.
+    """
     collision = rerun.bundle.result.collision
     involved = {collision.collider, collision.victim} if collision is not None else set()
     with temporary_folder("debug") as scratch:
@@ -118,9 +250,8 @@ def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:
             answer: ErrorData | _Done = json.loads((scratch / layout.ANSWER).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             ended = f"signal {-code}" if code < 0 else f"exit code {code}"
-            raise CrashhuntError(
-                f"the replay ended before its last step, with {ended}", where=rerun.bundle.id
-            ) from None
+            kind = _ReplayKilledError if is_sent_from_outside(code) else CrashhuntError
+            raise kind(f"the replay ended before its last step, with {ended}", where=rerun.bundle.id) from None
         if "error" in answer:
             raise CrashhuntError.from_json(answer)
         return TrialResult.from_json(answer["result"]), Recording(read_black_box(scratch / layout.BLACK_BOX))
@@ -208,13 +339,13 @@ class _Panels(Observer):
         self._episode = episode
         for name in episode.names:
             space = episode.simulator.actions[name].space
-            save_meanings(self._folder, name, space.meanings if offers(space, HasMeanings) else ())
+            save_meanings(self._folder, name, space.meanings if supports(space, HasMeanings) else ())
 
     def action(self, number: int, action: NDArray[np.generic]) -> None:
         name, step = self._episode.names[number], self._episode.steps + 1
         agent = self._episode.agents[name]
         agent = agent.agent if isinstance(agent, _Stopped) else agent
-        if step < self._first or not offers(agent, DrawsPanels):
+        if step < self._first or not supports(agent, DrawsPanels):
             return
         with scope(name):
             try:
@@ -226,7 +357,7 @@ class _Panels(Observer):
 
 @final
 class _Done(TypedDict):
-    result: ResultData
+    result: JsonObject
 
 
 class _Job(TypedDict):
@@ -243,8 +374,8 @@ class _Job(TypedDict):
         pause_before: the step before which a window waits.
     """
 
-    settings: SettingsData
-    spec: SpecData
+    settings: JsonObject
+    spec: JsonObject
     stop_at: int
     agent: str
     other: str
@@ -331,6 +462,8 @@ def main() -> None:
     """Run the trial that a file in a folder describes, with the terminal at hand."""
     folder = Path(sys.argv[1])
     job: _Job = json.loads((folder / layout.JOB).read_text(encoding="utf-8"))
+    if not job["stop_at"]:  # only the debugger handles Ctrl-C; without it, a traceback of the replay helps no user
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         settings, spec = WorkerSettings.from_json(job["settings"]), TrialSpec.from_json(job["spec"])
         seal(settings)
@@ -366,6 +499,6 @@ def main() -> None:
 
 
 def _opened(simulator: Simulator, job: _Job) -> _Window:
-    if not offers(simulator, HasWindow):
+    if not supports(simulator, HasWindow):
         raise UsageError(f"a {type(simulator).__name__} has no window", fix="watch it with --video")
     return _Window(simulator, job)

@@ -2,21 +2,198 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from crashhunt.base.errors import ArgumentError
+from crashhunt.base.errors import ArgumentError, UsageError
+from crashhunt.base.text import one_of
+from crashhunt.disturbances import FORM, is_fixed, parse_fixed, parse_rates, word_of
 from crashhunt.plans import Owners, Takes, takes_of
-from crashhunt.replays._disturbances import NAME, edited_disturbances, is_about_disturbances, with_other_words
-from crashhunt.trial import Constant, Value, parse_spec
+from crashhunt.trial import CELLS, KINDS, Constant, Value, parse_spec, why_not
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from crashhunt.plans import ArgumentSpec, HuntSettings
-    from crashhunt.trial import TrialSpec
+    from crashhunt.trial import Disturbance, TrialSpec
 
-__all__ = ["Edits", "edited_spec"]
+
+__all__ = ["NAME", "Edits", "edited_disturbances", "edited_spec", "is_about_disturbances", "with_other_words"]
+
+
+# A crash with other disturbances: ``--set disturbances…`` of a replay, and ``disturb`` of ``hunt.toml``.
+
+NAME = "disturbances"
+_FIELDS = ("who", "how_strong", "how_long")
+_NONE = "none"
+
+
+def is_about_disturbances(name: str) -> bool:
+    """Whether ``--set NAME=…`` is about the disturbances of the trial."""
+    return name == NAME or name.startswith(f"{NAME}.")
+
+
+def edited_disturbances(
+    planned: Sequence[Disturbance], name: str, text: str, agents: Sequence[str] = ()
+) -> tuple[tuple[Disturbance, ...], list[str]]:
+    """Return the disturbances with one change, and what is not as it was, in words.
+
+    Args:
+        planned: of the trial.
+        name: ``disturbances`` for all; ``disturbances.STEP`` or ``disturbances.KIND@STEP`` for one, and perhaps a dot
+            and one of its fields.
+        text: ``none``, the words that fix others, or the value of the field.
+        agents: the controlled vehicles; those that are disturbed already by default.
+
+    Raises:
+        ArgumentError: it cannot be meant.
+    """
+    where, agents = f"--set {name}", agents or tuple(dict.fromkeys(one.agent for one in planned))
+    if name == NAME:
+        found = () if text == _NONE else _fixed(where, text.split(","), agents)
+        return found, [f"{NAME} were {_all(planned, agents)} and are {_all(found, agents)}"] * (found != tuple(planned))
+    asked = _Asked.of(name.removeprefix(f"{NAME}."))
+    meant = [one for one in planned if asked.means(one)]
+    if asked.kind and not asked.field and text != _NONE:
+        new = _fixed(where, [f"{asked.kind}@{asked.step}={text}"], agents)
+        given = {_key(one) for one in new}
+        was = [one for one in planned if _key(one) in given]
+        found = tuple(sorted([*(one for one in planned if one not in was), *new], key=_key))
+        return found, [f"{name} was {_all(was, agents)} and is {_all(new, agents)}"] * (list(new) != was)
+    if not meant:
+        every = dict.fromkeys(f"{one.what}@{one.step}" if asked.kind else str(one.step) for one in planned)
+        fix = one_of(asked.written, every, give="they begin at", none=f"there is none; write {NAME}.{FORM}")
+        raise ArgumentError(f"{where}: none begins at step {asked.step!r}", fix=fix)
+    if not asked.field and text == _NONE:
+        left = tuple(one for one in planned if one not in meant)
+        return left, [f"{name} was {_all(meant, agents)} and is none"]
+    if not asked.field:
+        raise ArgumentError(f"{where}: {text!r} is not none", fix=f"write none, or {NAME}.{FORM}")
+    if asked.field not in _FIELDS:
+        fix = one_of(asked.field, _FIELDS, give="write one of")
+        raise ArgumentError(f"{where}: {asked.field!r} is nothing to change", fix=fix)
+    if len(meant) > 1:
+        several = [word_of(one, agents).partition("=")[0] for one in meant]
+        fix = f"write {NAME}.{several[0]}.{asked.field}"
+        raise ArgumentError(f"{where}: {' and '.join(several)} begin there", fix=fix)
+    before, value = meant[0], _value(where, asked.field, text)
+    now = replace(before, **{asked.field: value})
+    if reason := why_not(now):
+        raise ArgumentError(f"{where}: {reason[0]}", fix=reason[1])
+    words = [f"{name} was {getattr(before, asked.field)} and is {value}"] if now != before else []
+    return tuple(now if one == before else one for one in planned), words
+
+
+def with_other_words(
+    planned: Sequence[Disturbance], before: Sequence[str], after: Sequence[str], agents: Sequence[str]
+) -> tuple[tuple[Disturbance, ...], list[str], list[str]]:
+    """Return the disturbances of a trial where ``disturb`` of its ``hunt.toml`` has been edited.
+
+    What was fixed there is what is fixed now. Of what was drawn, that of kinds which have no rate any more is gone; it
+    cannot be drawn again with another rate.
+
+    Args:
+        planned: of the trial.
+        before: ``disturb`` as the hunt had it.
+        after: as it is.
+        agents: the controlled vehicles.
+
+    Returns:
+        The disturbances, what is not as it was, and what makes no difference, in words.
+
+    Raises:
+        UsageError: a word cannot be meant.
+    """
+    if tuple(before) == tuple(after):
+        return tuple(planned), [], []
+    was, now = parse_fixed(before, agents), parse_fixed(after, agents, shown="hunt.toml, disturb:")
+    rates, left = parse_rates(before), parse_rates(after)
+    gone = rates.keys() - left.keys()
+    if left:  # a model of somebody's own does not say its kind before it is imported
+        gone &= KINDS.keys()
+    drawn = [one for one in planned if one not in was]
+    kept = [one for one in drawn if (left and one.what not in gone) or not rates]
+    taken = {_key(one) for one in now}
+    found = tuple(sorted([*(one for one in kept if _key(one) not in taken), *now], key=_key))
+    changed = [f"disturb was {_said(before)} and is {_said(after)}"] * (was != now or bool(gone))
+    others = {name: rate for name, rate in rates.items() if name not in gone}
+    ignored = [
+        f"disturb was {_rates(others)} and is {_rates(left)} in hunt.toml; a replay keeps what was drawn for the trial"
+    ]
+    return found, changed, ignored * (others != left)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Which of them somebody means.
+
+    Args:
+        kind: perhaps with the agent before it; empty for whatever begins there.
+        step: as it was written.
+        field: what of it; empty for all.
+    """
+
+    kind: str
+    step: str
+    field: str
+
+    @classmethod
+    def of(cls, text: str) -> _Asked:
+        kind, at, rest = text.rpartition("@")
+        step, _, name = (rest if at else text).partition(".")
+        return cls(kind, step, name)
+
+    @property
+    def written(self) -> str:
+        return f"{self.kind}@{self.step}" if self.kind else self.step
+
+    def means(self, one: Disturbance) -> bool:
+        return str(one.step) == self.step and self.kind in ("", one.what, f"{one.agent}.{one.what}")
+
+
+def _fixed(where: str, words: Sequence[str], agents: Sequence[str]) -> tuple[Disturbance, ...]:
+    odd = next((word for word in words if not is_fixed(word)), None)
+    if odd is not None:
+        fix = f"write {NAME}=none, {NAME}={FORM},… or {NAME}.STEP.how_strong=2"
+        raise ArgumentError(f"{where}: {odd!r} is not none", fix=fix)
+    try:
+        return parse_fixed(words, agents, shown=where.partition(".")[0] + ":")
+    except UsageError as error:
+        raise ArgumentError(error.message, fix=error.fix) from None
+
+
+def _value(where: str, field: str, text: str) -> Any:
+    if field == "who":
+        if text not in CELLS:
+            raise ArgumentError(f"{where}: {text!r} is no place", fix=one_of(text, CELLS))
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (0 <= value < math.inf) or (field == "how_long" and value == 0):
+        least = "seconds above 0" if field == "how_long" else "a number from 0 on"
+        raise ArgumentError(f"{where}: {text!r} is none", fix=f"give {least}")
+    return value
+
+
+def _key(one: Disturbance) -> tuple[int, str, str]:
+    return one.step, one.agent, one.what
+
+
+def _all(some: Iterable[Disturbance], agents: Sequence[str]) -> str:
+    found = tuple(some)
+    return (word_of(found[0], agents) if len(found) == 1 else str(len(found))) if found else _NONE
+
+
+def _said(words: Sequence[str]) -> str:
+    return ",".join(words) or _NONE
+
+
+def _rates(rates: dict[str, float]) -> str:
+    return _said([f"{name}={rate!r}" for name, rate in rates.items()])
+
 
 Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name) to value
 

@@ -1,12 +1,12 @@
-from ._ci import (
+from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
+from ._findings import (
     corpus_annotations as corpus_annotations,
     corpus_summary as corpus_summary,
     crash_annotations as crash_annotations,
     crashes_summary as crashes_summary,
+    findings_of as findings_of,
+    write_sarif as write_sarif,
 )
-from ._compare import comparison_page as comparison_page, describe_comparison as describe_comparison
-from ._findings import findings_of as findings_of
-from ._groups import describe_groups as describe_groups
 from ._listing import (
     ArgumentEntry as ArgumentEntry,
     ListingEntry as ListingEntry,
@@ -17,8 +17,11 @@ from ._listing import (
     list_scenarios as list_scenarios,
 )
 from ._page import report_data as report_data, write_report as write_report
-from ._sarif import write_sarif as write_sarif
 from ._show import Story as Story
 from ._status_screen import Watcher as Watcher, format_arguments as format_arguments, format_seconds as format_seconds
-from ._summary import describe_hunt as describe_hunt, describe_replay as describe_replay
+from ._summary import (
+    describe_groups as describe_groups,
+    describe_hunt as describe_hunt,
+    describe_replay as describe_replay,
+)
 from ._table import check_fields as check_fields, format_table as format_table, steps_table as steps_table

@@ -12,8 +12,7 @@ import numpy as np
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import in_lines
 from crashhunt.hunts import FACTS, HuntResults, columns_of
-from crashhunt.report._table import aligned
-from crashhunt.report._units import argument_units
+from crashhunt.report._table import aligned, argument_units
 from crashhunt.trial import Outcome, in_order
 
 if TYPE_CHECKING:

@@ -7,24 +7,25 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines
-from crashhunt.crashes import Encounter, danger_course, judgement_of, last_escape, most_dangerous
-from crashhunt.report._danger import (
+from crashhunt.crashes import Encounter, danger_course, fault_of, judgement_of, last_escape, most_dangerous
+from crashhunt.report._status_screen import format_arguments
+from crashhunt.report._table import NEAREST, aligned, steps_table
+from crashhunt.report._words import (
     COLUMNS,
+    STANDS,
     about_danger,
+    about_disturbances,
+    about_events,
+    about_gap,
+    about_judgement,
     about_nearest,
+    about_place,
+    about_why,
     danger_cells,
     danger_to_json,
     nearest_to_json,
     window_of,
 )
-from crashhunt.report._disturbances import about_disturbances
-from crashhunt.report._events import about_events
-from crashhunt.report._judgement import about_judgement
-from crashhunt.report._positions import STANDS, about_gap, about_place
-from crashhunt.report._status_screen import format_arguments
-from crashhunt.report._table import NEAREST, aligned, steps_table
-from crashhunt.report._why import about_why
-from crashhunt.triage import fault_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

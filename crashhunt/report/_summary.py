@@ -8,20 +8,74 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines
-from crashhunt.report._disturbances import by_likelihood, describe_disturbances, told_disturbances
-from crashhunt.report._groups import describe_groups
-from crashhunt.report._probes import describe_branches, describe_probes
 from crashhunt.report._status_screen import format_arguments, format_seconds
+from crashhunt.report._words import (
+    by_likelihood,
+    describe_branches,
+    describe_disturbances,
+    describe_probes,
+    told_disturbances,
+)
 from crashhunt.world import event_counts
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import Plain
-    from crashhunt.crashes import Bundle
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.base.json_types import Plain
+    from crashhunt.crashes import Bundle, Group, Signature
     from crashhunt.hunts import HuntReport
     from crashhunt.replays import ReplayReport
     from crashhunt.trial import TrialResult
 
-__all__ = ["describe_hunt", "describe_replay"]
+
+__all__ = ["describe_groups", "describe_hunt", "describe_replay"]
+
+
+# The table of the kinds of crashes, for people; which are of one kind, and their order, is in `triage`.
+
+
+def describe_groups(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> str:
+    """Return a line a kind of crash, with the one to look at first.
+
+    Args:
+        groups: the kinds.
+        known: the cases of a corpus by kind; None where nobody has asked.
+    """
+    if not groups:
+        return "No crash was saved."
+    hunts = {bundle.hunt for group in groups for bundle in group.bundles}
+    faults = any(group.fault for group in groups)
+    rows = [["crashes", "kind", *(["at fault"] if faults else []), "shortest"]]
+    rows[0] += [*(["known as"] if known is not None else []), "steps"]
+    for group in groups:
+        shortest = group.shortest
+        name = shortest.id if len(hunts) == 1 else str(shortest.path)
+        rows.append(
+            [
+                str(group.count),
+                str(group.signature),
+                *([group.fault] if faults else []),
+                name,
+                *([known.get(group.signature, "new")] if known is not None else []),
+                str(shortest.result.steps),
+            ]
+        )
+    count = sum(group.count for group in groups)
+    words = f"{count} {'crash' if count == 1 else 'crashes'} of {len(groups)} {'kind' if len(groups) == 1 else 'kinds'}"
+    return "\n".join([f"{words}:", "", *_lines(rows)])
+
+
+def _lines(rows: list[list[str]]) -> list[str]:
+    """Numbers to the right, words to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.rjust(width) if place in (0, len(row) - 1) else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
+
 
 _SHOWN = 10
 _WITNESSES = {
@@ -70,7 +124,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
         all_of_them = len(report.crashes)
         what = "crash is" if all_of_them == 1 else "crashes are"
         lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
-    if report.kinds and len(report.crashes) > 1:
+    if report.kinds and sum(group.count for group in report.kinds) > 1:  # `--keep` leaves fewer bundles than crashes
         lines += ["", *describe_groups(report.kinds).splitlines()]
     crashes = by_likelihood(report.crashes)
     for bundle in crashes[:_SHOWN]:

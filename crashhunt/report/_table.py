@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeAlias
 
-from crashhunt.base.errors import UsageError
-from crashhunt.base.names import did_you_mean
-from crashhunt.base.text import one_line
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.plugins import locate
+from crashhunt.base.text import did_you_mean, one_line
 from crashhunt.crashes import Encounter
+from crashhunt.snapshots import latest_snapshot
+from crashhunt.trial import signature_of
 from crashhunt.world import approaches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
+    from crashhunt.plans import HuntSettings
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
-__all__ = ["NEAREST", "TableCell", "TableRow", "aligned", "check_fields", "format_table", "steps_table"]
+
+__all__ = [
+    "NEAREST",
+    "TableCell",
+    "TableRow",
+    "aligned",
+    "argument_units",
+    "check_fields",
+    "format_table",
+    "steps_table",
+]
+
 
 TableCell: TypeAlias = "bool | int | float | str | None"
 TableRow: TypeAlias = dict[str, TableCell]
@@ -151,3 +167,30 @@ def _format(value: TableCell) -> str:
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# The units of a hunt's arguments, for the axes of plots.
+
+
+def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, str], str]:
+    """Return the units that are known: (agent, or empty for the scenario; name of the argument) to unit.
+
+    The scenario of the snapshot says them, and the signatures of our own agents; no code of a bundle is run.
+    """
+    try:
+        found = latest_snapshot(directory)
+        scenario = found.scenario() if found is not None else None
+    except CrashhuntError:  # a page without units is better than none
+        scenario = None
+    units = {} if scenario is None else {("", name): setup.unit for name, setup in scenario.arguments.items()}
+    for agent, chosen in settings.agents.items():
+        if chosen.agent.startswith("crashhunt.agents:"):
+            # Another version of crashhunt may have an agent that this one does not have.
+            with suppress(CrashhuntError):
+                arguments = signature_of(locate("agents", chosen.agent)).arguments
+                units |= {(agent, name): argument.unit for name, argument in arguments.items()}
+        setup = scenario.agents.get(agent) if scenario is not None else None
+        if setup is not None and setup.agent == chosen.agent:
+            units |= {(agent, name): known.unit for name, known in setup.arguments.items() if known.unit}
+    # "vehicles (vehicles)" says nothing.
+    return {(agent, name): unit for (agent, name), unit in units.items() if unit and unit != name}

@@ -1,13 +1,10 @@
-from ._cube import Cube as Cube
-from ._grid import GridSampler as GridSampler, SweepSampler as SweepSampler
+from ._by_name import NamedSampler as NamedSampler, varies_only_asked as varies_only_asked
 from ._learning import (
     CmaEsSampler as CmaEsSampler,
     CrossEntropySampler as CrossEntropySampler,
     GuidedSampler as GuidedSampler,
     MutationSampler as MutationSampler,
 )
-from ._low_discrepancy import HaltonSampler as HaltonSampler, SobolSampler as SobolSampler
-from ._made import NamedSampler as NamedSampler, varies_only_asked as varies_only_asked
 from ._protocol import (
     HuntFacts as HuntFacts,
     Independent as Independent,
@@ -19,4 +16,11 @@ from ._protocol import (
     Space as Space,
     WantsHunt as WantsHunt,
 )
-from ._random import RandomSampler as RandomSampler
+from ._space_filling import (
+    Cube as Cube,
+    GridSampler as GridSampler,
+    HaltonSampler as HaltonSampler,
+    RandomSampler as RandomSampler,
+    SobolSampler as SobolSampler,
+    SweepSampler as SweepSampler,
+)

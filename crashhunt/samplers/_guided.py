@@ -1,70 +1,271 @@
-"""A portfolio: strategies have as many trials as they earn, and what they do not earn goes to an even search.
+"""The portfolio behind the sampler `guided`: distributes trials between a model, mutation and an even search.
 
-What a strategy earns is measured against trials that nothing guides, by rank alone: of a trial that is more dangerous
-than a share of 1 - q of those, the payoff is -log q, which is 1 on the average where there is nothing to learn. So
-strategies that follow a danger that says nothing get nothing but probes.
+Computes shares of trials by payoff. A trial that is more critical than a share of 1 - q of the unguided trials has
+payoff -log q. The mean payoff is 1 where a strategy learns nothing, so only ranks matter, not the scale of criticality.
 
-That danger grows does not yet mean that it leads to a crash, which nobody knows before the first one. There are two
-signs that it does not: strategies leave the unguided trials behind, and then come no nearer; or they never come near,
-as dangers from 0 to 1 are measured. Then they have little, so that a hunt is never much worse than an even search, and
-a part of that little goes to other peaks of danger than the highest.
+Invariant: a strategy keeps at least 2 % of the trials (probes), and the even search gets everything that strategies
+do not earn. A hunt with a misleading criticality is therefore never much worse than an even search.
 
-After the first crash, what counts is other kinds of crashes: the fewer of them a trial strategies have found than
-chance has, the less they have.
+Why not the best strategy alone: rising criticality does not imply a crash, which is unknown before the first one. Two
+signs show that it misleads: strategies are far ahead of the unguided trials and make no progress, or they never
+exceed a criticality of 0.5. In both cases their share is capped, and a part of it explores other peaks (`Niches`).
+
+After the first crash, new crash types count: the share falls with the ratio of the rate of new types that strategies
+find to the rate of the unguided trials.
+
+Sources: nearest-better distance (Preuss 2010), Halton's sequence (1960); payoffs and shares are our own, measured with
+`scripts/search`. Cost: below a millisecond per trial in addition to the model.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right, insort
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crashhunt.base.draws import one_of
-from crashhunt.samplers._elites import Elites
-from crashhunt.samplers._known import KnownCrashes
-from crashhunt.samplers._low_discrepancy import HaltonSampler
 from crashhunt.samplers._model import Model
-from crashhunt.samplers._mutation import Mutation
-from crashhunt.samplers._niches import Niches
-from crashhunt.samplers._strategy import Draft
+from crashhunt.samplers._space_filling import HaltonSampler
+from crashhunt.samplers._strategies import Mutation
+from crashhunt.samplers._strategy import Draft, Elites, reflected
 
 if TYPE_CHECKING:
-    from crashhunt.samplers._cube import Cube
-    from crashhunt.samplers._protocol import HuntFacts, Space
-    from crashhunt.samplers._strategy import Strategy
-    from crashhunt.samplers._told import Told
+    from collections.abc import Sequence
 
-__all__ = ["Portfolio"]
+    from numpy.typing import NDArray
+
+    from crashhunt.samplers._protocol import HuntFacts, Space
+    from crashhunt.samplers._space_filling import Cube
+    from crashhunt.samplers._strategy import ScoredTrial, Strategy
+
+
+__all__ = ["KnownCrashes", "Niches", "Portfolio"]
+
+
+# Niches: other peaks of criticality, explored when trials around the most critical one make no more progress.
+#
+# Criticality has several peaks, and the highest may not contain a crash. A trial that is far from every more critical
+# one is at the foot of another peak (nearest-better distance; Preuss 2010). A separate model searches the ball around
+# the foot whose radius is that distance.
+
+_LAST, _BEST = 256, 64  # trials among which feet of peaks are searched
+_LEAST = 12  # trials before the search for feet
+_RETRY_AFTER = 32  # trials between two searches without success
+_FAR_FOOT = 2.0  # times the mean distance to the next more critical trial: beyond that it is the foot of another peak
+_TRIED = 16  # last feet, which are not visited again
+_NICHE_PATIENCE, _NICHE_PATIENCE_PER_ARGUMENT = 5, 1  # trials without progress before a peak is abandoned
+_NEARER = 0.85  # progress: the distance of the score from 1 shrinks to this share or less
+_TRIES = 4  # proposals of the model, of which the first inside the ball is used
+
+
+class Niches:
+    """Climbs one peak after the other.
+
+    Args:
+        cube: of the arguments.
+        like: a model whose fitted parameters are the initial ones of the models of peaks.
+    """
+
+    def __init__(self, cube: Cube, like: Model) -> None:
+        self._cube, self._like = cube, like
+        self._patience = _NICHE_PATIENCE + _NICHE_PATIENCE_PER_ARGUMENT * cube.dimensions
+        self._last: deque[ScoredTrial] = deque(maxlen=_LAST)
+        self._best = Elites(_BEST)
+        self._tried: deque[ScoredTrial] = deque(maxlen=_TRIED)
+        self._foot: ScoredTrial | None = None
+        self._model = like
+        self._reach = self._record = 0.0
+        self._without_record = self._told = self._not_before = 0
+
+    @property
+    def climbs(self) -> bool:
+        """Whether a trial is nearer to a crash than the foot of the peak."""
+        return self._foot is not None and self._record > self._foot.score
+
+    def tell(self, trial: ScoredTrial) -> None:
+        """Add a trial; abandon the peak where no more progress is made."""
+        self._best.add(trial)
+        self._last.append(trial)
+        self._told += 1
+        if self._foot is None:
+            return
+        within = float(np.linalg.norm(trial.point - self._foot.point)) < self._reach
+        if within:
+            self._model.tell(trial)
+        if within and 1.0 - trial.score < _NEARER * (1.0 - self._record):
+            self._record, self._without_record = trial.score, 0
+        elif trial.origin == "niche":
+            self._without_record += 1
+        if self._without_record >= self._patience:
+            self._foot = None
+
+    def begin(self) -> None:
+        """Select the foot of another peak, unless one is being climbed."""
+        if self._foot is not None or self._told < max(self._not_before, _LEAST):
+            return
+        self._not_before = self._told + _RETRY_AFTER
+        trial = {one.number: one for one in self._last} | {one.number: one for one in self._best}
+        trials = [trial[number] for number in sorted(trial)]
+        points, scores = np.array([trial.point for trial in trials]), np.array([trial.score for trial in trials])
+        away = (points**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * points @ points.T
+        away = np.sqrt(np.maximum(away, 0.0))
+        away[scores <= scores[:, None]] = np.inf
+        reach = away.min(axis=1)
+        rank = np.searchsorted(np.sort(scores), scores) / len(scores)
+        known = np.isfinite(reach)  # all but the most critical one
+        least = _FAR_FOOT * float(reach[known].mean()) if known.any() else 0.0
+        worth = np.where(known & (reach > least), np.where(known, reach, 0.0) * rank, 0.0)
+        for place in np.argsort(-worth, kind="stable"):
+            tried = (float(np.linalg.norm(points[place] - foot.point)) for foot in self._tried)
+            if worth[place] > 0.0 and all(one > 0.5 * reach[place] for one in tried):
+                self._go(trials[place], float(reach[place]), trials)
+                return
+
+    def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
+        """Return a proposal of the model of this peak; None where there is no other peak."""
+        if self._foot is None:
+            return None
+        for _ in range(_TRIES):
+            draft = self._model.propose(place, rng)
+            if draft is not None and float(np.linalg.norm(draft.point - self._foot.point)) < self._reach:
+                return draft
+        size = len(self._foot.point)
+        step = self._reach / math.sqrt(size) * rng.standard_normal(size)
+        return Draft(reflected(self._foot.point + step), parent=self._foot.number)
+
+    def _go(self, foot: ScoredTrial, reach: float, trials: list[ScoredTrial]) -> None:
+        self._tried.append(foot)
+        self._foot, self._reach, self._record, self._without_record = foot, reach, foot.score, 0
+        self._model = Model(self._cube, like=self._like)
+        self._model.remember(trial for trial in trials if float(np.linalg.norm(trial.point - foot.point)) < reach)
+
+
+# Known crashes: a resumed hunt searches for other crashes, not for these again.
+
+_MOST = 32  # crashes whose neighbourhood is excluded
+_MAX_KINDS = 256  # crash types in memory
+_SEEDS = 1024  # seeds of crashes in memory
+_AROUND = 0.1  # radius of an excluded neighbourhood, times the square root of the dimensions
+_JUST_THERE = 0.02  # the same, while the next crash there may be of another type
+_REPEATS = 3  # consecutive crashes of known types in a neighbourhood: the next is new in at most one of five cases
+_WIDER, _WIDEST = 1.5, 0.45  # growth of a radius if the best trials are just outside, and its upper bound
+
+
+class KnownCrashes:
+    """The places in the space of arguments that are not worth another trial.
+
+    A crash excludes a neighbourhood that depends on its type. If the result has no type, a wide neighbourhood is
+    excluded at once. If it has one, almost nothing is excluded at first, because the same arguments may lead to other
+    types. After three consecutive crashes of known types, the wide neighbourhood is excluded.
+
+    The same traffic leads to the same crash even with other arguments, so no proposal reuses the seed of a crash.
+
+    Args:
+        dimensions: of the space.
+    """
+
+    def __init__(self, dimensions: int) -> None:
+        self._unit = math.sqrt(dimensions)
+        self._points = np.empty((0, dimensions))
+        self._radii = np.empty(0)
+        self._kinds: dict[str, None] = {}
+        self._seeds: dict[int, None] = {}
+        self._again: list[NDArray[np.float64]] = []  # last crashes of known types that no new type has followed nearby
+
+    def __bool__(self) -> bool:
+        return bool(len(self._radii))
+
+    def cover(self, point: NDArray[np.float64], seed: int | None = None) -> bool:
+        """Return whether a point is near a known crash, or a seed is that of one."""
+        return seed in self._seeds or bool((self._away(point) < self._radii).any())
+
+    def is_new(self, trial: ScoredTrial) -> bool:
+        """Return whether a crash has an unknown type; without a type, whether no known crash is near it."""
+        return trial.kind not in self._kinds if trial.kind else not self.cover(trial.point)
+
+    def outside(self, trials: Sequence[ScoredTrial]) -> list[ScoredTrial]:
+        """Return the trials that are neither near a known crash nor have the seed of one."""
+        if not trials:
+            return []
+        points = np.array([trial.point for trial in trials])
+        covered = np.any(self._away(points[:, None]) < self._radii, axis=1).tolist()
+        return [
+            trial for trial, near in zip(trials, covered, strict=True) if not near and trial.seed not in self._seeds
+        ]
+
+    def add(self, trial: ScoredTrial) -> bool:
+        """Add a crash; return whether the excluded region has changed."""
+        new = bool(trial.kind) and trial.kind not in self._kinds
+        self._kinds[trial.kind] = None
+        if len(self._kinds) > _MAX_KINDS:
+            del self._kinds[next(iter(self._kinds))]
+        self._seeds[trial.seed] = None
+        if len(self._seeds) > _SEEDS:
+            del self._seeds[next(iter(self._seeds))]
+        away = self._away(trial.point)
+        around = away < self._radii
+        if new:  # the region contains more types than assumed, so shrink what is excluded
+            self._radii = np.where(around, np.minimum(self._radii / _WIDER, away), self._radii)
+        elif around.any():
+            return False
+        kept = self._radii > 0.0  # a radius of 0 is the very same point, as with choices and whole numbers
+        radius = (_JUST_THERE if trial.kind and not self._is_worked_out(trial.point, new) else _AROUND) * self._unit
+        self._points = np.vstack((self._points[kept], trial.point))[-_MOST:]
+        self._radii = np.append(self._radii[kept], radius)[-_MOST:]
+        return True
+
+    def _is_worked_out(self, point: NDArray[np.float64], new: bool) -> bool:
+        """Count a crash, and return whether its neighbourhood yields known types only."""
+        near = [float(np.linalg.norm(other - point)) < _AROUND * self._unit for other in self._again]
+        if new:
+            self._again = [other for other, is_near in zip(self._again, near, strict=True) if not is_near]
+            return False
+        self._again = [*self._again, point][-_MOST:]
+        return sum(near) + 1 >= _REPEATS
+
+    def widen(self, top: NDArray[np.float64]) -> bool:
+        """Enlarge the nearest excluded neighbourhood if the top trial is just outside; return whether it was."""
+        away = self._away(top)
+        nearest = int(np.argmin(away / self._radii))
+        if away[nearest] >= _WIDER * self._radii[nearest]:
+            return False
+        wider = max(self._radii[nearest] * _WIDER, _AROUND * self._unit)
+        self._radii[nearest] = wider if wider < _WIDEST * self._unit else _AROUND * self._unit
+        return True
+
+    def _away(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        away: NDArray[np.float64] = np.sqrt(((self._points - point) ** 2).sum(axis=-1))
+        return away
+
 
 _EVEN, _MODEL, _MUTATION, _NICHE = "halton", "model", "mutation", "niche"
-_FIRST = 10  # unguided trials before anybody is measured against them
-_OF_OURS = 0.8  # the share of a hunt's trials that the portfolio is asked for at all; of all are the shares below
-_CLIMBING, _STUCK = 0.7, 0.05  # what strategies have at most
-_FAR, _NEAR = 0.35, 0.5  # at most the first, as long as no danger has been above the second
-_PROBING = 0.02  # what each has at least: what it earned before is no longer what it would
-_OTHER_PEAKS, _CLIMBING_THERE = 0.08, 0.15  # what the search for other peaks has, where strategies are stuck
-_PATIENCE, _PATIENCE_PER_ARGUMENT = 8, 3  # trials of strategies without a greater danger until they may be stuck
-_NEARER = 0.85  # of what was missing to a crash is missing now, or less: else it is no greater danger
-_AHEAD = 0.4  # as many of the strategies' trials are above all unguided ones, lately: so they are stuck, or
-_FAR_AHEAD = 2.5  # this is what one of them earns, and it comes no nearer
-_LATELY = 0.1  # what the last one counts in that
-_CREDIT = 3.0  # trials with a payoff of 2, which everybody begins with
-_FORGET = 0.96  # of what a strategy has earned, at each of its trials
-_INHERITED = 0.3  # what a trial counts that has its danger from the seed of its parent
-_KINDS, _TRIALS = 0.5, 25.0  # so many new kinds in so many trials everybody begins with
-_REMEMBERED = 200  # trials from which strategies begin anew after a crash
-_TRIES = 4
+_FIRST = 10  # unguided trials before payoffs are computed
+_OF_OURS = 0.8  # share of a hunt's trials that the portfolio proposes; the shares below are of all trials
+_CLIMBING, _STUCK = 0.7, 0.05  # maximum share of strategies, with and without progress
+_FAR, _NEAR = 0.35, 0.5  # maximum share while no criticality has exceeded the second number
+_PROBING = 0.02  # minimum share of each strategy: its payoff may have changed
+_OTHER_PEAKS, _CLIMBING_THERE = 0.08, 0.15  # share of niches where strategies are stuck, and while a niche climbs
+_PATIENCE, _PATIENCE_PER_ARGUMENT = 8, 3  # trials of strategies without progress before they may be stuck
+_AHEAD = 0.4  # recent share of strategy trials above all unguided ones, beyond which strategies are stuck
+_FAR_AHEAD = 2.5  # mean payoff of a strategy, beyond which strategies are stuck
+_LATELY = 0.1  # weight of the last trial in that recent share
+_CREDIT = 3.0  # initial trials of each strategy, with a payoff of 2, so that each one is tried
+_FORGET = 0.96  # decay of a strategy's payoff per trial
+_INHERITED = 0.3  # weight of a trial whose criticality may come from the seed of its parent
+_KINDS, _TRIALS = 0.5, 25.0  # prior of the rate of new crash types: so many types in so many trials
+_REMEMBERED = 200  # trials from which strategies restart after a crash
 
 
 class Portfolio:
-    """A model of danger and mutation, beside Halton's sequence.
+    """A model of criticality and mutation, in addition to Halton's sequence.
 
     Args:
         cube: of the arguments.
         space: the same as distributions.
-        hunt: whose seed scrambles the sequence.
+        hunt: its seed scrambles the sequence.
     """
 
     def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
@@ -74,57 +275,57 @@ class Portfolio:
         self._unguided: list[float] = []  # scores, in order
         self._best = Elites(_REMEMBERED)
         self._known = KnownCrashes(cube.dimensions)
-        self._earned = dict.fromkeys((_MODEL, _MUTATION), (2.0 * _CREDIT, _CREDIT))  # sum and count, forgotten slowly
-        self._kinds = {True: (_KINDS, _TRIALS), False: (_KINDS, _TRIALS)}  # new ones and trials: guided, and not
+        self._earned = dict.fromkeys((_MODEL, _MUTATION), (2.0 * _CREDIT, _CREDIT))  # decaying sum and count of payoffs
+        self._kinds = {True: (_KINDS, _TRIALS), False: (_KINDS, _TRIALS)}  # new types and trials: guided, unguided
         self._model = Model(cube)
         self._begin()
 
     def _begin(self) -> None:
-        """Make the strategies anew, from everything that is not near to a crash that is known."""
-        best, self._best = sorted(self._best, key=lambda told: told.number), Elites(_REMEMBERED)
+        """Restart the strategies from the trials that are not near a known crash."""
+        best, self._best = sorted(self._best, key=lambda trial: trial.number), Elites(_REMEMBERED)
         kept = self._known.outside(best)
         self._model, mutation = Model(self._cube, like=self._model), Mutation(self._cube)
         self._model.remember(kept)
         self._strategies: dict[str, Strategy] = {_MODEL: self._model, _MUTATION: mutation}
         self._niches = Niches(self._cube, self._model)
-        self._record, self._without_record = -1.0, 0  # the greatest danger, and for how many trials
-        self._top = np.zeros(self._cube.dimensions)  # where that was
-        self._rival = 0.0  # the greatest danger of an unguided trial
-        self._ahead = 0.0  # how many of the strategies' trials are above all unguided ones, lately
-        for told in kept:
-            self._best.add(told)
-            mutation.tell(told)
-            self._measure(told)
+        self._record, self._without_record = -1.0, 0  # greatest criticality, and trials since then
+        self._top = np.zeros(self._cube.dimensions)  # its point
+        self._rival = 0.0  # greatest criticality of an unguided trial
+        self._ahead = 0.0  # recent share of strategy trials above all unguided ones
+        for trial in kept:
+            self._best.add(trial)
+            mutation.tell(trial)
+            self._measure(trial)
 
-    def tell(self, told: Told) -> None:
-        """Account for a trial, and let the strategies know of it."""
-        if told.origin in self._strategies:
-            total, count = self._earned[told.origin]
-            payoff, weight = (1.0, _INHERITED) if self._is_inherited(told) else (self._payoff(told.score), 1.0)
-            self._earned[told.origin] = (total * _FORGET + payoff * weight, count * _FORGET + weight)
-        elif told.origin != _NICHE:
-            insort(self._unguided, told.score)
-        is_guided = told.origin in self._strategies or told.origin == _NICHE
+    def tell(self, trial: ScoredTrial) -> None:
+        """Update payoffs and strategies with a trial."""
+        if trial.origin in self._strategies:
+            total, count = self._earned[trial.origin]
+            payoff, weight = (1.0, _INHERITED) if self._is_inherited(trial) else (self._payoff(trial.score), 1.0)
+            self._earned[trial.origin] = (total * _FORGET + payoff * weight, count * _FORGET + weight)
+        elif trial.origin != _NICHE:
+            insort(self._unguided, trial.score)
+        is_guided = trial.origin in self._strategies or trial.origin == _NICHE
         kinds, trials = self._kinds[is_guided]
-        self._kinds[is_guided] = (kinds + (told.crashed and self._known.is_new(told)), trials + 1.0)
-        if told.crashed:
-            if self._known.add(told):
+        self._kinds[is_guided] = (kinds + (trial.crashed and self._known.is_new(trial)), trials + 1.0)
+        if trial.crashed:
+            if self._known.add(trial):
                 self._begin()
             return
-        if self._known.cover(told.point, told.seed):
+        if self._known.cover(trial.point, trial.seed):
             return
-        self._best.add(told)
+        self._best.add(trial)
         for strategy in self._strategies.values():
-            strategy.tell(told)
-        self._measure(told)
-        self._niches.tell(told)
+            strategy.tell(trial)
+        self._measure(trial)
+        self._niches.tell(trial)
         if self._is_stuck:
             self._niches.begin()
         if self._known and self._without_record >= self._patience and self._known.widen(self._top):
             self._begin()
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft:
-        """Return what one of the strategies proposes, or the next point of the even search."""
+        """Return a proposal of one of the strategies, or the next point of the even search."""
         if len(self._unguided) >= _FIRST:
             for name in self._drawn(rng):
                 for _ in range(_TRIES):
@@ -135,7 +336,7 @@ class Portfolio:
         return Draft(self._even.point(place), origin=_EVEN)
 
     def _drawn(self, rng: np.random.Generator) -> list[str]:
-        """Return whose turn it is; that of none where it is the even search's."""
+        """Return the strategies in the order in which they are asked; none where it is the even search's turn."""
         names = []
         elsewhere = _CLIMBING_THERE if self._niches.climbs else _OTHER_PEAKS
         if self._is_stuck and rng.random() < elsewhere / _OF_OURS:
@@ -145,21 +346,21 @@ class Portfolio:
             names.append(one_of(shares, rng))
         return names
 
-    def _measure(self, told: Told) -> None:
-        """See whether it is a greater danger, and from whom."""
-        if 1.0 - told.score < _NEARER * (1.0 - self._record):
-            self._record, self._top, self._without_record = told.score, told.point, 0
-        elif told.origin in self._strategies:
+    def _measure(self, trial: ScoredTrial) -> None:
+        """Update the greatest criticality and the progress of strategies."""
+        if 1.0 - trial.score < _NEARER * (1.0 - self._record):
+            self._record, self._top, self._without_record = trial.score, trial.point, 0
+        elif trial.origin in self._strategies:
             self._without_record += 1
-        if told.origin in self._strategies:
-            self._ahead += _LATELY * ((told.score > self._rival) - self._ahead)
-        elif told.origin != _NICHE:
-            self._rival = max(self._rival, told.score)
+        if trial.origin in self._strategies:
+            self._ahead += _LATELY * ((trial.score > self._rival) - self._ahead)
+        elif trial.origin != _NICHE:
+            self._rival = max(self._rival, trial.score)
 
-    def _is_inherited(self, told: Told) -> bool:
-        """Whether it has the seed of its parent and is no more dangerous: that much may be the traffic's."""
-        parent = next((one for one in self._best if one.number == told.parent), None)
-        return parent is not None and parent.seed == told.seed and told.score <= parent.score
+    def _is_inherited(self, trial: ScoredTrial) -> bool:
+        """Return whether a trial has its parent's seed and is no more critical: the traffic alone may explain that."""
+        parent = next((one for one in self._best if one.number == trial.parent), None)
+        return parent is not None and parent.seed == trial.seed and trial.score <= parent.score
 
     def _payoff(self, score: float) -> float:
         below, at_most = bisect_left(self._unguided, score), bisect_right(self._unguided, score)
@@ -167,7 +368,7 @@ class Portfolio:
         return math.log((len(self._unguided) + 1.0) / (above + 0.5))
 
     def _shares(self) -> dict[str, float]:
-        """Of all trials of the hunt, which share a strategy has."""
+        """Return the share of each strategy in all trials of the hunt."""
         gains = {name: max(total / count - 1.0, 0.05) ** 2 for name, (total, count) in self._earned.items()}
         most = _STUCK if self._is_stuck else _CLIMBING if self._record > _NEAR else _FAR
         whole = most * min(1.0, max(gains.values()))

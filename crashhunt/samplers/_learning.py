@@ -1,17 +1,14 @@
-"""Samplers that learn: a strategy each, beside a stream of plain random trials."""
+"""Samplers that learn: each has one strategy, and every fifth trial is a plain random one."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from crashhunt.samplers._cma_es import CmaEs
-from crashhunt.samplers._cross_entropy import CrossEntropy
-from crashhunt.samplers._cube import Cube
 from crashhunt.samplers._guided import Portfolio
-from crashhunt.samplers._mutation import Mutation
 from crashhunt.samplers._protocol import HuntFacts, Proposal
-from crashhunt.samplers._random import RandomSampler
-from crashhunt.samplers._told import told_of
+from crashhunt.samplers._space_filling import Cube, RandomSampler
+from crashhunt.samplers._strategies import CmaEs, CrossEntropy, Mutation
+from crashhunt.samplers._strategy import scored_trial
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,12 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["CmaEsSampler", "CrossEntropySampler", "GuidedSampler", "Learning", "MutationSampler"]
 
-_PLAIN_EVERY = 5  # trials, of which the first is a plain random one
+_PLAIN_EVERY = 5  # trials: one of five is plain random, for an unbiased crash rate
 _PLAIN, _START = "random", "start"
 
 
 class Learning:
-    """What all of them are: every fifth trial is random, the others are a strategy's.
+    """The base of all samplers that learn: every fifth trial is random, the others come from a strategy.
 
     Args:
         space: what to sample.
@@ -52,26 +49,26 @@ class Learning:
         raise NotImplementedError
 
     def ask(self, number: int, rng: np.random.Generator) -> Proposal:
-        """Return a plain random trial, or what the strategy makes of what it was told."""
+        """Return a plain random trial, or the proposal of the strategy."""
         if number % _PLAIN_EVERY == 0:
             return Proposal(self._random.ask(number, rng).arguments, origin=_PLAIN)
-        # Of its own trials alone: Halton's sequence without every fifth point has a hole, where an argument has base 5.
+        # Count the strategy's trials alone: without every fifth point, Halton's sequence in base 5 has a hole.
         place = number - number // _PLAIN_EVERY - 1
         draft = self._strategy.propose(place, rng) if self._cube.dimensions else None
-        if draft is None:  # there is nothing to go by yet, or nothing to vary
+        if draft is None:  # too few results yet, or no argument varies
             return Proposal(self._random.ask(number, rng).arguments, origin=_START)
         arguments = self._cube.arguments(draft.point)
         return Proposal(arguments, seed=draft.seed, parent=draft.parent, origin=draft.origin or self.origin)
 
     def tell(self, result: TrialResult) -> None:
         """Learn how a trial ended."""
-        told = told_of(result, self._cube, self._hunt)
-        if told is not None and self._cube.dimensions:
-            self._strategy.tell(told)
+        trial = scored_trial(result, self._cube, self._hunt)
+        if trial is not None and self._cube.dimensions:
+            self._strategy.tell(trial)
 
 
 class CrossEntropySampler(Learning):
-    """Draws from what is fitted to the most dangerous trials (`CrossEntropy`)."""
+    """Draws from a distribution that is fitted to the most critical trials (`CrossEntropy`)."""
 
     origin = "cross-entropy"
 
@@ -80,7 +77,7 @@ class CrossEntropySampler(Learning):
 
 
 class MutationSampler(Learning):
-    """Changes the most dangerous trials, with the same traffic or with other (`Mutation`)."""
+    """Changes the most critical trials, with the same or other traffic (`Mutation`)."""
 
     origin = "mutation"
 
@@ -89,7 +86,7 @@ class MutationSampler(Learning):
 
 
 class CmaEsSampler(Learning):
-    """Follows danger uphill by CMA-ES, which needs two arguments or more that vary (`CmaEs`)."""
+    """Follows rising criticality by CMA-ES, which needs two arguments or more that vary (`CmaEs`)."""
 
     origin = "cma-es"
 
@@ -98,7 +95,7 @@ class CmaEsSampler(Learning):
 
 
 class GuidedSampler(Learning):
-    """Gives each strategy what it has earned (`Portfolio`)."""
+    """Gives each strategy a share of the trials by its success (`Portfolio`)."""
 
     origin = "guided"
 

@@ -1,10 +1,16 @@
-"""A model of danger: what is near in arguments, and has the same traffic perhaps, is about as dangerous.
+"""A model of criticality over arguments and seeds, which selects the most promising of many candidates.
 
-A Gaussian process (Rasmussen and Williams 2006) over the most dangerous trials and the last ones. It has two parts:
-what arguments explain, and what they explain only as long as the seed is kept; what neither does is noise. How far it
-is worth looking along each argument, and how much each part counts, is fitted while trials are told. Of many
-candidates, most of them neighbours of dangerous trials, that one is proposed which most likely is more dangerous than
-all so far (Kushner 1964).
+Computes a Gaussian process (Rasmussen and Williams 2006) over the most critical and the latest trials. Its kernel has
+two parts: one of arguments alone, and one of arguments that counts only between trials with the same seed, because the
+seed determines the traffic. The rest is noise. Length scales and shares are fitted while results arrive. Of 64
+candidates, most of them neighbours of critical trials, the model proposes the one that most likely exceeds the best
+score so far (Kushner 1964).
+
+Why not a library: proposals must follow from the reported results bit by bit, and take milliseconds.
+
+Invariant: only the order of scores matters, so any monotonic measure of criticality gives the same proposals.
+
+Cost: at most 96 trials are in the process, so one solution takes 96³ / 3 operations, whatever the hunt's length.
 """
 
 from __future__ import annotations
@@ -15,98 +21,174 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.samplers._elites import Elites
-from crashhunt.samplers._process import Process
-from crashhunt.samplers._strategy import Draft, reflected
+from crashhunt.samplers._strategy import Draft, Elites, reflected
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
-    from crashhunt.samplers._cube import Cube
-    from crashhunt.samplers._told import Told
+    from crashhunt.samplers._space_filling import Cube
+    from crashhunt.samplers._strategy import ScoredTrial
 
-__all__ = ["Model"]
+    Floats = NDArray[np.float64]
 
-_LEAST = 6  # trials before there is a model
-_BEST, _LAST = 48, 48  # trials that it is of: so many are quick to solve for
-_OFTEN = 64  # trials, after each of which a parameter is fitted; later, as many times for every doubling and a half
-_CANDIDATES = 64
-_ANYWHERE, _FITTED = 0.15, 0.25  # of them; the others are neighbours of one trial
-_PARENTS = 12
-_KEEP_SEED = 0.5
-_LARGEST, _SMALLEST = 0.3, 0.005  # standard deviation of a step, drawn evenly in the logarithm between them
-_NARROWEST = 0.02  # standard deviation of what is drawn around all parents, at least
-_OTHER = 0.3  # how often a categorical argument that is to be changed is
-_LENGTH = 0.4  # times the square root of the dimensions: how far it is worth looking, to begin with
-_UNLIKELY = 0.25  # how little it is believed that a length is many times that
-_NOISE = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)  # shares of what danger varies by
-_SEEDED = (0.0, 0.2, 0.5, 0.8, 0.95)  # of the rest, what is explained only as long as the seed is kept
-_AMBITION = 0.5  # standard deviations by which a crash is above the most dangerous trial, on the average of draws
+
+__all__ = ["Model", "Process"]
+
+
+# A Gaussian process over arguments and seeds (Rasmussen and Williams 2006, algorithm 2.1).
+
+_CATEGORY_DISTANCE_SQUARED = 0.5  # squared distance between two different values of a choice
+_WIDER = 1.5  # ratio of the length scale with the same seed to that without
+_JITTER = 1e-6  # added to the diagonal, so that the matrix stays positive definite
+
+
+class Process:
+    """The process for given trials and parameters.
+
+    Args:
+        points: trials x arguments; a choice is the index of its value.
+        seeds: of the trials.
+        scores: of the trials; only their order matters.
+        categorical: which arguments are choices.
+        scales: factors of the arguments, the reciprocals of length scales.
+        noise: the share of the variance of scores that is noise, above 0 and below 1.
+        seeded: the share of the remaining variance that counts only between trials with the same seed.
+    """
+
+    def __init__(
+        self, points: Floats, seeds: NDArray[np.int64], scores: Floats, *, categorical: NDArray[np.bool_],
+        scales: Floats, noise: float, seeded: float,
+    ) -> None:  # fmt: skip
+        self._points, self._seeds = points, seeds
+        self._categorical, self._scales = categorical, scales
+        self._noise, self._seeded = noise / (1.0 - noise) + _JITTER, seeded
+        worths = _worths(scores)
+        self._target = (worths - worths.mean()) / (float(worths.std()) or 1.0)
+        kernel = self._kernel(points, seeds)
+        kernel[np.diag_indices(len(kernel))] += self._noise
+        self._lower = np.linalg.cholesky(kernel)
+        self._half = np.linalg.solve(self._lower, self._target)
+        self._amplitude = max(float(self._half @ self._half) / len(points), 1e-9)
+        self.likelihood = -0.5 * len(points) * math.log(self._amplitude) - float(np.log(np.diag(self._lower)).sum())
+        """The logarithm of the likelihood of the scores, up to a constant."""
+
+    def worth(self, points: Floats, seeds: NDArray[np.int64], ambition: float) -> Floats:
+        """Return by how many standard deviations the expected score at each point exceeds the target.
+
+        Args:
+            points: in the same form as those of the trials.
+            seeds: of the points; below 0 for a seed that no trial has.
+            ambition: by how much the target exceeds the best score, in standard deviations of all scores.
+        """
+        half = np.linalg.solve(self._lower, self._kernel(points, seeds).T)
+        spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), _JITTER)
+        worth: Floats = (half.T @ self._half - float(self._target.max()) - ambition) / np.sqrt(spread)
+        return worth
+
+    def _kernel(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
+        numbers = ~self._categorical
+        one, other = (of[:, numbers] * self._scales[numbers] for of in (points, self._points))
+        squared = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2.0 * one @ other.T
+        squared = np.maximum(squared, 0.0)
+        for place in np.flatnonzero(self._categorical):
+            differ = points[:, place, None] != self._points[:, place]
+            squared += _CATEGORY_DISTANCE_SQUARED * self._scales[place] ** 2 * differ
+        kernel: Floats = (1.0 - self._seeded) * np.exp(-0.5 * squared)
+        if self._seeded:
+            same = seeds[:, None] == self._seeds
+            kernel += self._seeded * same * np.exp(-0.5 / _WIDER**2 * squared)
+        return kernel
+
+
+def _worths(scores: Floats) -> Floats:
+    """Return values that depend on the order of scores alone, and are further apart among the greatest."""
+    order, count = np.sort(scores), len(scores)
+    below = np.searchsorted(order, scores, "left")
+    above = count - np.searchsorted(order, scores, "right")
+    worths: Floats = -np.log((above + 0.5 * (count - above - below)) / count)
+    return worths
+
+
+_LEAST = 6  # trials before the model proposes
+_BEST, _LAST = 48, 48  # trials in the process: a solution of 96 takes about a millisecond
+_OFTEN = 64  # trials up to which a parameter is fitted after each one; later the fits become rarer in proportion
+_CANDIDATES = 64  # per proposal
+_ANYWHERE, _FITTED = 0.15, 0.25  # shares of candidates; the others are neighbours of one trial
+_PARENTS = 12  # best trials whose neighbours are candidates
+_KEEP_SEED = 0.5  # probability that a neighbour keeps the seed of its parent
+_LARGEST, _SMALLEST = 0.3, 0.005  # standard deviation of a step, drawn log-uniformly between these
+_NARROWEST = 0.02  # lower bound of the standard deviation of draws around all parents
+_OTHER = 0.3  # probability that a selected categorical argument changes
+_LENGTH = 0.4  # initial length scale, times the square root of the dimensions
+_UNLIKELY = 0.25  # weight of the prior against length scales far from the initial one
+_NOISE = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9)  # candidates for the noise share
+_SEEDED = (0.0, 0.2, 0.5, 0.8, 0.95)  # candidates for the share that counts only with the same seed
+_AMBITION = 0.5  # mean of the drawn ambition, in standard deviations
 
 
 class _Parameters(NamedTuple):
-    lengths: NDArray[np.float64]  # logarithms to base 2 of what the first ones are multiplied by
+    lengths: NDArray[np.float64]  # logarithms to base 2 of factors of the initial length scales
     noise: int
     seeded: int
 
 
 class Model:
-    """A Gaussian process that is asked which candidate is worth a trial.
+    """Proposes the candidate with the greatest chance to exceed the best score.
 
     Args:
         cube: of the arguments.
-        like: one whose fitted parameters it begins with.
+        like: a model whose fitted parameters are the initial ones.
     """
 
     def __init__(self, cube: Cube, like: Model | None = None) -> None:
         self._cube = cube
         self._best = Elites(_BEST)
-        self._last: deque[Told] = deque(maxlen=_LAST)
+        self._last: deque[ScoredTrial] = deque(maxlen=_LAST)
         self._count = self._turn = 0
         unknown = _Parameters(np.zeros(cube.dimensions), 3, 1)
         self._parameters: _Parameters = unknown if like is None else like._parameters
         self._process: Process | None = None
 
-    def remember(self, trials: Iterable[Told]) -> None:
-        """Take in trials that were told before, and fit nothing."""
-        for told in trials:
-            self._best.add(told)
-            self._last.append(told)
+    def remember(self, trials: Iterable[ScoredTrial]) -> None:
+        """Add earlier trials without fitting."""
+        for trial in trials:
+            self._best.add(trial)
+            self._last.append(trial)
             self._count += 1
         self._process = None
 
-    def tell(self, told: Told) -> None:
-        """Take it in; every so often, one of the parameters is fitted anew."""
-        self.remember((told,))
+    def tell(self, trial: ScoredTrial) -> None:
+        """Add a trial; at growing intervals, fit one of the parameters again."""
+        self.remember((trial,))
         if self._count >= _LEAST and self._count % max(1, self._count // _OFTEN) == 0:
             self._tune()
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return the best of many candidates."""
+        """Return the best of many candidates; None while there are too few trials."""
         if self._count < _LEAST:
             return None
         if self._process is None:
             self._process = self._with(self._parameters)
         best = self._best.best(_PARENTS)
         points, places, kept = self._candidates(best, rng)
-        seeds = np.where(kept, np.array([told.seed for told in best])[places], -1)
+        seeds = np.where(kept, np.array([trial.seed for trial in best])[places], -1)
         worth = self._process.worth(self._cube.values(points), seeds, float(rng.exponential(_AMBITION)))
         chosen = int(np.argmax(worth))
         point, parent = points[chosen], best[places[chosen]]
         seed = parent.seed if kept[chosen] else None
         if seed is not None and self._cube.arguments(point) == self._cube.arguments(parent.point):
-            seed = None  # it would be the same trial again
+            seed = None  # the same point and seed would repeat the trial
         return Draft(point, seed=seed, parent=parent.number)
 
     def _with(self, parameters: _Parameters) -> Process:
-        known = {told.number: told for told in self._last} | {told.number: told for told in self._best}
+        known = {trial.number: trial for trial in self._last} | {trial.number: trial for trial in self._best}
         trials = [known[number] for number in sorted(known)]
         return Process(
-            self._cube.values(np.array([told.point for told in trials])),
-            np.array([told.seed for told in trials]),
-            np.array([told.score for told in trials]),
+            self._cube.values(np.array([trial.point for trial in trials])),
+            np.array([trial.seed for trial in trials]),
+            np.array([trial.score for trial in trials]),
             categorical=self._cube.categorical,
             scales=2.0**-parameters.lengths / (_LENGTH * math.sqrt(self._cube.dimensions)),
             noise=_NOISE[parameters.noise],
@@ -114,14 +196,14 @@ class Model:
         )
 
     def _tune(self) -> None:
-        """Try one parameter a little smaller and a little larger, and keep what explains the trials best."""
+        """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood."""
         tried = [self._parameters, *(self._stepped(by) for by in (-1, 1))]
         likely = [self._with(one).likelihood - _UNLIKELY * float(one.lengths @ one.lengths) for one in tried]
         self._parameters = tried[int(np.argmax(likely))]
         self._turn += 1
 
     def _stepped(self, by: int) -> _Parameters:
-        """Return other parameters: in turns, one length, and one of all lengths, the noise and the seed's part."""
+        """Return neighbouring parameters: in turns, one length, and one of all lengths, noise and seed share."""
         lengths, noise, seeded = self._parameters
         turn, whole = divmod(self._turn, 2)
         if not whole:
@@ -136,11 +218,11 @@ class Model:
         return _Parameters(lengths, noise, seeded)
 
     def _candidates(
-        self, best: list[Told], rng: np.random.Generator
+        self, best: list[ScoredTrial], rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.bool_]]:
-        """Return points, of each the place of its parent, and whether it keeps that one's seed."""
+        """Return candidate points, the index of the parent of each, and whether each keeps its parent's seed."""
         shape = (_CANDIDATES, self._cube.dimensions)
-        known = np.array([told.point for told in best])
+        known = np.array([trial.point for trial in best])
         energy = np.cumsum(1.0 / (2.0 + np.arange(len(best))))
         places = np.searchsorted(energy / energy[-1], rng.random(_CANDIDATES))
         places = np.minimum(places, len(best) - 1)

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from optuna.storages import InMemoryStorage
+from optuna.trial import FrozenTrial, TrialState
 
 from crashhunt.base.errors import PluginError, UsageError
-from crashhunt.base.names import one_of
+from crashhunt.base.text import one_of
 from crashhunt.samplers._learning import Learning
 from crashhunt.samplers._protocol import HuntFacts
 from crashhunt.samplers._strategy import Draft
@@ -20,10 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from crashhunt.samplers._protocol import Space
-    from crashhunt.samplers._strategy import Strategy
-    from crashhunt.samplers._told import Told
+    from crashhunt.samplers._strategy import ScoredTrial, Strategy
 
-__all__ = ["ORIGIN", "PREFIX", "OptunaMaker", "optuna_maker"]
+
+__all__ = ["ORIGIN", "PREFIX", "OptunaMaker", "Storage", "optuna_maker"]
+
 
 PREFIX = "optuna:"
 ORIGIN = "optuna"
@@ -31,9 +34,9 @@ _LONGEST = 2**29  # points of a sequence that are surely there
 _INSTEAD = {
     "bruteforce": "--sampler grid tries every combination",
     "grid": "--sampler grid tries every combination",
-    "partialfixed": "--arg NAME=VALUE fixes an argument, whoever searches",
+    "partialfixed": "--arg NAME=VALUE fixes an argument, with any sampler",
 }
-"""What of Optuna there is no use for here, and what to do instead."""
+"""Samplers of Optuna that make no sense here, and alternatives."""
 _NEEDS = {
     "cmaes": ("cmaes", "pip install 'crashhunt[search]'"),
     "gp": ("torch", "pip install 'crashhunt[torch]'"),
@@ -54,7 +57,7 @@ class OptunaMaker:
     wants_hunt: ClassVar[bool] = True
 
     def __call__(self, space: Space, *, points: int = 10, hunt: HuntFacts = HuntFacts()) -> Learning:  # noqa: B008
-        """Return a sampler of a space, beside a stream of plain random trials."""
+        """Return a sampler of a space; every fifth of its trials is a plain random one."""
         return _OptunaSampler(space, self.kind, points=points, hunt=hunt)
 
 
@@ -111,22 +114,20 @@ class _OptunaSampler(Learning):
 
 
 class _Study:
-    """A study that maximizes danger: a number from 0 to 1 for each argument, a category for each that is a choice.
+    """A study that maximizes criticality: a number from 0 to 1 for each numeric argument, a category for each choice.
 
-    What it proposes follows from what it was told, as crashhunt's samplers promise, so that a hunt goes on exactly:
-    for every trial that is asked for or told there is a new sampler, seeded by that trial, on the same study, and what
-    is asked for leaves no trace in that (`Storage`). A trial is asked of Optuna in the moment when it is told.
+    Its proposals depend only on the reported results, as crashhunt's samplers promise, so a hunt resumes exactly. Each
+    request and each report therefore uses a new Optuna sampler on the same study, seeded by that trial. A request
+    leaves no trace in the study (`Storage`). A trial is added to the study when its result is reported.
 
     Args:
         kind: the class in ``optuna.samplers``.
-        options: how many values each argument has that is a choice; 0 for those that are none.
+        options: the number of values of each choice; 0 for a numeric argument.
         seed: of the hunt.
     """
 
     def __init__(self, kind: str, options: tuple[int, ...], seed: int) -> None:
         import optuna
-
-        from crashhunt.samplers._optuna_storage import Storage
 
         self._optuna = optuna
         self._make: Any = getattr(optuna.samplers, kind)
@@ -148,11 +149,11 @@ class _Study:
             with self._seeded(self._seed):
                 _ = self._study.ask().relative_params
 
-    def tell(self, told: Told) -> None:
-        """Tell the study; a generation of CMA-ES is of its own draws alone."""
-        if self._kind == "QMCSampler" or (self._kind == "CmaEsSampler" and told.origin != ORIGIN):
+    def tell(self, scored: ScoredTrial) -> None:
+        """Report a result to the study; CMA-ES receives only the results of its own draws."""
+        if self._kind == "QMCSampler" or (self._kind == "CmaEsSampler" and scored.origin != ORIGIN):
             return
-        self._add(told.point.tolist(), told.score, told.number)
+        self._add(scored.point.tolist(), scored.score, scored.number)
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
         """Return what the study suggests."""
@@ -197,3 +198,74 @@ class _Study:
                 yield
         finally:
             logging.set_verbosity(known)
+
+
+# A storage for Optuna studies that learn from reported results only.
+
+_ASKED = -1  # the id of a requested trial; reported trials have ids from 0
+
+
+class Storage(InMemoryStorage):  # type: ignore[misc] # whose types are not looked at
+    """Keeps trials in memory; a requested trial exists only during the request.
+
+    Optuna's samplers keep their state in the study: the generation in which a trial was requested, the state of CMA-ES,
+    the parents of a generation. Without this class, proposals would depend on requests whose results never arrived.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._asked: FrozenTrial | None = None
+        self.count = 0
+        """The number of trials."""
+
+    @contextmanager
+    def asking(self) -> Iterator[None]:
+        """Discard everything that is written inside the context."""
+        self._asked = FrozenTrial(
+            number=self.count, trial_id=_ASKED, state=TrialState.RUNNING, value=None, datetime_start=None,
+            datetime_complete=None, params={}, distributions={}, user_attrs={}, system_attrs={}, intermediate_values={},
+        )  # fmt: skip
+        try:
+            yield
+        finally:
+            self._asked = None
+
+    def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
+        """Return the id of the requested trial, or of a new one."""
+        if self._asked is not None:
+            return _ASKED
+        self.count += 1
+        made: int = super().create_new_trial(study_id, template_trial)
+        return made
+
+    def get_trial(self, trial_id: int) -> FrozenTrial:
+        """Return a trial."""
+        return self._asked if trial_id == _ASKED and self._asked is not None else super().get_trial(trial_id)
+
+    def set_trial_param(self, trial_id: int, param_name: str, param_value_internal: float, distribution: Any) -> None:
+        """Store the value of an argument."""
+        if trial_id != _ASKED:
+            super().set_trial_param(trial_id, param_name, param_value_internal, distribution)
+            return
+        assert self._asked is not None
+        self._asked.distributions[param_name] = distribution
+        self._asked.params[param_name] = distribution.to_external_repr(param_value_internal)
+
+    def set_trial_system_attr(self, trial_id: int, key: str, value: Any) -> None:
+        """Store what a sampler records about a trial."""
+        if trial_id != _ASKED:
+            super().set_trial_system_attr(trial_id, key, value)
+            return
+        assert self._asked is not None
+        self._asked.system_attrs[key] = value
+
+    def set_study_system_attr(self, study_id: int, key: str, value: Any) -> None:
+        """Store what a sampler records about the study."""
+        if self._asked is None:
+            super().set_study_system_attr(study_id, key, value)
+
+    def count_from(self, drawn: int) -> None:
+        """Set the draw counters that samplers keep in attributes of the study, as if they had made so many draws."""
+        for study in self.get_all_studies():
+            for key in study.system_attrs:
+                self.set_study_system_attr(study._study_id, key, drawn - 1)

@@ -57,24 +57,25 @@ class HuntFacts:
 class Sampler(Protocol):
     """Proposes trials, and may learn from their results.
 
-    It is made with the space and, as a keyword, ``points``: how many values to try of a range that has no step of its
-    own; and with ``hunt``, where it says that it wants that (`WantsHunt`).
+    It is created with the space and, as a keyword, ``points``: the number of values to try of a range without a step.
+    It also receives ``hunt`` if it asks for that (`WantsHunt`).
 
-    Contract: a proposal depends on what it was made with, the trial's number, its generator and the results told so
-    far, in their order, never on time, on what was asked before or on anything else. So one that is made anew and told
-    the same results proposes the same, which is how a hunt goes on after it was interrupted.
+    Contract: a proposal depends on the constructor's arguments, the trial's number, its generator, and the reported
+    results in their order. It never depends on time, on earlier requests or on anything else. A new sampler that
+    receives the same results therefore makes the same proposals, so an interrupted hunt can resume.
 
-    One whose ``learns`` is false is told nothing, and its proposals for a number are the same however many trials run
-    at once.
+    A sampler whose ``learns`` is false receives no results. Its proposal for a number is the same for any number of
+    parallel trials.
 
-    One that learns is told results by this rule. Before the proposal for trial n is asked for, all results up to
-    n - lag are told that are there and were not told before, in the order of their numbers. A trial that has not ended
-    by then is not waited for: it is told late, before the first proposal after its end, so that one that hangs keeps
-    nobody from learning. The lag is how many trials a hunt has under way at once. A hunt with
-    ``--deterministic`` waits: there, exactly the results up to n - lag are told, and the lag is 32, or what the hunt
-    that began had under way where that is more; so its trials are the same whatever runs how fast. Proposals, and what
-    was told before each, are in the ledger before their trials start. So a hunt that goes on, however it ended, runs
-    those very trials, and tells the results in the order in which they were told.
+    A sampler that learns receives results by this rule. The lag is the number of parallel trials of the hunt.
+
+    - Before the proposal for trial n, it receives all new results up to trial n - lag, in the order of their numbers.
+    - A trial that has not ended by then is reported late, before the first proposal after its end. One trial that
+      hangs therefore does not stop the sampler from learning.
+    - A hunt with ``--deterministic`` waits: the sampler receives exactly the results up to n - lag. The lag is 32, or
+      the parallel trials of the first run, if those are more. The trials are then the same at any speed.
+    - The ledger stores proposals, and the results reported before each, before their trials start. A resumed hunt runs
+      the same trials, and reports results in the same order.
     """
 
     learns: bool
@@ -93,10 +94,10 @@ class Sampler(Protocol):
 
 @runtime_checkable
 class OnlyAsked(Protocol):
-    """A sampler that may vary only what somebody asks for by name.
+    """A sampler that may vary only the arguments that the user asks for by name.
 
-    Where ``only_asked`` is true, everything else is a constant in its space. The class says so, for it is asked before
-    a sampler is made.
+    Where ``only_asked`` is true, every other argument is a constant in its space. It is a class attribute, because it
+    is read before a sampler is created.
     """
 
     only_asked: bool
@@ -116,9 +117,9 @@ class WantsHunt(Protocol):
 class Independent(Protocol):
     """A sampler that may draw every trial from the distributions of its space, independently of all others.
 
-    Where ``independent`` is true, how often a hunt crashes says how often its agent does, and so the rate gets an
-    interval. Such a one draws the scenario's arguments first, in order of their names, so that two hunts with one seed
-    have the same traffic whoever drives.
+    Where ``independent`` is true, the share of trials that crash estimates the crash rate of the agent, so the rate
+    gets a confidence interval. Such a sampler draws the scenario's arguments first, in order of their names. Two
+    hunts with one seed therefore have the same traffic for any agent.
     """
 
     independent: bool
@@ -126,10 +127,10 @@ class Independent(Protocol):
 
 @runtime_checkable
 class PlainStream(Protocol):
-    """A sampler that learns, and keeps some trials apart that it draws as `RandomSampler` does, whatever it was told.
+    """A sampler that learns, and draws some trials as `RandomSampler` does, independently of all results.
 
-    Their numbers are fixed beforehand, and ``plain_origin`` is the origin of all of them and of no other. How often
-    they crash says how often the agent does, as the other trials never could.
+    Their numbers are fixed beforehand, and ``plain_origin`` is the origin of all of them and of no other trial. The
+    share of them that crash estimates the crash rate of the agent. The other trials are biased towards crashes.
     """
 
     plain_origin: str

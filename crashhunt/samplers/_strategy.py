@@ -1,29 +1,36 @@
-"""A strategy proposes points near what was dangerous; samplers are made of one or several."""
+"""The protocol of strategies, which propose points near critical trials; a sampler uses one or several of them."""
 
 from __future__ import annotations
 
+import re
+from bisect import insort
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
-    from crashhunt.samplers._told import Told
+    from crashhunt.samplers._protocol import HuntFacts
+    from crashhunt.samplers._space_filling import Cube
+    from crashhunt.trial import TrialResult
 
-__all__ = ["Draft", "Strategy", "reflected"]
+
+__all__ = ["CRASHED", "Draft", "Elites", "ScoredTrial", "Strategy", "reflected", "scored_trial"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draft:
-    """A point that is proposed.
+    """A proposed point.
 
     Args:
         point: in the cube.
         seed: of the trial; None for the one that its number has.
-        parent: the number of the trial that it was made from; None where there is none.
-        origin: which strategy proposes it, where there are several.
+        parent: the number of the trial that it is derived from; None where there is none.
+        origin: the strategy that proposes it, where there are several.
     """
 
     point: NDArray[np.float64]
@@ -33,16 +40,114 @@ class Draft:
 
 
 class Strategy(Protocol):
-    """Learns from what is told, and proposes on that alone: what it proposed before changes nothing."""
+    """Learns from reported results, and proposes from these alone: earlier proposals change nothing."""
 
     def propose(self, place: int, rng: np.random.Generator) -> Draft | None:
-        """Return a draft, the one at a place from 0 among all; None for as long as there is too little to go by."""
+        """Return the draft at a place from 0 in the sequence of drafts; None while there are too few results."""
 
-    def tell(self, told: Told) -> None:
-        """Learn how a trial ended, whoever proposed it."""
+    def tell(self, trial: ScoredTrial) -> None:
+        """Learn how a trial ended, whatever its origin."""
 
 
 def reflected(point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a point inside the cube: what is outside by a little is inside by as much."""
+    """Return a point inside the cube: a point outside is mirrored at the border."""
     inside: NDArray[np.float64] = np.abs(np.mod(point + 1.0, 2.0) - 1.0)
     return inside
+
+
+# Results as a sampler that learns sees them: a point, and a score that says how near it came to a crash.
+
+CRASHED = 1.0
+_NEAREST = 0.999  # upper bound of the score of a trial without a crash
+_NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index on its road
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredTrial:
+    """A trial that has ended.
+
+    Args:
+        number: of the trial.
+        point: where it was in the cube.
+        seed: of the trial.
+        score: 0 to 1, `CRASHED` for a crash.
+        origin: from which strategy it was.
+        parent: the number of the trial that it was made from; None where there is none.
+        kind: of a crash, its manner and its place as far as its result says so; empty where it does not.
+    """
+
+    number: int
+    point: NDArray[np.float64]
+    seed: int
+    score: float
+    origin: str = ""
+    parent: int | None = None
+    kind: str = ""
+
+    @property
+    def crashed(self) -> bool:
+        """Whether it is what the hunt is after."""
+        return self.score == CRASHED
+
+
+def scored_trial(result: TrialResult, cube: Cube, hunt: HuntFacts) -> ScoredTrial | None:
+    """Return a result as a sampler learns from it; None where it says nothing, as after a failed setup."""
+    if result.outcome in hunt.crash_on:
+        score = CRASHED
+    elif result.danger is None or result.outcome.category != "no crash":
+        return None  # a crash that is not hunted says nothing about the crashes that are
+    else:
+        score = min(max(result.danger, 0.0), _NEAREST)
+    spec = result.spec
+    kind = _kind(result) if score == CRASHED else ""
+    return ScoredTrial(spec.number, cube.point(spec), spec.seed, score, spec.origin, spec.parent, kind)
+
+
+def _kind(result: TrialResult) -> str:
+    """Return the crash type as far as it is known without a recording: outcome, role and place, or the exception."""
+    hit, failed, event = result.collision, result.failure, result.event
+    words = [str(result.outcome)]
+    if hit is not None:
+        words += [hit.role, hit.kind, _NUMBER_AT_END.sub("", hit.lane)]
+    elif failed is not None:
+        words += [failed.kind, failed.agent]
+    elif event is not None:
+        words += [event.kind, _NUMBER_AT_END.sub("", event.lane)]
+    else:
+        return ""
+    return " ".join(words)
+
+
+# The best trials so far, in order and limited in number.
+
+
+class Elites:
+    """The trials with the greatest scores; of equal ones, those that were reported first.
+
+    Args:
+        most: the maximum number of trials.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._kept: list[tuple[float, int, ScoredTrial]] = []
+        self._count = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[ScoredTrial]:
+        return (trial for _, _, trial in self._kept)
+
+    def __getitem__(self, place: int) -> ScoredTrial:
+        return self._kept[place][2]
+
+    def add(self, trial: ScoredTrial) -> ScoredTrial | None:
+        """Add a trial; return the one that is dropped for it, which is the trial itself if it is not good enough."""
+        self._count += 1
+        insort(self._kept, (-trial.score, self._count, trial))
+        return self._kept.pop()[2] if len(self._kept) > self._most else None
+
+    def best(self, many: int) -> list[ScoredTrial]:
+        """Return the best trials, at most so many."""
+        return [trial for _, _, trial in self._kept[:many]]

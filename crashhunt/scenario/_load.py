@@ -7,25 +7,163 @@ import os
 import tomllib
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from crashhunt.base import layout
-from crashhunt.base.errors import ScenarioError
-from crashhunt.base.names import did_you_mean, listed, near_path
+from crashhunt.base.errors import ArgumentError, ScenarioError
+from crashhunt.base.layout import PACKAGE, SCENARIO
 from crashhunt.base.plugins import registered
+from crashhunt.base.text import did_you_mean, listed, near_path, one_of
 from crashhunt.base.tolerance import known_part
 from crashhunt.base.validation import validate
-from crashhunt.scenario._checks import check, check_arguments, unregistered
-from crashhunt.scenario._registry import backend_names, backend_of, configurations
-from crashhunt.scenario._scenario import Scenario
-from crashhunt.scenario._shipped import shipped_folder, shipped_scenarios
-from crashhunt.scenario._tables import AgentSetup, ObservationSetup
+from crashhunt.scenario._backend import backend_names, backend_of, configurations, titles
+from crashhunt.scenario._scenario import AgentSetup, ObservationSetup, Scenario
+from crashhunt.world import LIMITS
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import Plain
-    from crashhunt.scenario._backend import Configuration
+    from crashhunt.base.json_types import Plain
+    from crashhunt.scenario._backend import Backend, Configuration
 
-__all__ = ["endings", "load_scenario", "scenario_from_dict"]
+
+__all__ = [
+    "check",
+    "check_arguments",
+    "endings",
+    "load_scenario",
+    "refuse",
+    "scenario_from_dict",
+    "shipped_folder",
+    "shipped_scenarios",
+    "unregistered",
+]
+
+
+# What a scenario must be, whatever simulator it is for; what its simulator demands is in its `Backend`.
+
+
+def refuse(where: str, key: str, value: object, message: str, fix: str) -> NoReturn:
+    """Refuse the value of a key of a scenario.
+
+    Raises:
+        ScenarioError: always.
+    """
+    raise ScenarioError(f"{key} = {value!r} {message}", fix=fix, where=where)
+
+
+def unregistered(simulator: str, where: str) -> ScenarioError:
+    """Return the error about a simulator that is not installed."""
+    fix = f"{one_of(simulator, registered('simulators'))}, or module:attribute"
+    return ScenarioError(f"simulator = {simulator!r} is not registered", fix=fix, where=where)
+
+
+def check(scenario: Scenario, where: str, *, kept: bool) -> None:
+    """Refuse a scenario that cannot be meant.
+
+    Args:
+        scenario: with the folder in which its files are.
+        where: the file that it was read from.
+        kept: it has been run.
+
+    Raises:
+        ScenarioError: with key, value and fix.
+    """
+    if not scenario.agents:
+        refuse(where, "agents", {}, "names no controlled vehicle", "add a table [agents.ego]")
+    if ":" not in scenario.simulator and scenario.simulator not in registered("simulators"):
+        raise unregistered(scenario.simulator, where)
+    for key in ("step_length_s", "insertion_timeout_s"):
+        value = getattr(scenario, key)
+        if not 0 < value < float("inf"):
+            refuse(where, key, value, "is not a time above 0", "give seconds, such as 0.1")
+    if not 0 <= scenario.warmup_s < float("inf"):
+        refuse(where, "warmup_s", scenario.warmup_s, "is not a time", "give seconds, such as 20.0")
+    if scenario.observation is not None and scenario.observation.vehicles < 1:
+        refuse(where, "observation.vehicles", scenario.observation.vehicles, "is below 1", "give at least 1")
+    _check_tables(scenario, where, kept=kept)
+    for name, backend in scenario.backends.items():
+        _check_files(scenario, name, backend, where)
+        if backend.keys is not None:
+            _check_keys(scenario, backend.keys, where)
+        backend.check(scenario, where)
+    for kind, limit in scenario.events.items():
+        if kind not in LIMITS:
+            refuse(where, "events", kind, "has no limit", f"give some of {', '.join(LIMITS)}")
+        if not 0 < limit < float("inf"):
+            refuse(where, f"events.{kind}", limit, "is no limit", f"give {LIMITS[kind][1]} above 0")
+
+
+def check_arguments(scenario: Scenario, *, kept: bool) -> None:
+    """Refuse ranges that are none, and defaults outside of them.
+
+    Raises:
+        ScenarioError: with the argument.
+    """
+    tables = {"arguments": scenario.arguments}
+    tables |= {f"agents.{agent}.arguments": setup.arguments for agent, setup in scenario.agents.items()}
+    for table, setups in tables.items():
+        for name, setup in setups.items():
+            try:
+                range_ = setup.argument(name, f"{scenario.origin}: {table}").distribution
+            except ArgumentError as error:
+                raise ScenarioError(error.message, fix=error.fix, where=error.where) from None
+            if range_ is not None and setup.default is not None and not range_.contains(setup.default) and not kept:
+                message, fix = f"is outside its range {setup.range!r}", "give a default within it, or widen the range"
+                refuse(scenario.origin, f"{table}.{name}.default", setup.default, message, fix)
+
+
+def _check_tables(scenario: Scenario, where: str, *, kept: bool) -> None:
+    simulator, backend = scenario.simulator, backend_of(scenario.simulator)
+    if backend is None:  # a user's class, which may use any of them
+        return
+    if backend.table is not None and simulator not in scenario.tables:
+        refuse(where, simulator, None, "is missing", f"add a table [{simulator}] with {backend.example}")
+    for name in scenario.tables:
+        if name != simulator and not kept:
+            refuse(where, "simulator", simulator, f"has no use for the table [{name}]", "remove it")
+
+
+def _check_files(scenario: Scenario, name: str, backend: Backend, where: str) -> None:
+    for file in backend.files(scenario):
+        path = Path(os.path.normpath(scenario.folder / file))
+        if not path.is_file():
+            refuse(where, name, file, "does not exist", f"give a path relative to {scenario.folder}")
+        if not path.is_relative_to(scenario.folder):
+            fix = "move it inside, so that it can be archived"
+            refuse(where, name, file, "lies outside the scenario's folder", fix)
+
+
+def _check_keys(scenario: Scenario, heeded: frozenset[str], where: str) -> None:
+    """Refuse what only another simulator would heed, instead of passing it over."""
+    plain = AgentSetup()
+    for agent, setup in scenario.agents.items():
+        for item in fields(AgentSetup):
+            value = getattr(setup, item.name)
+            common = item.name in ("agent", "arguments") or f"agents.{item.name}" in heeded
+            if not common and value != getattr(plain, item.name):
+                refuse(where, f"agents.{agent}.{item.name}", value, _meant_for(f"agents.{item.name}"), "remove it")
+    for key in ("warmup_s", "insertion_timeout_s"):
+        value = getattr(scenario, key)
+        if key not in heeded and value != getattr(Scenario, key):
+            refuse(where, key, value, _meant_for(key), "remove it")
+
+
+def _meant_for(key: str) -> str:
+    return f"is for {titles(lambda backend: key in (backend.keys or ()))}"
+
+
+# The scenarios that come with crashhunt.
+
+
+def shipped_folder() -> Path:
+    """Return the folder of the scenarios that come with crashhunt."""
+    inside = PACKAGE / "scenarios"
+    return inside if inside.is_dir() else PACKAGE.parent / "scenarios"
+
+
+def shipped_scenarios() -> tuple[str, ...]:
+    """Return the names of the scenarios that come with crashhunt."""
+    return tuple(sorted(path.parent.name for path in shipped_folder().glob(f"*/{SCENARIO}")))
+
 
 _INTERNAL = ("folder", "file", "notes", "added")  # of a Scenario, and not of a file
 
@@ -44,7 +182,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     path = _path_of(name)
     if path.suffix == ".toml":
         if ego:
-            message = f"--ego {ego!r} is for a bare {_told()}"
+            message = f"--ego {ego!r} is for a bare {_configuration_endings()}"
             raise ScenarioError(message, fix="set the vehicle under [agents] instead", where=str(path))
         scenario = _load_toml(path, kept=kept)
     else:
@@ -56,7 +194,7 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
 
 
 def endings() -> tuple[str, ...]:
-    """Return how people are told of the files that are scenarios: ``.toml``, and those of simulators' own."""
+    """Return the endings of scenario files for messages: ``.toml``, and those of simulators."""
     return (".toml", *(configuration.endings[0] for configuration in configurations()))
 
 
@@ -97,7 +235,7 @@ def scenario_from_dict(data: Plain, *, where: str, folder: Path, tolerant: bool 
         if data[name] is not None  # as an older crashhunt sends it to a worker
     }
     own = _table_kind(scenario.simulator)
-    if own is not None and scenario.simulator not in tables and _may_be_left_out(own):
+    if own is not None and scenario.simulator not in tables and _is_optional(own):
         tables[scenario.simulator] = own()
     observation = scenario.observation
     if observation is None and not scenario.backend.shows_itself:
@@ -126,7 +264,7 @@ def _table_kind(name: str) -> type | None:
     return backend.table if backend is not None else None
 
 
-def _may_be_left_out(kind: type) -> bool:
+def _is_optional(kind: type) -> bool:
     return all(item.default is not MISSING or item.default_factory is not MISSING for item in fields(kind))
 
 
@@ -149,7 +287,7 @@ def _path_of(name: str | Path) -> Path:
         fix = f"give {listed(inside)}" if inside else "give the folder that has one"
         raise ScenarioError("the folder has no scenario.toml", fix=fix, where=text)
     fix = f"{near_path(path, *_endings()) or did_you_mean(text, shipped_scenarios())} give one of "
-    fix += f"{listed(shipped_scenarios())}, or the path of a folder, a scenario.toml or a {_told()}"
+    fix += f"{listed(shipped_scenarios())}, or the path of a folder, a scenario.toml or a {_configuration_endings()}"
     raise ScenarioError(f"there is no scenario {text!r}", fix=" ".join(fix.split()))
 
 
@@ -157,7 +295,7 @@ def _endings() -> tuple[str, ...]:
     return (".toml", *(ending for configuration in configurations() for ending in configuration.endings))
 
 
-def _told() -> str:
+def _configuration_endings() -> str:
     return " or a ".join(endings()[1:])
 
 
@@ -165,7 +303,7 @@ def _configuration(path: Path) -> Configuration:
     for configuration in configurations():
         if path.name.endswith(configuration.endings):
             return configuration
-    message, fix = f"{path.name!r} is neither a scenario.toml nor a {_told()}", "give one of the two"
+    message, fix = f"{path.name!r} is neither a scenario.toml nor a {_configuration_endings()}", "give one of the two"
     raise ScenarioError(message, fix=fix, where=str(path))
 
 
@@ -182,11 +320,11 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     scenario = scenario_from_dict(data, where=str(path), folder=path.resolve().parent, tolerant=kept)
     scenario = replace(scenario, file=path.name)
     check_arguments(scenario, kept=kept)
-    agents = {agent: _beside(setup, scenario.folder) for agent, setup in scenario.agents.items()}
+    agents = {agent: _resolve_default_path(setup, scenario.folder) for agent, setup in scenario.agents.items()}
     scenario = replace(scenario, agents=agents)
     check(scenario, str(path), kept=kept)
     if "schema" not in data and not kept:
-        # Some day there will be another one, and then nobody knows which of the two this file is.
+        # A later schema may exist some day, and a file without this key would then be ambiguous.
         raise ScenarioError("the key 'schema' is missing", fix="add schema = 1", where=str(path))
     if kept:
         return scenario
@@ -194,8 +332,8 @@ def _load_toml(path: Path, *, kept: bool) -> Scenario:
     return replace(scenario, notes=(*scenario.notes, *notes))
 
 
-def _beside(setup: AgentSetup, folder: Path) -> AgentSetup:
-    """The agent's arguments, where a default that names a file beside the ``scenario.toml`` is its path."""
+def _resolve_default_path(setup: AgentSetup, folder: Path) -> AgentSetup:
+    """Return the agent with defaults that name a file in the scenario's folder replaced by the path of that file."""
     found = {}
     for name, argument in setup.arguments.items():
         default = argument.default

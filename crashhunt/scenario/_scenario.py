@@ -2,23 +2,135 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypedDict, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._backend import Backend
-from crashhunt.scenario._registry import backend_of
-from crashhunt.scenario._tables import AgentSetup, ArgumentSetup, ObservationSetup
+from crashhunt.base.integrity import digest_of_file
+from crashhunt.scenario._backend import Backend, backend_of
 from crashhunt.scenario.backends import DEFAULT_SIMULATOR
+from crashhunt.trial import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
-    from crashhunt.trial import Argument, Value
+    from crashhunt.base.json_types import Plain
+    from crashhunt.trial import Value
 
-__all__ = ["STEP_LENGTH_S", "Scenario", "argument_values", "with_action"]
+
+__all__ = [
+    "STEP_LENGTH_S",
+    "AgentSetup",
+    "ArgumentSetup",
+    "ObservationSetup",
+    "Scenario",
+    "argument_values",
+    "as_in_file",
+    "as_plain_data",
+    "digest_of_described",
+    "scenario_digest",
+    "with_action",
+]
+
+
+# The tables of a ``scenario.toml`` that every simulator has.
+
+DEFAULT_AGENT = "crashhunt.agents:KeepLaneWithSpeed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArgumentSetup:
+    """``[arguments.NAME]`` or ``[agents.ID.arguments.NAME]``.
+
+    Args:
+        range: what a hunt tries, as a specification such as ``5:40``; empty where it stays at the default.
+        default: the value without a request for another one.
+        unit: for people.
+        help: for people.
+        option: of a scenario argument, its target: an option of SUMO such as ``scale``, or a dotted entry of an
+            environment's configuration or keywords such as ``observation.vehicles_count``. Without an option, it
+            fills ``${NAME}`` in SUMO's route and additional files, or sets the entry of its own name.
+    """
+
+    range: str = ""
+    default: bool | int | float | str | None = None
+    unit: str = ""
+    help: str = ""
+    option: str = ""
+
+    def argument(self, name: str, where: str) -> Argument:
+        """Return what this says about the argument ``name``."""
+        kind: Kind | None = kind_of(self.default) if self.default is not None else None
+        distribution = parse_spec(self.range, kind, where=f"{where}.{name}.range") if self.range else None
+        return Argument(name, kind, self.default, distribution, self.unit, self.help)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSetup:
+    """``[agents.ID]``: one controlled vehicle and who drives it. All but the first and the last are SUMO's.
+
+    Args:
+        agent: ``module:attribute``, or the name of a registered agent.
+        existing: take over the vehicle ID of the traffic; otherwise one with that id is added.
+        replaces: the name of a scenario argument that names a vehicle of the traffic: when that has entered, this one
+            drives on in its place.
+        type: the vehicle type of the added one.
+        route: the route of the added one, by its id.
+        edges: or the edges that it drives along (two: the way between them is looked up).
+        depart_s: when it enters, in s of simulation time; the end of the warm-up by default. Of one that ``replaces``
+            another, the latest time at which that may be expected.
+        depart_lane: as SUMO's departLane.
+        depart_pos: as SUMO's departPos.
+        depart_speed: as SUMO's departSpeed.
+        action: ``continuous`` is (target speed, lane change); ``meta`` is highway-env's DiscreteMetaAction.
+        target_speeds: the speeds that FASTER and SLOWER of ``meta`` step through, in m/s.
+        speed_mode: SUMO's speed mode bits; 6 keeps physical limits and ignores the safe speed.
+        arguments: what is known about the agent's arguments here.
+    """
+
+    agent: str = DEFAULT_AGENT
+    existing: bool = False
+    replaces: str = ""
+    type: str = "DEFAULT_VEHTYPE"
+    route: str = ""
+    edges: tuple[str, ...] = ()
+    depart_s: float | None = None
+    depart_lane: str = "best"
+    depart_pos: str = "base"
+    depart_speed: str = "max"
+    action: Literal["continuous", "meta"] = "continuous"
+    target_speeds: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
+    speed_mode: int = 6
+    arguments: dict[str, ArgumentSetup] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationSetup:
+    """``[observation]``: what an agent is shown; the layout is highway-env's Kinematics.
+
+    Args:
+        vehicles: rows: the controlled vehicle and its nearest actors.
+        features: columns; ``kind`` says what a row is: 1 a motor vehicle, 2 a two-wheeler, 3 a person on foot, 4 what
+            runs on rails, 5 an obstacle.
+        normalize: scale to [-1, 1] by highway-env's ranges.
+    """
+
+    vehicles: int = 8
+    features: tuple[Literal["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind"], ...] = (
+        "presence",
+        "x",
+        "y",
+        "vx",
+        "vy",
+        "cos_h",
+        "sin_h",
+    )
+    normalize: bool = False
+
 
 STEP_LENGTH_S = 0.1  # ten decisions a second, as drivers' models are made for
 T = TypeVar("T")
@@ -37,7 +149,7 @@ class Scenario:
         observation: what agents are shown; None for what the simulator shows of itself, or the default.
         arguments: the arguments that shape the traffic.
         agents: agent id to controlled vehicle.
-        tables: what simulators of their own want to know, by the name of the table; in the file, they stand beside
+        tables: the tables of plugin simulators by name; in the file, they are on the same level as
             these keys. Each is of the dataclass that the simulator's `Backend` says.
         events: limits of traffic events, such as ``not_moving`` in s, where they are not the default.
         disturbances: how often others err, or an agent sees or acts late: name to a rate per second. Hunts heed it, and
@@ -163,3 +275,54 @@ def with_action(scenario: Scenario, agent: str, action: str) -> Scenario:
 def argument_values(scenario: Scenario) -> dict[str, Value]:
     """Return the default of every scenario argument."""
     return {name: setup.default for name, setup in scenario.arguments.items() if setup.default is not None}
+
+
+# A digest of what a scenario is: its files, and what it says.
+
+
+class HasDigest(TypedDict):
+    """What is written down of a file."""
+
+    blake2b: str
+
+
+def scenario_digest(scenario: Scenario) -> str:
+    """Return a digest of the scenario's files and settings, independent of its agents."""
+    files: dict[str, HasDigest] = {
+        name: {"blake2b": digest_of_file(scenario.folder / name)} for name in scenario.files()
+    }
+    plain = as_plain_data(scenario)
+    del plain["agents"]
+    files[""] = {"blake2b": json.dumps(plain, sort_keys=True)}
+    return digest_of_described(files)
+
+
+def digest_of_described(files: Mapping[str, HasDigest], *, says: object = None) -> str:
+    """Return a digest of files that have been described (name to an entry with ``blake2b``), and of plain data."""
+    content = {name: entry["blake2b"] for name, entry in files.items()}
+    text = json.dumps(content if says is None else [content, says], sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def as_in_file(data: Plain) -> dict[str, object]:
+    """Return the fields of a scenario as plain data, in which the simulator's table stands where it does in a file."""
+    found: dict[str, object] = {}
+    for key, value in data.items():
+        found |= value if key == "tables" and isinstance(value, dict) else {key: value}
+    return found
+
+
+def as_plain_data(scenario: Scenario) -> dict[str, object]:
+    """Return a scenario as plain data that TOML can hold, without values that belong to this process only."""
+
+    def plain(value: object) -> object:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items() if item is not None}
+        return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+    said = asdict(replace(scenario, folder=Path()))
+    data = as_in_file({key: plain(value) for key, value in said.items() if value is not None})
+    for later in ("events", "disturbances"):  # which an earlier crashhunt does not know
+        if not data[later]:
+            del data[later]
+    return {key: value for key, value in data.items() if key not in ("folder", "file", "notes", "added")}

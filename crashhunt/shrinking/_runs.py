@@ -13,18 +13,17 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, RecorderError
 from crashhunt.base.integrity import digest_of_data
-from crashhunt.crashes import write_bundle
+from crashhunt.crashes import signature_of, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor, read_map
 from crashhunt.replays import is_todays
-from crashhunt.triage import signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from crashhunt.base.watching import Watch
+    from crashhunt.crashes import Signature
     from crashhunt.replays import Rerun
-    from crashhunt.triage import Signature
     from crashhunt.trial import TrialResult, TrialSpec
 
 __all__ = ["OutOfTimeError", "Ran", "Runs", "StoppedError", "is_same"]

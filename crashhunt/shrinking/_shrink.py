@@ -4,57 +4,33 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, TypedDict
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.temporary import remove_at_once, temporary_folder
-from crashhunt.crashes import is_bundle_made_here, write_bundle
+from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
 from crashhunt.executors import FreshProcessExecutor, read_map
 from crashhunt.replays import ReplayOptions, confirm, prepare
 from crashhunt.shrinking._runs import Runs, is_same
 from crashhunt.shrinking._stages import Ended, Form, Search
-from crashhunt.triage import signature_of
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.base.watching import Watch
-    from crashhunt.crashes import Bundle
+    from crashhunt.crashes import Bundle, Signature
     from crashhunt.replays import Rerun
-    from crashhunt.triage import Signature
     from crashhunt.trial import TrialResult, TrialSpec, Value
 
-__all__ = ["Shrunk", "ShrunkData", "shrink", "shrunk_name"]
+__all__ = ["Shrunk", "shrink", "shrunk_name"]
 
 Verdict = Literal["shrunk", "unchanged", "not_reproduced"]
 _TRIES = 3  # of what is left of a flaky crash
 _WRITE_AGAIN = "free some space and run the same command again: what came of the trials is remembered"
-
-
-class ShrunkData(TypedDict):
-    """What ``shrink --json`` prints."""
-
-    crash: str
-    path: str | None
-    verdict: Verdict
-    ended: Ended
-    why: str
-    signature_kept: bool
-    confirmed: bool | None
-    actors_before: int
-    actors_after: int
-    steps_before: int
-    steps_after: int
-    trials_run: int
-    steps_run: int
-    removed: list[str]
-    changed: dict[str, list[Value | None]]
-    scripted: list[str] | None
-    steps_cut: int
-    notes: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +71,7 @@ class Shrunk:
         script = self.small.result.spec.script if self.small is not None else None
         return None if script is None else script.names
 
-    def to_json(self) -> ShrunkData:
+    def to_json(self) -> JsonObject:
         """Return the shape that ``shrink --json`` prints."""
         after = self.small or self.bundle
         return {

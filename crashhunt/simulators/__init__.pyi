@@ -4,16 +4,15 @@ from ._actions import (
     SpaceAction as SpaceAction,
     SpeedAndLaneChange as SpeedAndLaneChange,
 )
-from ._foreign_spaces import action_form as action_form, native as native
+from ._gymnasium import action_form as action_form, native as native
 from ._kinematics import Kinematics as Kinematics
 from ._protocol import (
     FACULTIES as FACULTIES,
     ActionForm as ActionForm,
+    ActiveDisturbance as ActiveDisturbance,
     AtOnce as AtOnce,
     BrakesFully as BrakesFully,
     CountsSetUp as CountsSetUp,
-    Disturbing as Disturbing,
-    Disturbs as Disturbs,
     FlattensObservations as FlattensObservations,
     FullBraking as FullBraking,
     HasMap as HasMap,
@@ -28,9 +27,11 @@ from ._protocol import (
     Options as Options,
     PlaysPaths as PlaysPaths,
     ReadiesProcess as ReadiesProcess,
+    Reseeds as Reseeds,
     Simulator as Simulator,
     StepResult as StepResult,
     StepsAtOnce as StepsAtOnce,
+    SupportsDisturbances as SupportsDisturbances,
     TellsEvents as TellsEvents,
     TellsNotices as TellsNotices,
     Tidies as Tidies,

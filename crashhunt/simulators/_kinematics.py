@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from crashhunt.scenario import ObservationSetup
     from crashhunt.world import Scene
 
-__all__ = ["Kinematics"]
+
+__all__ = ["Kinematics", "Unseen"]
+
 
 _SINGLE = np.dtype("<f4")
 _ALL = ("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "kind")
@@ -164,3 +166,30 @@ class Kinematics:
             return self._select(tuple(scaled))
 
         return select
+
+
+# A vehicle that an agent does not see for a while; it is left out of the observation, and nothing else changes.
+
+
+class Unseen:
+    """Hides one vehicle from one agent, from the next observation on.
+
+    Args:
+        kinematics: which makes the observations.
+        agent: who does not see it.
+        vehicle: whom.
+    """
+
+    how_strong = 1.0
+
+    def __init__(self, kinematics: Kinematics, agent: str, vehicle: str) -> None:
+        self._hidden = kinematics.hidden
+        self._pair = agent, vehicle
+        self._hidden.add(self._pair)
+
+    def keep(self) -> None:
+        """It stays hidden."""
+
+    def end(self) -> None:
+        """Show it again."""
+        self._hidden.discard(self._pair)

@@ -21,11 +21,10 @@ if TYPE_CHECKING:
 __all__ = [
     "FACULTIES",
     "ActionForm",
+    "ActiveDisturbance",
     "AtOnce",
     "BrakesFully",
     "CountsSetUp",
-    "Disturbing",
-    "Disturbs",
     "FlattensObservations",
     "FullBraking",
     "HasMap",
@@ -39,9 +38,11 @@ __all__ = [
     "Observations",
     "Options",
     "PlaysPaths",
+    "Reseeds",
     "Simulator",
     "StepResult",
     "StepsAtOnce",
+    "SupportsDisturbances",
     "TellsEvents",
     "TellsNotices",
     "Tidies",
@@ -107,10 +108,10 @@ class Simulator(Protocol):
 
     Contract: between two calls of `reset` with equal arguments, everything that any method returns is equal to the
     bit, in this process and in another, whatever ran before. All arrays that are handed out stay as they are.
-    What not every simulator can do is a protocol of its own, of which each offers as many as it likes: `TellsNotices`,
-    `FlattensObservations`, `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `Disturbs`,
-    `HoldsBack`, `LeavesOut`, `PlaysPaths`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. Nothing is registered: a
-    simulator that has the methods and attributes of one offers it.
+    What only some simulators can do is a protocol of its own: `TellsNotices`, `FlattensObservations`,
+    `NamesObservations`, `TellsEvents`, `HasMap`, `HasWindow`, `BrakesFully`, `SupportsDisturbances`, `HoldsBack`,
+    `LeavesOut`, `PlaysPaths`, `Reseeds`, `CountsSetUp`, `Tidies` and `ReadiesProcess`. A simulator supports one
+    by having its methods and attributes; there is nothing to register.
     """
 
     @property
@@ -243,7 +244,7 @@ class BrakesFully(Protocol):
         """Return how; None where this vehicle's actions do not keep it in its lane. Called after `Simulator.reset`."""
 
 
-class Disturbing(Protocol):
+class ActiveDisturbance(Protocol):
     """A vehicle that errs; it has begun to with the next step."""
 
     @property
@@ -257,7 +258,7 @@ class Disturbing(Protocol):
         """Let the vehicle drive by itself again from the next step on. It may be gone."""
 
 
-class Disturbs(Protocol):
+class SupportsDisturbances(Protocol):
     """A simulator that can have others than the agents err.
 
     Contract: an erring vehicle does what vehicles of its type can do, and is never one of the agents'. Only one
@@ -268,18 +269,18 @@ class Disturbs(Protocol):
     def disturbing_kinds(self) -> Sequence[str]:
         """What it can do, such as ``brake``."""
 
-    def whom(self, disturbance: Disturbance) -> str:
+    def resolve_target(self, disturbance: Disturbance) -> str:
         """Return which vehicle is meant, as it is now; empty where there is none.
 
         Args:
             disturbance: says the agent, and the place around it.
         """
 
-    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
         """Have a vehicle err from the next step on; None where it cannot, as where there is no lane to change to.
 
         Args:
-            vehicle: as `whom` has just said.
+            vehicle: as `resolve_target` has just said.
             disturbance: what it is to do.
         """
 
@@ -287,7 +288,7 @@ class Disturbs(Protocol):
 class HoldsBack(Protocol):
     """A simulator that can keep one of the others from doing something, to see what hangs on it."""
 
-    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+    def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
         """Keep a vehicle from something, from the next step on; None where that cannot be.
 
         Args:
@@ -311,6 +312,25 @@ class PlaysPaths(Protocol):
     @property
     def scripted(self) -> bool:
         """Whether the others of this episode are moved along recorded ways."""
+
+
+class Reseeds(Protocol):
+    """A simulator whose random generators can get another seed between two steps.
+
+    Contract: after `reseed`, the steps that follow are a function of the state and of this seed. What the generators
+    returned before changes nothing.
+    """
+
+    @property
+    def why_no_reseeding(self) -> str:
+        """Why that is not possible here, as a sentence without its period; empty where it is."""
+
+    def reseed(self, seed: int) -> None:
+        """Give all generators another seed, from the next step on.
+
+        Args:
+            seed: 0 to 2**31 - 1.
+        """
 
 
 class CountsSetUp(Protocol):
@@ -357,7 +377,7 @@ class AtOnce(Protocol):
     core: UsualSteps
     """What takes a step, and says what has come of it."""
 
-    def stands_for(self, simulator: Simulator, /) -> bool:
+    def is_unpatched(self, simulator: Simulator, /) -> bool:
         """Whether it does what a simulator does: not where somebody has wrapped that, or a method of it."""
 
     @property
@@ -397,10 +417,11 @@ FACULTIES: tuple[type, ...] = (
     HasMap,
     HasWindow,
     BrakesFully,
-    Disturbs,
+    SupportsDisturbances,
     HoldsBack,
     LeavesOut,
     PlaysPaths,
+    Reseeds,
     StepsAtOnce,
     CountsSetUp,
     Tidies,

@@ -15,8 +15,7 @@ from crashhunt.base.plugins import load_object
 from crashhunt.base.text import encodable
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.gym import GymSetup
-from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, native
-from crashhunt.simulators._options import as_tables, merge
+from crashhunt.simulators._gymnasium import ObservationForm, action_form, as_tables, merge, native, reseed_in_place
 from crashhunt.world import Contact, Roster, Scene
 
 if TYPE_CHECKING:
@@ -84,6 +83,12 @@ class GymSimulator:
         self.named_danger = None
         self._look("")
         return {self._agent: self._shown(observation)}, {self._agent: info}
+
+    why_no_reseeding = ""
+
+    def reseed(self, seed: int) -> None:
+        """Give Gymnasium's generator of the environment another seed; generators of its own keep theirs."""
+        reseed_in_place(self._env.unwrapped.np_random, seed)
 
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Step the environment."""

@@ -16,9 +16,8 @@ import numpy as np
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
 from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators._unseen import Unseen
 from crashhunt.world import Actor, Contact, Lane, Roster, Scene
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
+    from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance
 
 __all__ = ["ToySimulator"]
@@ -82,6 +81,12 @@ class ToySimulator:
         self._look(())
         return {agent: self._observe(agent) for agent in self.agents}, {}
 
+    why_no_reseeding = ""
+
+    def reseed(self, seed: int) -> None:
+        """Draw when the leader brakes from another seed."""
+        self._rng = np.random.default_rng(seed)
+
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Move everybody; the reward is the distance driven, in m."""
         self._step += 1
@@ -129,18 +134,18 @@ class ToySimulator:
 
     disturbing_kinds = ("brake", "stop", "unseen")
 
-    def whom(self, disturbance: Disturbance) -> str:
+    def resolve_target(self, disturbance: Disturbance) -> str:
         """Return the leader where it is next ahead; everybody else is an agent."""
         ahead = [name for name, x in self._x.items() if x > self._x.get(disturbance.agent, np.inf)]
         return _LEADER if disturbance.who == "ahead" and ahead == [_LEADER] else ""
 
-    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing:
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance:
         """Brake, as hard as vehicles can at most, or be unseen."""
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return _Braking(self, vehicle, min(disturbance.how_strong, _BRAKING))
 
-    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+    def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
         """Hold the leader to its speed; there is but one lane, and it stays on it."""
         return _Steady(self, vehicle) if vehicle == _LEADER and what == "keep_speed" else None
 

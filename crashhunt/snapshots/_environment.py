@@ -14,7 +14,7 @@ from crashhunt.base.plugins import distributions as installed
 from crashhunt.scenario import installed_backends
 
 if TYPE_CHECKING:
-    from crashhunt.snapshots._data import Environment
+    from crashhunt.snapshots._snapshot import Environment
 
 __all__ = ["environment", "environment_changes", "processor", "versions"]
 

@@ -6,26 +6,76 @@ import hashlib
 import importlib.machinery
 import json
 import os
+import shutil
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.authentication import authentication_code, is_authentic
 from crashhunt.base.errors import BundleError
 from crashhunt.base.integrity import (
     FILES,
+    authentication_code,
     changed_file,
+    describe_files,
     digest_of_data,
+    is_authentic,
     read_object,
     typed,
 )
 from crashhunt.base.tolerance import typed_where_there
 from crashhunt.plans import HuntSettings, read_settings
 from crashhunt.scenario import Scenario, digest_of_described, load_scenario
-from crashhunt.snapshots._data import Environment, Manifest
 
-__all__ = ["Snapshot", "code_of_manifest", "latest_snapshot"]
+if TYPE_CHECKING:
+    from crashhunt.base.integrity import FileEntry
+
+
+__all__ = ["Environment", "Manifest", "Snapshot", "code_of_manifest", "latest_snapshot", "without_code"]
+
+
+# The shapes of what describes a snapshot: ``manifest.json`` and ``environment.json``.
+
+
+class Manifest(TypedDict):
+    """``manifest.json``: which files there are, and from where modules are imported.
+
+    ``described`` are the files that say what the snapshot is and are no part of its digest; the earliest had neither
+    them nor ``integrity``. ``authentication_code`` proves to the user who took the snapshot that it is unchanged.
+    """
+
+    schema: int
+    paths: list[str]
+    argument_files: dict[str, str]
+    left_out: list[str]
+    files: dict[str, FileEntry]
+    described: NotRequired[dict[str, FileEntry]]
+    authentication_code: NotRequired[str]
+    integrity: NotRequired[str]
+
+
+class Environment(TypedDict):
+    """``environment.json``: what a result depends on besides code. ``git`` has the revision of each work tree.
+
+    ``core`` is whether the simulator's compiled core was used, which makes no difference to results. ``load_order`` is
+    ``fixed`` or ``not fixed: REASON`` where results depend on an order at load; snapshots of earlier versions lack it.
+    """
+
+    schema: int
+    python: str
+    implementation: str
+    platform: str
+    machine: str
+    cpu: str
+    versions: dict[str, str]
+    distributions: dict[str, str]
+    loaded: list[str]
+    variables: dict[str, str]
+    core: NotRequired[str]
+    load_order: NotRequired[str]
+    git: NotRequired[dict[str, str]]
+
 
 SCHEMA = 2
 _PROTECTED = 2  # the first version with a digest of its manifest and of what describes the rest
@@ -240,3 +290,50 @@ def latest_snapshot(hunt: Path) -> Snapshot | None:
     """Return the snapshot that a hunt took last; None where it has none."""
     found = sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN), key=lambda path: path.stat().st_mtime)
     return Snapshot(found[-1]) if found else None
+
+
+# A snapshot without its code: the scenario alone, for whoever runs it with today's code.
+
+
+def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
+    """Copy what of a snapshot is no code: the scenario with its files, and on what its results depended.
+
+    Args:
+        snapshot: of a hunt; nobody else needs to have it looked at.
+        snapshots: the folder to make the copy in.
+
+    Raises:
+        BundleError: a file of it is missing or has changed.
+        OSError: it cannot be written.
+    """
+    kept = {
+        name: entry
+        for name, entry in snapshot.manifest["files"].items()
+        if name.startswith(f"{layout.SCENARIO_FILES}/")
+    }
+    digest = digest_of_described(kept, says=[[], {}])
+    final = snapshots / digest
+    (final / layout.SCENARIO_FILES).mkdir(parents=True)
+    for name, entry in kept.items():
+        wrong = changed_file(snapshot.path / name, entry)
+        if wrong:
+            fix = "get an undamaged copy of the hunt's directory"
+            raise BundleError(f"the snapshot is damaged: {name} {wrong}", fix=fix, where=str(snapshot.path))
+        (final / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(snapshot.path / name, final / name)
+    shutil.copyfile(snapshot.path / layout.HUNT, final / layout.HUNT)
+    environment = json.dumps(_of_simulation(snapshot.environment()), indent=1)
+    (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")
+    manifest: Manifest = {"schema": SCHEMA, "paths": [], "argument_files": {}, "left_out": [], "files": kept}
+    manifest["described"] = describe_files(final)
+    manifest["authentication_code"] = code_of_manifest(manifest)
+    manifest["integrity"] = digest_of_data(manifest)
+    (final / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    return Snapshot(final)
+
+
+def _of_simulation(found: Environment) -> Environment:
+    """What a result depends on; not what else was installed, nor the folders of whoever ran it."""
+    loaded = set(found["loaded"])
+    distributions = {name: version for name, version in found["distributions"].items() if name in loaded}
+    return {**found, "distributions": distributions, "variables": {}, "git": {}}

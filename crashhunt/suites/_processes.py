@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,12 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.authentication import authentication_code
-from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UsageError
+from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import exchange, put_in_place, whole_file
+from crashhunt.base.integrity import authentication_code, is_authentic
 from crashhunt.base.signals import stop_requests
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.hunts import HuntDirectory, Ledger
+from crashhunt.crashes import add_trusted, describe_code, is_fingerprint_trusted, is_hunt_trusted, trust_snapshot
+from crashhunt.hunts import HuntDirectory
+from crashhunt.ledger import Ledger
 from crashhunt.plans import (
     Request,
     RunSettings,
@@ -33,25 +37,29 @@ from crashhunt.plans import (
     read_settings,
     with_settings,
 )
-from crashhunt.scenario import load_scenario
-from crashhunt.snapshots import SnapshotOptions, latest_snapshot
+from crashhunt.snapshots import Snapshot, SnapshotOptions, latest_snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from crashhunt.crashes import TrustedOrigin
     from crashhunt.plans import Given, HuntSettings
     from crashhunt.scenario import Scenario
+
 
 __all__ = [
     "PURPOSE_OF_REQUEST",
     "REQUEST",
     "RunRequest",
     "check_machine",
+    "refuse_untrusted_hunt",
     "run_all",
     "set_aside",
     "slots_of",
+    "trust_hunt",
     "write_request",
 ]
+
 
 REQUEST = layout.REQUEST
 PURPOSE_OF_REQUEST = "request of a suite"  # of its authentication code
@@ -279,14 +287,17 @@ def _main(folder: Path, run: Given, parent: int) -> None:
 
 def _planned(folder: Path, request: Request, run: Given) -> tuple[Scenario, HuntSettings]:
     """What to run: what is there already, or what was asked for."""
-    if not (folder / layout.HUNT).exists():
+    begun, snapshot = (folder / layout.HUNT).exists(), latest_snapshot(folder)
+    if not begun or snapshot is None:
         from crashhunt.hunts import TrafficSurveyor
 
         survey = TrafficSurveyor(folder, overwrite=False)
-        return plan(replace(request, run=replace(request.run, **run)), survey=survey)
+        scenario, settings = plan(replace(request, run=replace(request.run, **run)), survey=survey)
+        if not begun:
+            return scenario, settings
+    else:
+        scenario = snapshot.scenario()
     settings = read_settings(folder / layout.HUNT)
-    snapshot = latest_snapshot(folder)
-    scenario = load_scenario(request.scenario, ego=request.ego) if snapshot is None else snapshot.scenario()
     return with_settings(scenario, settings), replace(settings, run=replace(settings.run, **run))
 
 
@@ -301,3 +312,73 @@ def _fail(folder: Path, message: str, trace: str) -> None:
 
 if __name__ == "__main__":
     _main(Path(sys.argv[1]), json.loads(sys.argv[2]), int(sys.argv[3]))
+
+
+# Whether a hunt may run again without asking: what it names is imported, so it has to be trusted first.
+
+
+def refuse_untrusted_hunt(hunt: Path) -> None:
+    """Refuse to run a hunt again that is neither made here nor trusted.
+
+    Raises:
+        UntrustedError: with what would be imported.
+    """
+    requested = (hunt / REQUEST).exists()
+    begun = (hunt / layout.HUNT).exists()
+    snapshot = latest_snapshot(hunt) if begun else None
+    trusted = not requested or _is_request_trusted(hunt / REQUEST)
+    if snapshot is not None:
+        trusted = trusted and is_hunt_trusted(hunt, snapshot)
+    elif not requested:  # it was killed before it had a snapshot, so nothing proves anything
+        trusted = False
+    if trusted:
+        return
+    try:
+        if snapshot is not None:
+            runs = describe_code(snapshot, read_settings(hunt / layout.HUNT))
+        else:
+            request = RunRequest.read(hunt / REQUEST)
+            runs = f"{', '.join(request.request.agents.values()) or 'its agents'}, imported from {request.folder}"
+    except CrashhuntError as error:
+        runs = f"what cannot be described: {error.message}"
+    raise UntrustedError(
+        "nothing proves that you began this hunt on this machine (earlier versions of crashhunt wrote no proof), and "
+        f"running it again would run code: {runs}",
+        fix=f"if you trust that code, run crashhunt trust {shlex.quote(str(hunt))} once, or add --trust",
+        where=str(hunt),
+    )
+
+
+def trust_hunt(hunt: Path, path: Path) -> list[TrustedOrigin]:
+    """Trust all code of a hunt from now on, and return the entries.
+
+    Args:
+        hunt: its directory.
+        path: what the user named.
+
+    Raises:
+        BundleError: a snapshot is damaged.
+        HuntDirectoryError: an entry cannot be written.
+    """
+    places = sorted((hunt / layout.SNAPSHOTS).glob(layout.SHOWN))
+    for place in places:
+        Snapshot(place).verify()
+    found = [trust_snapshot(Snapshot(place), path) for place in places]
+    if (hunt / REQUEST).is_file():
+        agents = RunRequest.read(hunt / REQUEST).request.agents.values()
+        runs = f"the request of a suite for {', '.join(agents) or 'the agents of its scenario'}"
+        found.append(add_trusted(_fingerprint(hunt / REQUEST), path=str(path.resolve()), runs=runs))
+    return found
+
+
+def _is_request_trusted(file: Path) -> bool:
+    try:
+        data = json.loads(file.read_bytes())
+        code = data.pop("authentication_code", None)
+        return is_authentic(PURPOSE_OF_REQUEST, data, code) or is_fingerprint_trusted(_fingerprint(file))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return False
+
+
+def _fingerprint(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()

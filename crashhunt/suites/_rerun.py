@@ -13,12 +13,20 @@ from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.base.files import is_empty_folder, sync_folder
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.disturbances import NONE
-from crashhunt.hunts import HuntState, Ledger, hunt_state
+from crashhunt.hunts import HuntState, hunt_state
+from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Owners, Request, Takes, TrialOptions, fields_of, read_settings, takes_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import latest_snapshot
-from crashhunt.suites._origins import refuse_untrusted_hunt
-from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, set_aside, write_request
+from crashhunt.suites._processes import (
+    REQUEST,
+    RunRequest,
+    check_machine,
+    refuse_untrusted_hunt,
+    run_all,
+    set_aside,
+    write_request,
+)
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:

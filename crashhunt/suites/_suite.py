@@ -14,13 +14,19 @@ import numpy as np
 
 from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import HuntDirectoryError, UsageError
-from crashhunt.base.names import near_path
+from crashhunt.base.text import near_path
 from crashhunt.base.validation import validate
 from crashhunt.hunts import HuntState, hunt_state, is_hunt
 from crashhunt.plans import HuntOptions, Request, SnapshotChoices, fields_of, request_of
 from crashhunt.scenario import load_scenario, shipped_scenarios
-from crashhunt.suites._origins import refuse_untrusted_hunt
-from crashhunt.suites._processes import REQUEST, RunRequest, check_machine, run_all, write_request
+from crashhunt.suites._processes import (
+    REQUEST,
+    RunRequest,
+    check_machine,
+    refuse_untrusted_hunt,
+    run_all,
+    write_request,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

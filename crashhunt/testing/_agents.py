@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crashhunt.agents import Agent, Closes, DrawsPanels, NeedsLibraries
-from crashhunt.base.faculties import offers
+from crashhunt.base.capabilities import supports
 from crashhunt.panels import labelled
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class AgentContract:
             answers = []
             for observation in observations:
                 answers.append(form.encode(agent.act(observation)).tobytes())
-                if looked_at and offers(agent, DrawsPanels):
+                if looked_at and supports(agent, DrawsPanels):
                     panels = labelled(agent.panels())
                     assert len(panels) == len({label for label, _ in panels})
                     for label, panel in panels:
@@ -98,7 +98,7 @@ class AgentContract:
                 agent.reset(1)
             for observation in observations[: max(0, ends_after)]:
                 agent.act(observation)
-            if offers(agent, Closes):
+            if supports(agent, Closes):
                 agent.close()
         agent = make()
         agent.reset(1)
@@ -107,6 +107,6 @@ class AgentContract:
     def test_the_libraries_that_it_needs_are_names(self, make: Make) -> None:
         """`NeedsLibraries`: a sequence of names of modules, and not one text."""
         kind = type(make())
-        libraries: Sequence[str] = kind.libraries if offers(kind, NeedsLibraries) else ()
+        libraries: Sequence[str] = kind.libraries if supports(kind, NeedsLibraries) else ()
         assert not isinstance(libraries, str)
         assert all(part.isidentifier() for name in libraries for part in name.split("."))

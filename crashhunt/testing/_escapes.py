@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from crashhunt.base.faculties import offers
+from crashhunt.base.capabilities import supports
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.crashes import partner
 from crashhunt.executors import FreshProcessExecutor
@@ -63,7 +63,7 @@ class RecordedThenBrakes:
     def __init__(self, log: str, agent: str, after: int, action_space: Any) -> None:
         self._actions = read_log(Path(log)).actions(agent)
         self._after = after
-        meta = offers(action_space, HasMeanings)
+        meta = supports(action_space, HasMeanings)
         self._brake: object = tuple(action_space.meanings).index("SLOWER") if meta else (0.0, 0)
         self._step = 0
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.base.faculties import offers
+from crashhunt.base.capabilities import supports
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import Executor, HasNodes
 from crashhunt.recording import Recording, read_black_box
@@ -86,7 +86,7 @@ class ExecutorContract:
         assert [found[spec.number].spec for spec in specs] == specs
         assert {result.outcome for result in found.values()} == {Outcome.SURVIVED}
         assert list(executor.completed(0.0)) == []
-        if offers(executor, HasNodes):
+        if supports(executor, HasNodes):
             self._see_nodes(executor, executor, len(specs))
 
     def test_a_failure_costs_its_own_trial_only(self, executor: Executor) -> None:

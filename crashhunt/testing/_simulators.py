@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from crashhunt.base.capabilities import members, supports
 from crashhunt.base.errors import ActionError
-from crashhunt.base.faculties import members, offers
 from crashhunt.simulators import (
     FACULTIES,
     BrakesFully,
     CountsSetUp,
-    Disturbs,
     FlattensObservations,
     FullBraking,
     HasMap,
     NamesObservations,
+    Reseeds,
     Simulator,
+    SupportsDisturbances,
     TellsEvents,
     TellsNotices,
     Tidies,
@@ -55,7 +56,7 @@ class SimulatorContract:
         """Return what makes a simulator."""
         raise NotImplementedError("give the suite a fixture named make")
 
-    def _drive(self, simulator: Simulator, seed: int) -> list[_Shown]:
+    def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
         """Everything that an episode shows, as bytes and numbers."""
         observations, _ = simulator.reset(seed=seed)
         trace: list[_Shown] = [self._shown(simulator, observations, {})]
@@ -63,7 +64,10 @@ class SimulatorContract:
         for agent in simulator.agents:
             simulator.actions[agent].space.seed(3)
             held[agent] = simulator.actions[agent].encode(simulator.actions[agent].space.sample())
-        for _ in range(self.steps):
+        for step in range(self.steps):
+            if reseeded is not None and step == reseeded[0]:
+                assert supports(simulator, Reseeds)
+                simulator.reseed(reseeded[1])
             acting = tuple(simulator.agents)
             if not acting:
                 break
@@ -110,6 +114,19 @@ class SimulatorContract:
         other = self._drive(simulator, 2)
         assert self._drive(simulator, 1) == first
         assert other != first
+        simulator.close()
+
+    def test_another_seed_within_an_episode_changes_only_what_follows(self, make: Make) -> None:
+        """With another seed from a step on, the steps before stay equal, and equal seeds give equal episodes."""
+        simulator = make()
+        if not supports(simulator, Reseeds) or simulator.why_no_reseeding:
+            return
+        first = self._drive(simulator, 1)
+        after = max(0, len(first) // 2 - 1)
+        again = [self._drive(simulator, 1, (after, seed)) for seed in (7, 7, 8)]
+        assert again[0] == again[1]
+        assert all(trace[: after + 1] == first[: after + 1] for trace in again)
+        assert self._drive(simulator, 1) == first
         simulator.close()
 
     def test_a_second_instance_does_the_same(self, make: Make) -> None:
@@ -175,7 +192,7 @@ class SimulatorContract:
         simulator.reset(seed=1)
         names = tuple(simulator.agents)
         brakes: dict[str, FullBraking] = {}
-        if offers(simulator, BrakesFully):
+        if supports(simulator, BrakesFully):
             for name in names:
                 braking = simulator.full_braking(name)
                 if braking is not None:
@@ -198,7 +215,7 @@ class SimulatorContract:
         """`HasMap`: lanes have a name of their own, a width and at least two points; and they stay the same."""
         simulator = make()
         simulator.reset(seed=1)
-        if offers(simulator, HasMap):
+        if supports(simulator, HasMap):
             lanes = list(simulator.lanes())
             assert len({lane.id for lane in lanes}) == len(lanes)
             for lane in lanes:
@@ -213,7 +230,7 @@ class SimulatorContract:
         """`FlattensObservations`: what an agent is shown is unflattened from what is recorded, and flattens to it."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
-        shown = simulator.shown_spaces if offers(simulator, FlattensObservations) else {}
+        shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         assert set(shown) <= set(observations)
         for agent, space in shown.items():
             seen: object = spaces.unflatten(space, observations[agent])
@@ -225,7 +242,7 @@ class SimulatorContract:
         """`NamesObservations`: as many names as the last axis is long, where there are any."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
-        names = tuple(simulator.observation_names) if offers(simulator, NamesObservations) else ()
+        names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
         assert all(isinstance(name, str) for name in names)
         assert len(set(names)) == len(names)
         assert not names or all(observation.shape[-1] == len(names) for observation in observations.values())
@@ -234,15 +251,15 @@ class SimulatorContract:
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
         """`TellsEvents`: its scenes have events of those kinds only, and none without it."""
         simulator = make()
-        kinds = tuple(simulator.told_events) if offers(simulator, TellsEvents) else ()
+        kinds = tuple(simulator.told_events) if supports(simulator, TellsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
         simulator.close()
 
     def test_others_err_and_the_next_episode_knows_nothing_of_it(self, make: Make) -> None:
-        """`Disturbs`: who is meant is in the scene and no agent; what goes on is forgotten by the next `reset`."""
+        """`SupportsDisturbances`: a target is in the scene and is no agent; `reset` ends every disturbance."""
         simulator = make()
-        if not offers(simulator, Disturbs):
+        if not supports(simulator, SupportsDisturbances):
             simulator.close()
             return
         assert all(isinstance(kind, str) for kind in simulator.disturbing_kinds)
@@ -256,7 +273,7 @@ class SimulatorContract:
         for number, kind in enumerate(simulator.disturbing_kinds):
             for cell in CELLS:
                 planned = Disturbance(number + 1, cell, kind, 0.5, 1.0, agents[0])
-                vehicle = simulator.whom(planned)
+                vehicle = simulator.resolve_target(planned)
                 assert vehicle == "" or vehicle in simulator.scene().roster.index
                 assert vehicle not in agents
                 if vehicle and vehicle not in erring:
@@ -276,7 +293,7 @@ class SimulatorContract:
     def test_notices_are_lines(self, make: Make) -> None:
         """`TellsNotices`: each is one line of text."""
         simulator = make()
-        if offers(simulator, TellsNotices):
+        if supports(simulator, TellsNotices):
             self._drive(simulator, 1)
             for notice in simulator.notices:
                 assert isinstance(notice, str)
@@ -287,7 +304,7 @@ class SimulatorContract:
         """`CountsSetUp`: a number of steps, after each reset."""
         simulator = make()
         simulator.reset(seed=1)
-        if offers(simulator, CountsSetUp):
+        if supports(simulator, CountsSetUp):
             steps = simulator.setup_steps
             assert type(steps) is int
             assert steps >= 0
@@ -298,7 +315,7 @@ class SimulatorContract:
     def test_tidying_changes_no_episode(self, make: Make) -> None:
         """`Tidies`: before the first episode, and between two."""
         simulator = make()
-        if not offers(simulator, Tidies):
+        if not supports(simulator, Tidies):
             simulator.close()
             return
         first = self._drive(simulator, 1)
@@ -306,7 +323,7 @@ class SimulatorContract:
         assert self._drive(simulator, 1) == first
         simulator.close()
         fresh = make()
-        assert offers(fresh, Tidies)
+        assert supports(fresh, Tidies)
         fresh.tidy()
         assert self._drive(fresh, 1) == first
         fresh.close()

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, TypedDict
 
 from crashhunt.api import run
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.names import one_of
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.base.text import visible
+from crashhunt.base.text import one_of, visible
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
 from crashhunt.plans import HuntOptions, plan, request_of
@@ -22,9 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle
     from crashhunt.plans import Driver, Spec
-    from crashhunt.trial import DisturbanceData, TrialResult, Value
+    from crashhunt.trial import TrialResult, Value
 
 __all__ = ["Example", "assert_survives"]
 
@@ -44,7 +44,7 @@ class Example(TypedDict, total=False):
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     only: Sequence[str]
-    disturbances: Sequence[DisturbanceData]
+    disturbances: Sequence[JsonObject]
 
 
 def assert_survives(

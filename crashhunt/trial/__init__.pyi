@@ -1,13 +1,7 @@
-from ._branches import Branch as Branch, Branches as Branches
 from ._data import (
-    BranchData as BranchData,
-    BranchesData as BranchesData,
-    CollisionData as CollisionData,
-    DisturbanceData as DisturbanceData,
-    EscapeData as EscapeData,
-    FailureData as FailureData,
-    ResultData as ResultData,
-    SpecData as SpecData,
+    check_disturbances as check_disturbances,
+    check_parts as check_parts,
+    check_plain as check_plain,
 )
 from ._disturbance import (
     CELLS as CELLS,
@@ -28,13 +22,13 @@ from ._outcome import (
     in_order as in_order,
     outcome_of as outcome_of,
 )
-from ._plain import (
-    check_disturbances as check_disturbances,
-    check_parts as check_parts,
-    check_plain as check_plain,
+from ._result import (
+    Branch as Branch,
+    Branches as Branches,
+    Stress as Stress,
+    TrialResult as TrialResult,
+    in_effect as in_effect,
 )
-from ._result import TrialResult as TrialResult, in_effect as in_effect
-from ._signature import Signature as Signature, signature_of as signature_of
 from ._space import (
     Argument as Argument,
     Choice as Choice,
@@ -42,10 +36,17 @@ from ._space import (
     Distribution as Distribution,
     Kind as Kind,
     Range as Range,
+    Signature as Signature,
     Value as Value,
     kind_of as kind_of,
     parse_spec as parse_spec,
+    signature_of as signature_of,
     without_folder as without_folder,
 )
-from ._specification import EVERYBODY as EVERYBODY, Overruled as Overruled, TrialSpec as TrialSpec
-from ._stress import Stress as Stress
+from ._specification import (
+    EVERYBODY as EVERYBODY,
+    Handover as Handover,
+    Overruled as Overruled,
+    Reseeding as Reseeding,
+    TrialSpec as TrialSpec,
+)

@@ -1,176 +1,94 @@
-"""The shapes of a trial's plain data, as it crosses between processes and stands in ledgers and bundles.
+"""Checks of a trial's plain data, as it crosses between processes and stands in ledgers and bundles.
 
 What an earlier version did not write need not be there, and what a later one has added may be there as well.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+import math
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base.codec import plain_types
+from crashhunt.base.integrity import typed
+from crashhunt.base.tolerance import typed_where_there
+from crashhunt.trial._disturbance import Disturbance
+from crashhunt.trial._evidence import Collision, Escape, Failure
+from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from crashhunt.trial._space import Value
-    from crashhunt.world import ClosestData, EventData, PathsData
+    from crashhunt.base.codec import JsonObject
 
-__all__ = [
-    "BranchData",
-    "BranchesData",
-    "CollisionData",
-    "DisturbanceData",
-    "EscapeData",
-    "FailureData",
-    "OverruledData",
-    "ResultData",
-    "SpecData",
-    "SpecExtras",
-    "StressData",
-]
+__all__ = ["check_disturbances", "check_parts", "check_plain"]
 
 
-class OverruledData(TypedDict):
-    """Of an `Overruled`."""
+# The types that the plain data of a trial must have before anything is made of it.
 
-    agent: str
-    after: int
-    manoeuvre: NotRequired[str]
-    keeps: NotRequired[str]
+_TEXT_OR_NUMBER = bool | float | str | None
 
 
-class DisturbanceData(TypedDict):
-    """Of a `Disturbance`."""
-
-    step: int
-    who: str
-    what: str
-    how_strong: float
-    how_long: float
-    agent: str
-    vehicle: NotRequired[str]
+_SPEC = {
+    "arguments": dict[str, dict[str, _TEXT_OR_NUMBER]],
+    "scenario_arguments": dict[str, _TEXT_OR_NUMBER],
+}
 
 
-class SpecExtras(TypedDict, total=False):
-    """What of a `TrialSpec` is left out where there is none; ``requires`` names what another version must know."""
+def check_plain(data: JsonObject) -> None:
+    """See that plain data has the types that `TrialResult.from_json` takes for granted.
 
-    overruled: OverruledData
-    parent: int
-    origin: str
-    disturbances: list[DisturbanceData]
-    only: list[str]
-    script: PathsData
-    requires: list[str]
-
-
-class SpecData(SpecExtras):
-    """Of a `TrialSpec`."""
-
-    number: int
-    seed: int
-    arguments: Mapping[str, Mapping[str, Value]]
-    scenario_arguments: Mapping[str, Value]
-    max_steps: int
-
-
-class CollisionData(TypedDict):
-    """Of a `Collision`; null where nobody knows a number."""
-
-    agent: str
-    role: str
-    collider: str
-    victim: str
-    seen_by: Sequence[str]
-    kind: str
-    x: float | None
-    y: float | None
-    lane: str
-    collider_speed: float | None
-    victim_speed: float | None
-    time_s: float | None
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    typed(data, {"outcome": str, "steps": int, "spec": dict})
+    typed_where_there(data, {"sim_time_s": float, "digest": str, "wall_s": float})
+    spec = data["spec"]
+    typed(spec, dict.fromkeys(("number", "seed", "max_steps"), int))
+    typed_where_there(spec, _SPEC)
+    typed({"events": data.get("events")}, {"events": dict | None})
+    typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
+    for planned in (data.get("disturbances"), spec.get("disturbances")):
+        check_disturbances(planned)
+    typed_where_there(data, dict.fromkeys(("log_likelihood", "danger"), float | None))
+    typed_where_there(data, {"setup_steps": int | None})
+    parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
+    check_parts(data.get("closest", {}), *parts)
+    if min(data["steps"], data.get("setup_steps") or 0, spec["number"], spec["seed"], spec["max_steps"]) < 0:
+        raise ValueError("a number is below 0")
 
 
-class FailureData(TypedDict):
-    """Of a `Failure`."""
+def check_disturbances(disturbances: Sequence[JsonObject] | None) -> None:
+    """See the same of a list of disturbances, where there is one.
 
-    kind: str
-    message: str
-    traceback: str
-    agent: str
-    exit_code: int | None
-    last_output: str
-
-
-class EscapeData(TypedDict):
-    """Of an `Escape`."""
-
-    step: int | None
-    too_late: int | None
-    braking: float | None
-    how: str
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    typed({"disturbances": disturbances}, {"disturbances": list | None})
+    for one in disturbances or ():
+        typed({"disturbance": one}, {"disturbance": dict})
+        _check(one, Disturbance)
+        if one["step"] < 1 or not math.isfinite(one["how_strong"]) or not 0 < one["how_long"] < math.inf:
+            raise ValueError("a disturbance is out of its range")
 
 
-class StressData(TypedDict):
-    """Of a `Stress`; its margin is null where not all was asked."""
+def check_parts(
+    closest: object, collision: object, failure: object, escape: object = None, event: object = None
+) -> None:
+    """See the same of what a trial ended with, where anything is there.
 
-    margin: float | None
-    probes: int
-    steps: int
-    left_out: int
-    disturbance: DisturbanceData | None
-    outcome: str
-    step: int
-    moments: NotRequired[int]
-    moments_asked: NotRequired[int]
-    margin_upper_bound: NotRequired[float | None]
-    why_unasked: NotRequired[str]
-    may_be_asked_again: NotRequired[bool]
-
-
-class BranchData(TypedDict):
-    """Of a `Branch`."""
-
-    disturbances: list[DisturbanceData]
-    branched: int
-    outcome: str
-    step: int
-    log_likelihood: float | None
+    Raises:
+        ValueError: with what is not as it should be.
+    """
+    for name, part, kind in (
+        ("closest", closest, ClosestApproach), ("collision", collision, Collision), ("failure", failure, Failure),
+        ("escape", escape, Escape), ("event", event, Event),
+    ):  # fmt: skip
+        typed({name: part}, {name: dict if name == "closest" else dict | None})
+        if isinstance(part, dict):
+            _check(part, kind)
 
 
-class BranchesData(TypedDict):
-    """Of `Branches`."""
-
-    moments: int
-    asked: int
-    steps: int
-    left_out: int
-    crashes: list[BranchData]
-    unanswered: NotRequired[int]
-    why_unanswered: NotRequired[str]
-    may_be_asked_again: NotRequired[bool]
-
-
-class ResultData(TypedDict):
-    """Of a `TrialResult`; ``category`` is that of an outcome which an oracle has brought."""
-
-    steps: int
-    sim_time_s: float
-    digest: str
-    wall_s: float
-    setup_s: float
-    worker: int
-    kept: bool
-    outcome: str
-    category: NotRequired[str]
-    spec: SpecData
-    closest: ClosestData
-    collision: CollisionData | None
-    failure: FailureData | None
-    escape: NotRequired[EscapeData | None]
-    event: NotRequired[EventData | None]
-    events: NotRequired[dict[str, int] | None]
-    disturbances: NotRequired[list[DisturbanceData]]
-    log_likelihood: NotRequired[float | None]
-    danger: NotRequired[float | None]
-    stress: NotRequired[StressData]
-    branches: NotRequired[BranchesData]
-    setup_steps: NotRequired[int | None]
-    why_no_escape: NotRequired[str]
+def _check(part: JsonObject, kind: Any) -> None:
+    needed, known = plain_types(kind)
+    typed(part, needed)
+    typed_where_there(part, known)

@@ -7,12 +7,10 @@ import sys
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from crashhunt.base.tolerance import known_values
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-    from crashhunt.trial._data import DisturbanceData
 
 __all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of", "why_not"]
 
@@ -94,7 +92,7 @@ def _in_steps(seconds: float, step_length_s: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Disturbance:
+class Disturbance(Serializable):
     """One disturbance: planned, as part of a trial's specification, or as it took place.
 
     Args:
@@ -114,7 +112,7 @@ class Disturbance:
     how_strong: float
     how_long: float
     agent: str = ""
-    vehicle: str = field(default="")
+    vehicle: str = field(default="", metadata=OMIT_DEFAULT)
 
     def took_place(self, vehicle: str, how_strong: float, step_length_s: float = 0.0) -> Disturbance:
         """Return it as it took place: in whole steps, so that with steps of 1 s nothing is 0.2 s late.
@@ -153,25 +151,6 @@ class Disturbance:
     def goes_on(self, step: int, step_length_s: float) -> bool:
         """Whether it goes on in a step, of a simulation with such steps."""
         return self.step <= step < self.step + steps_of(self.how_long, step_length_s)
-
-    def to_json(self) -> DisturbanceData:
-        """Return plain text and numbers; who was meant only where that is known."""
-        data: DisturbanceData = {
-            "step": self.step,
-            "who": self.who,
-            "what": self.what,
-            "how_strong": self.how_strong,
-            "how_long": self.how_long,
-            "agent": self.agent,
-        }
-        if self.vehicle:
-            data["vehicle"] = self.vehicle
-        return data
-
-    @classmethod
-    def from_json(cls, data: DisturbanceData) -> Disturbance:
-        """Rebuild it from plain data."""
-        return cls(**known_values(cls, data))
 
 
 def why_not(one: Disturbance) -> tuple[str, str] | None:

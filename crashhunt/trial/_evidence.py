@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field
+from typing import Final
 
-from crashhunt.base.plain import finite
+from crashhunt.base.codec import Serializable, null_is
 from crashhunt.base.text import encodable
-from crashhunt.base.tolerance import known_values
-
-if TYPE_CHECKING:
-    from crashhunt.base.plain import Plain
-    from crashhunt.trial._data import CollisionData, EscapeData, FailureData
 
 __all__ = ["KILLED", "Collision", "Escape", "Failure"]
 
@@ -21,7 +16,7 @@ KILLED: Final = "killed from outside"
 
 
 @dataclass(frozen=True, slots=True)
-class Collision:
+class Collision(Serializable):
     """Who hit whom, or who left the road.
 
     Args:
@@ -46,35 +41,12 @@ class Collision:
     victim: str = ""
     seen_by: tuple[str, ...] = ()
     kind: str = ""
-    x: float = math.nan
-    y: float = math.nan
+    x: float = field(default=math.nan, metadata=null_is(math.nan))
+    y: float = field(default=math.nan, metadata=null_is(math.nan))
     lane: str = ""
-    collider_speed: float = math.nan
-    victim_speed: float = math.nan
-    time_s: float = math.nan
-
-    @classmethod
-    def from_json(cls, data: Plain) -> Collision:
-        """Rebuild it from plain data, in which null stands for a number that nobody knows."""
-        known = known_values(cls, data, null=math.nan)
-        return cls(**known | {"seen_by": tuple(known.get("seen_by", ()))})
-
-    def to_json(self) -> CollisionData:
-        """Return plain data, in which null stands for a number that nobody knows."""
-        return {
-            "agent": self.agent,
-            "role": self.role,
-            "collider": self.collider,
-            "victim": self.victim,
-            "seen_by": self.seen_by,
-            "kind": self.kind,
-            "x": finite(self.x),
-            "y": finite(self.y),
-            "lane": self.lane,
-            "collider_speed": finite(self.collider_speed),
-            "victim_speed": finite(self.victim_speed),
-            "time_s": finite(self.time_s),
-        }
+    collider_speed: float = field(default=math.nan, metadata=null_is(math.nan))
+    victim_speed: float = field(default=math.nan, metadata=null_is(math.nan))
+    time_s: float = field(default=math.nan, metadata=null_is(math.nan))
 
     @property
     def other(self) -> str:
@@ -85,7 +57,7 @@ class Collision:
 
 
 @dataclass(frozen=True, slots=True)
-class Escape:
+class Escape(Serializable):
     """Until when the agent's brakes would have avoided a collision, found out by running the trial again.
 
     Args:
@@ -95,23 +67,14 @@ class Escape:
         how: how it brakes, in words; one of `FullBraking`.
     """
 
-    step: int | None
-    too_late: int | None
-    braking: float | None
-    how: str
-
-    @classmethod
-    def from_json(cls, data: EscapeData) -> Escape:
-        """Rebuild it from plain data."""
-        return cls(data.get("step"), data.get("too_late"), data.get("braking"), data.get("how", ""))
-
-    def to_json(self) -> EscapeData:
-        """Return plain data."""
-        return {"step": self.step, "too_late": self.too_late, "braking": self.braking, "how": self.how}
+    step: int | None = None
+    too_late: int | None = None
+    braking: float | None = None
+    how: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class Failure(Serializable):
     """What a program did wrong.
 
     Args:
@@ -123,28 +86,12 @@ class Failure:
         last_output: what the process printed last.
     """
 
-    kind: str
-    message: str
+    kind: str = ""
+    message: str = ""
     traceback: str = ""
     agent: str = ""
     exit_code: int | None = None
     last_output: str = ""
-
-    @classmethod
-    def from_json(cls, data: Plain) -> Failure:
-        """Rebuild it from plain data."""
-        return cls(**{"kind": "", "message": "", **known_values(cls, data)})
-
-    def to_json(self) -> FailureData:
-        """Return plain data."""
-        return {
-            "kind": self.kind,
-            "message": self.message,
-            "traceback": self.traceback,
-            "agent": self.agent,
-            "exit_code": self.exit_code,
-            "last_output": self.last_output,
-        }
 
     def __post_init__(self) -> None:
         # It goes into JSON, a log and onto terminals, and what an exception says may be no valid text.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from enum import StrEnum
-from typing import TYPE_CHECKING, Literal, NotRequired, Self, TypedDict, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from crashhunt.world import EVENT_WORDS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
 __all__ = ["CRASHES", "EVENTS", "Category", "Outcome", "in_order", "outcome_of"]
 
@@ -112,14 +112,7 @@ _CATEGORIES: dict[str, Category] = {
 """By outcome; what oracles declare is added. It says how a name is to be read and never changes what a trial does."""
 
 
-class HasOutcome(TypedDict):
-    """Plain data that says how a trial ended."""
-
-    outcome: str
-    category: NotRequired[str]
-
-
-def outcome_of(data: HasOutcome) -> Outcome:
+def outcome_of(data: Mapping[str, Any]) -> Outcome:
     """Return what plain data calls ``outcome``, and an oracle's own with what it calls ``category``.
 
     Raises:
@@ -127,7 +120,7 @@ def outcome_of(data: HasOutcome) -> Outcome:
     """
     outcome = Outcome(data["outcome"])
     if outcome.is_own and "category" in data:
-        return Outcome.own(outcome.value, cast(Category, data["category"]))
+        return Outcome.own(outcome.value, data["category"])
     return outcome
 
 

@@ -2,29 +2,150 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
-from crashhunt.base.plain import finite
-from crashhunt.trial._branches import Branches
+from crashhunt.base.codec import OMIT_DEFAULT, Serializable, from_plain, null_is, written_if
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._evidence import KILLED, Collision, Escape, Failure
 from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
-from crashhunt.trial._stress import Stress
-from crashhunt.trial._summary import summarize
 from crashhunt.world import ClosestApproach, Event
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+__all__ = ["Branch", "Branches", "Stress", "TrialResult", "in_effect", "summarize"]
 
-    from crashhunt.trial._data import ResultData
 
-__all__ = ["TrialResult", "in_effect"]
+_NOT_ALL_ANSWERED = written_if(lambda branches: branches.unanswered)
+_NOT_ALL_ASKED = written_if(lambda stress: stress.margin is None)
+
+
+# What else might have happened: copies of a trial that went on with other disturbances.
 
 
 @dataclass(frozen=True, slots=True)
-class TrialResult:
+class Branch(Serializable):
+    """A branch that crashed, as a specification from the start.
+
+    Args:
+        disturbances: those of the trial up to where it branched, and those of the branch.
+        branched: after which step it left the trial.
+        outcome: of the branch.
+        step: at which it ended.
+        log_likelihood: that just what took place begins in these steps: the natural logarithm of the probability; None
+            where it is none that the hunt's models would draw.
+    """
+
+    disturbances: tuple[Disturbance, ...]
+    branched: int
+    outcome: str
+    step: int
+    log_likelihood: float | None = field(default=None, metadata=null_is(None))
+
+
+@dataclass(frozen=True, slots=True)
+class Branches(Serializable):
+    """What came of the branches of a trial.
+
+    Args:
+        moments: from how many copies went on.
+        asked: how many branches there were.
+        steps: how many steps they took.
+        left_out: how many were left out, because branches had taken enough steps.
+        crashes: those that crashed, in the order in which they were found.
+        unanswered: how many more there were to be, of which no copy answered.
+        why_unanswered: the reason for the first of them, in words; empty where there is none.
+        may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
+    """
+
+    moments: int = 0
+    asked: int = 0
+    steps: int = 0
+    left_out: int = 0
+    crashes: tuple[Branch, ...] = ()
+    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
+    why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
+    may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
+
+    @property
+    def extent(self) -> str:
+        """How much of it was asked, in words: "asked 12 of 13"."""
+        return f"asked {self.asked} of {self.asked + self.unanswered}"
+
+
+# How little it would have taken: what copies of a trial have found out while it ran.
+
+
+@dataclass(frozen=True, slots=True)
+class Stress(Serializable):
+    """What came of asking copies of a trial.
+
+    Args:
+        margin: the strength of the mildest disturbance that made it crash, as a share of the strongest that is
+            plausible; 1 where none did, 0 where it crashed without any. None where not all was asked.
+        probes: how many copies were asked.
+        steps: how many steps they took.
+        left_out: how many questions were left out, because copies had taken enough steps.
+        disturbance: the mildest that made it crash; None where none did.
+        outcome: of that copy.
+        step: at which it ended.
+        moments: at how many moments copies were to be asked; 0 where an earlier version wrote it.
+        moments_asked: at how many of these every copy that was asked answered.
+        margin_upper_bound: where not all was asked, the margin of what was: the whole margin is not greater.
+        why_unasked: why not all was asked, in words; empty where all was.
+        may_be_asked_again: whether the reason lies outside of the trial, so that another run may get all answers.
+    """
+
+    margin: float | None
+    probes: int = 0
+    steps: int = 0
+    left_out: int = 0
+    disturbance: Disturbance | None = None
+    outcome: str = ""
+    step: int = 0
+    moments: int = 0
+    moments_asked: int = 0
+    margin_upper_bound: float | None = field(default=None, metadata=_NOT_ALL_ASKED)
+    why_unasked: str = field(default="", metadata=_NOT_ALL_ASKED)
+    may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ASKED)
+
+    @property
+    def least(self) -> float:
+        """The margin, or what it is at most where not all was asked."""
+        found = self.margin_upper_bound if self.margin is None else self.margin
+        return 1.0 if found is None else found
+
+    @property
+    def extent(self) -> str:
+        """How much of it was asked, in words: "asked 1 of 9"."""
+        return f"asked {self.moments_asked} of {self.moments}"
+
+
+# A result in one sentence, "ego drove into main.31 at step 47": what commands, screen and page say of a trial.
+
+
+def summarize(result: TrialResult) -> str:
+    """Return the outcome of a trial in one line, for people."""
+    if result.collision is not None:
+        hit = result.collision
+        if hit.role == "alone":
+            what = "left the road" if result.outcome is Outcome.OFF_ROAD else f"crashed ({hit.kind})"
+            return f"{hit.agent} {what} at step {result.steps}"
+        verb = "drove into" if hit.role == "collider" else "was hit by"
+        return f"{hit.agent} {verb} {hit.other} at step {result.steps}"
+    if result.event is not None:
+        return f"{result.event.what}, at step {result.steps}"
+    if result.failure is not None:
+        failure = result.failure
+        if failure.traceback and failure.exit_code is None and failure.kind != "timeout":
+            whose = f"{failure.agent}: " if failure.agent else ""
+            return f"{whose}{failure.kind}: {failure.message}"
+        return failure.message
+    return f"{result.outcome} after {result.steps} steps"
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult(Serializable):
     """What came of one trial.
 
     Args:
@@ -69,82 +190,30 @@ class TrialResult:
     escape: Escape | None = None
     event: Event | None = None
     events: Mapping[str, int] | None = None
-    disturbances: tuple[Disturbance, ...] = ()
-    log_likelihood: float | None = None
-    danger: float | None = None
-    stress: Stress | None = None
-    branches: Branches | None = None
-    setup_steps: int | None = None
-    why_no_escape: str = ""
+    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    log_likelihood: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    danger: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    stress: Stress | None = field(default=None, metadata=OMIT_DEFAULT)
+    branches: Branches | None = field(default=None, metadata=OMIT_DEFAULT)
+    setup_steps: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    why_no_escape: str = field(default="", metadata=OMIT_DEFAULT)
 
-    def to_json(self) -> ResultData:
-        """Return plain dicts, strings and numbers; what is not a finite number is null."""
-        data: ResultData = {
-            "steps": self.steps,
-            "sim_time_s": self.sim_time_s,
-            "digest": self.digest,
-            "wall_s": self.wall_s,
-            "setup_s": self.setup_s,
-            "worker": self.worker,
-            "kept": self.kept,
-            "outcome": str(self.outcome),
-            "category": self.outcome.category,
-            "spec": self.spec.to_json(),
-            "closest": self.closest.to_json(),
-            "collision": self.collision.to_json() if self.collision else None,
-            "failure": self.failure.to_json() if self.failure else None,
-            "escape": self.escape.to_json() if self.escape else None,
-            "event": self.event.to_json() if self.event else None,
-            "events": dict(self.events) if self.events is not None else None,
-        }
-        if not self.outcome.is_own:
-            del data["category"]
-        if self.disturbances:
-            data["disturbances"] = [one.to_json() for one in self.disturbances]
-        if self.log_likelihood is not None:
-            data["log_likelihood"] = finite(self.log_likelihood)
-        if self.danger is not None:
-            data["danger"] = finite(self.danger)
-        if self.stress is not None:
-            data["stress"] = self.stress.to_json()
-        if self.branches is not None:
-            data["branches"] = self.branches.to_json()
-        if self.setup_steps is not None:
-            data["setup_steps"] = self.setup_steps
-        if self.why_no_escape:
-            data["why_no_escape"] = self.why_no_escape
-        return data
+    json_keys = (
+        "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
+        "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
+        "stress", "branches", "setup_steps", "why_no_escape",
+    )  # fmt: skip
 
     @classmethod
-    def from_json(cls, data: ResultData) -> TrialResult:
-        """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default."""
-        hit, failure = data.get("collision"), data.get("failure")
-        event, escape, stress = data.get("event"), data.get("escape"), data.get("stress")
-        branches = data.get("branches")
-        return cls(
-            spec=TrialSpec.from_json(data["spec"]),
-            outcome=outcome_of(data),
-            closest=ClosestApproach.from_json(data.get("closest") or {}),
-            collision=Collision.from_json(hit) if hit else None,
-            failure=Failure.from_json(failure) if failure else None,
-            escape=Escape.from_json(escape) if escape else None,
-            event=Event.from_json(event) if event else None,
-            events=data.get("events"),
-            steps=data.get("steps", 0),
-            sim_time_s=data.get("sim_time_s", 0.0),
-            digest=data.get("digest", ""),
-            wall_s=data.get("wall_s", 0.0),
-            setup_s=data.get("setup_s", 0.0),
-            worker=data.get("worker", 0),
-            kept=data.get("kept", False),
-            disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
-            log_likelihood=data.get("log_likelihood"),
-            danger=data.get("danger"),
-            stress=Stress.from_json(stress) if stress else None,
-            branches=Branches.from_json(branches) if branches else None,
-            setup_steps=data.get("setup_steps"),
-            why_no_escape=data.get("why_no_escape", ""),
-        )
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Rebuild what `to_json` returned, of any version; an oracle's own outcome keeps its category."""
+        outcome_of(data)
+        return from_plain(cls, data)
+
+    @property
+    def category(self) -> str | None:
+        """The category of an outcome that an oracle has brought; None for the outcomes that every hunt has."""
+        return self.outcome.category if self.outcome.is_own else None
 
     @property
     def was_killed_from_outside(self) -> bool:

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
+from crashhunt.base.codec import OMIT_DEFAULT, JsonObject, Serializable, from_plain, to_plain
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.tolerance import ESSENTIAL, known_values, not_understood, required_of
+from crashhunt.base.tolerance import ESSENTIAL, not_understood, required_of
 from crashhunt.base.version import __version__
 from crashhunt.trial._disturbance import Disturbance
+from crashhunt.trial._space import Value
 from crashhunt.world import Paths
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from crashhunt.trial._data import OverruledData, SpecData, SpecExtras
-    from crashhunt.trial._space import Value
-
-__all__ = ["EVERYBODY", "Overruled", "TrialSpec"]
+__all__ = ["EVERYBODY", "Handover", "Overruled", "Reseeding", "TrialSpec"]
 
 EVERYBODY = "*"
 """In `TrialSpec.only`: nobody is left out, but who enters is written down."""
 
 
+_ESSENTIAL = {**ESSENTIAL, **OMIT_DEFAULT}
+
+
 @dataclass(frozen=True, slots=True)
-class Overruled:
+class Overruled(Serializable):
     """A trial in which an agent does not do as its code says: its vehicle brakes as hard as it can, or holds still.
 
     Args:
@@ -37,21 +37,40 @@ class Overruled:
 
     agent: str
     after: int
-    manoeuvre: str = field(default="brake", metadata=ESSENTIAL)
-    keeps: str = field(default="", metadata=ESSENTIAL)
-
-    def to_json(self) -> OverruledData:
-        """Return plain data; what is at its default is left out."""
-        plain: OverruledData = {"agent": self.agent, "after": self.after}
-        if self.manoeuvre != "brake":
-            plain["manoeuvre"] = self.manoeuvre
-        if self.keeps:
-            plain["keeps"] = self.keeps
-        return plain
+    manoeuvre: str = field(default="brake", metadata=_ESSENTIAL)
+    keeps: str = field(default="", metadata=_ESSENTIAL)
 
 
 @dataclass(frozen=True, slots=True)
-class TrialSpec:
+class Handover(Serializable):
+    """A trial in which a recording drives a vehicle up to a step, and the vehicle's agent from that step on.
+
+    Args:
+        agent: the id of the vehicle.
+        after: how many recorded actions are played; the agent makes its first decision in the next step.
+        log: the path of the ``log.mcap`` with the recorded actions.
+    """
+
+    agent: str
+    after: int
+    log: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reseeding(Serializable):
+    """A trial whose simulator gets other seeds for its random generators after a step.
+
+    Args:
+        after: the step; the next step is the first that draws from the new seeds.
+        seed: of all generators of the simulator; 0 to 2**31 - 1.
+    """
+
+    after: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSpec(Serializable):
     """Everything that determines one trial.
 
     Args:
@@ -67,6 +86,8 @@ class TrialSpec:
         only: which of the others take part; None for all. A crash that was made smaller has it.
         script: recorded ways along which the others are moved, whatever anybody does; the agents begin where theirs
             do, and the traffic takes no part. None where the others drive.
+        handover: which agent takes over from recorded actions, and when; None where all agents drive from the start.
+        reseeding: when the simulator's generators get another seed; None where they keep that of the trial.
     """
 
     number: int
@@ -74,63 +95,33 @@ class TrialSpec:
     arguments: Mapping[str, Mapping[str, Value]]
     scenario_arguments: Mapping[str, Value]
     max_steps: int
-    overruled: Overruled | None = field(default=None, metadata=ESSENTIAL)
-    parent: int | None = None
-    origin: str = ""
-    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=ESSENTIAL)
-    only: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
-    script: Paths | None = field(default=None, metadata=ESSENTIAL)
+    overruled: Overruled | None = field(default=None, metadata=_ESSENTIAL)
+    parent: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    origin: str = field(default="", metadata=OMIT_DEFAULT)
+    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=_ESSENTIAL)
+    only: tuple[str, ...] | None = field(default=None, metadata=_ESSENTIAL)
+    script: Paths | None = field(default=None, metadata=_ESSENTIAL)
+    handover: Handover | None = field(default=None, metadata=_ESSENTIAL)
+    reseeding: Reseeding | None = field(default=None, metadata=_ESSENTIAL)
 
-    def to_json(self) -> SpecData:
-        """Return plain dicts and numbers."""
-        more: SpecExtras = {}
-        if self.overruled:
-            more["overruled"] = self.overruled.to_json()
-        if self.parent is not None:
-            more["parent"] = self.parent
-        if self.origin:
-            more["origin"] = self.origin
-        if self.disturbances:
-            more["disturbances"] = [one.to_json() for one in self.disturbances]
-        if self.only is not None:
-            more["only"] = list(self.only)
-        if self.script is not None:
-            more["script"] = self.script.to_json()
+    def to_json(self) -> JsonObject:
+        """Return plain dicts and numbers; ``requires`` names what another version must know."""
+        data = to_plain(self)
         if requires := [*required_of(self), *(required_of(self.overruled) if self.overruled else ())]:
-            more["requires"] = requires
-        return {
-            "number": self.number,
-            "seed": self.seed,
-            "arguments": {agent: dict(values) for agent, values in self.arguments.items()},
-            "scenario_arguments": dict(self.scenario_arguments),
-            "max_steps": self.max_steps,
-            **more,
-        }
+            data["requires"] = requires
+        return data
 
     @classmethod
-    def from_json(cls, data: SpecData) -> TrialSpec:
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Rebuild what `to_json` returned, of any version: what it adds is left out, what it lacks is the default.
 
         Raises:
             CrashhuntError: it needs what this version does not know.
         """
-        unknown = not_understood(data.get("requires") or (), cls, Overruled)
+        unknown = not_understood(data.get("requires") or (), cls, Overruled, Handover, Reseeding)
         if unknown:
             raise CrashhuntError(
                 f"trial {data['number']} has {', '.join(unknown)}, which crashhunt {__version__} does not know",
                 fix="use the version that wrote it",
             )
-        overruled = data.get("overruled")
-        return cls(
-            data["number"],
-            data["seed"],
-            data.get("arguments", {}),
-            data.get("scenario_arguments", {}),
-            max_steps=data["max_steps"],
-            overruled=Overruled(**known_values(Overruled, overruled)) if overruled else None,
-            parent=data.get("parent"),
-            origin=data.get("origin", ""),
-            disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
-            only=tuple(only) if (only := data.get("only")) is not None else None,
-            script=Paths.from_json(script) if (script := data.get("script")) else None,
-        )
+        return from_plain(cls, {"arguments": {}, "scenario_arguments": {}, **data})

@@ -1,4 +1,4 @@
-"""What is on the road at one step, and how near things are: scenes, outlines, contacts, the closest approach."""
+"""The road at one step and the distances on it: scenes, outlines, contacts, the closest approach, criticality."""
 
 import lazy_loader
 

@@ -1,15 +1,22 @@
-"""How near to a crash an episode came: time to collision, gap, required deceleration."""
+"""The closest approach of an episode to a crash: time to collision, gap, required deceleration.
+
+Computes for each scene the three measures between a controlled vehicle and every other actor, and keeps the best ones.
+
+Invariant: the result is that of all pairs of rectangles. A pair is skipped only where circles around and within the
+outlines prove that it cannot improve on the best value. Many scenes are computed in one NumPy call, because the
+overhead of a call exceeds the arithmetic of one scene tenfold. Sources are cited at `ApproachMeter`.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.world._closest import ClosestApproach
-from crashhunt.world._geometry import rectangle_gap, time_to_contact
-from crashhunt.world._outlines import LEVEL_M, levels, outlines
+from crashhunt.base.codec import Serializable, null_is
+from crashhunt.world._geometry import LEVEL_M, levels, outlines, rectangle_gap, time_to_contact
 from crashhunt.world._scene import core_of, part_of
 
 if TYPE_CHECKING:
@@ -19,11 +26,31 @@ if TYPE_CHECKING:
 
     from crashhunt.world._scene import Frame, Scene
 
-__all__ = ["ApproachMeter", "approaches", "closest_approach"]
 
-_CHUNK = 256  # scenes at a time, which costs a tenth of one at a time
-_GAP_M = 50.0  # what is further away is not near
-_HORIZON_S = 10.0  # a collision course further ahead than this says nothing
+__all__ = ["ApproachMeter", "ClosestApproach", "approaches", "closest_approach"]
+
+
+# The closest approach.
+
+
+@dataclass(frozen=True, slots=True)
+class ClosestApproach(Serializable):
+    """The closest approach of a trial to a crash: each value over all steps, controlled vehicles and other actors.
+
+    Args:
+        time_to_collision_s: the minimum, at constant velocities; infinite where no courses crossed.
+        gap_m: the minimum distance between outlines; 0 at a touch.
+        required_deceleration: the maximum that was needed to avoid a collision, in m/s².
+    """
+
+    time_to_collision_s: float = field(default=math.inf, metadata=null_is(math.inf))
+    gap_m: float = field(default=math.inf, metadata=null_is(math.inf))
+    required_deceleration: float = field(default=0.0, metadata=null_is(math.inf))
+
+
+_CHUNK = 256  # scenes per call, which costs a tenth of one scene per call
+_GAP_M = 50.0  # larger gaps are ignored
+_HORIZON_S = 10.0  # later collisions are ignored: velocities change within that time
 _NOTHING = ClosestApproach()
 
 
@@ -43,14 +70,14 @@ class ApproachMeter:
         self.closest = ClosestApproach()
 
     def measure(self, frames: Sequence[Frame]) -> None:
-        """Take scenes in."""
+        """Measure more scenes and update the closest approach."""
         for agent in self._agents:
-            so_far = self.closest
-            times, gaps, brakes = approaches(frames, agent, so_far, only_best=True)
+            closest = self.closest
+            times, gaps, brakes = approaches(frames, agent, closest, only_best=True)
             self.closest = ClosestApproach(
-                min(so_far.time_to_collision_s, float(times.min(initial=math.inf))),
-                min(so_far.gap_m, float(gaps.min(initial=math.inf))),
-                max(so_far.required_deceleration, float(brakes.max(initial=0.0))),
+                min(closest.time_to_collision_s, float(times.min(initial=math.inf))),
+                min(closest.gap_m, float(gaps.min(initial=math.inf))),
+                max(closest.required_deceleration, float(brakes.max(initial=0.0))),
             )
 
 
@@ -63,23 +90,23 @@ def closest_approach(scenes: Sequence[Scene], agents: Sequence[str]) -> ClosestA
 
 
 def approaches(
-    frames: Sequence[Frame], agent: str, so_far: ClosestApproach = _NOTHING, *, only_best: bool = False
+    frames: Sequence[Frame], agent: str, closest: ClosestApproach = _NOTHING, *, only_best: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return, for each scene, how near the agent is to the nearest danger.
+    """Return the closest approach of an agent in each scene.
 
     Args:
         frames: in order.
-        agent: the controlled vehicle; scenes without it are as safe as can be.
-        so_far: what does not come nearer than this in any way may be left out.
-        only_best: what does not come nearer than another scene does, too.
+        agent: the controlled vehicle; scenes without it have no approach.
+        closest: approaches no closer than this in any measure may be skipped.
+        only_best: whether approaches no closer than that of another scene may be skipped too.
 
     Returns:
         Time to collision (s), gap (m), required deceleration (m/s²), each of shape (scenes,). Gaps of more than 50 m
-        and times of more than 10 s do not count.
+        and times of more than 10 s are ignored.
     """
     count = sum(len(frame.columns) for frame in frames)
     times, gaps, brakes = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
-    whole = _near_block(frames, agent, so_far, only_best) or _whole_block(frames, agent, so_far)
+    whole = _near_block(frames, agent, closest, only_best) or _whole_block(frames, agent, closest)
     if whole is None or not len(whole.x):
         return times, gaps, brakes
     heading, speed, half, number, own = whole.heading, whole.speed, whole.half, whole.step, whole.own
@@ -103,16 +130,16 @@ def approaches(
 
     near = np.flatnonzero(others & (distance - reach < _GAP_M))
     if len(near):
-        # The circles around both outlines bound the gap from below, those within from above (a person is wider than
-        # long); only who could be the nearest is measured.
+        # Circles around both outlines bound the gap from below, circles within from above (a person is wider than
+        # long), so only actors that can be the nearest are measured.
         bound, within = distance[near] - reach[near], half.min(axis=1)
         best = np.full(count, np.inf)
         np.minimum.at(best, number[near], distance[near] - within[near] - within[own[near]])
         near = near[bound <= best[number[near]]]
         place, _, turn, one, two = pairs(near)
         np.minimum.at(gaps, number[near], rectangle_gap(place, turn, one, two))
-    # The circles also bound who can ever touch: closing, and passing nearer than both radii. Where they overlap by now,
-    # outlines may meet although the centres part, such as those of a lorry and a car that pulls in beside its cab.
+    # Pairs touch only if they close in and their circles meet. Where the circles overlap already, outlines may meet
+    # although the centres part, such as those of a lorry and of a car that pulls in next to its cab.
     closing = -np.einsum("ij,ij->i", offset, relative)
     squared = np.einsum("ij,ij->i", relative, relative)
     passing = np.abs(offset[:, 0] * relative[:, 1] - offset[:, 1] * relative[:, 0])
@@ -132,7 +159,7 @@ def approaches(
 
 
 class _Block(NamedTuple):
-    """Rectangles of scenes in which an agent is: of each its front, how it moves, and against whom it is measured."""
+    """Rectangles of scenes with an agent: front, motion, and the agent rectangle that each is measured against."""
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]
@@ -146,17 +173,17 @@ class _Block(NamedTuple):
     tall: NDArray[np.float64]
 
     def moved(self, step: int, first: int) -> _Block:
-        """The same, counted on from a step and a rectangle."""
+        """Return the same rectangles with step and agent numbers offset."""
         return self._replace(step=self.step + step, own=self.own + first)
 
 
-def _whole_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -> _Block | None:
+def _whole_block(frames: Sequence[Frame], agent: str, closest: ClosestApproach) -> _Block | None:
     blocks = []
     step = first = 0
     for frame in frames:
         row = frame.roster.index.get(agent)
         if row is not None:
-            near = _near_block([frame], agent, so_far)
+            near = _near_block([frame], agent, closest)
             for block in [near] if near is not None else _blocks(frame, row):
                 blocks.append(block.moved(step, first))
                 first += len(block.x)
@@ -164,13 +191,15 @@ def _whole_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach) -
     return _Block(*(np.concatenate(columns) for columns in zip(*blocks, strict=True))) if blocks else None
 
 
-def _near_block(frames: Sequence[Frame], agent: str, so_far: ClosestApproach, only_best: bool = False) -> _Block | None:
-    """Those only who may be near, as the core finds them; None where it does not."""
+def _near_block(
+    frames: Sequence[Frame], agent: str, closest: ClosestApproach, only_best: bool = False
+) -> _Block | None:
+    """Return only the rectangles that may be near, found by the core; None where the core cannot do that."""
     core = core_of(frames)
     if core is None:
         return None
     parts = [part_of(frame, agent, frame.roster.rows) for frame in frames]
-    least = so_far.gap_m, so_far.time_to_collision_s, so_far.required_deceleration
+    least = closest.gap_m, closest.time_to_collision_s, closest.required_deceleration
     found = core.may_be_near(parts, _GAP_M, _HORIZON_S, *least, only_best)
     if found is None:
         return None
@@ -203,7 +232,7 @@ def _block(frame: Frame, row: int) -> _Block:
 
 
 def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
-    """One for each scene and each part of the agent, which is measured against all parts of the others."""
+    """Return one block per scene and part of the agent; each part is measured against all parts of the others."""
     blocks = []
     for step in range(len(frame.columns)):
         scene = frame.scene(step)
@@ -230,7 +259,7 @@ def _bent_blocks(frame: Frame, row: int) -> list[_Block]:
 
 
 def _on_one_level(whole: _Block, forward: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """As `same_level` says of two."""
+    """Return for each rectangle whether `same_level` holds between it and the agent."""
     own = whole.own
     dx, dy = whole.x - whole.x[own], whole.y - whole.y[own]
     ahead = whole.grade[own] * (dx * forward[own, 0] + dy * forward[own, 1])

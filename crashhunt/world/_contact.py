@@ -1,4 +1,13 @@
-"""When two actors first touch on their ways from one scene to the next, and who drives into whom."""
+"""The first contact of two actors between two scenes, and which one drives into the other.
+
+Computes when two moving rectangles first overlap. Scenes are steps apart (0.1 s to 1 s), so a test of the scenes alone
+misses contacts in between and reports others too late.
+
+Each rectangle follows a cubic between its poses (`_Way`). Conservative advancement then moves forward in time by the
+gap divided by a bound of the approach speed, so no contact is skipped (B. Mirtich, Impulse-based dynamic simulation of
+rigid body systems, 1996). A fixed small time step would be slower and could miss a short overlap. Bisection finds the
+time of the overlap to within 1e-9 of a step.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +16,24 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from crashhunt.world._geometry import separation
-from crashhunt.world._outlines import levels, outlines, same_level
+from crashhunt.world._geometry import levels, outlines, same_level, separation
 from crashhunt.world._scene import is_person
 
 if TYPE_CHECKING:
-    from crashhunt.world._outlines import Level, Rectangle
+    from crashhunt.world._geometry import Level, Rectangle
     from crashhunt.world._scene import Scene
 
 __all__ = ["Touch", "first_contact"]
 
-_JUMP_M = 1.5  # sideways in one step; less is drifting within a lane, more is a lane change at once
-_LANES_M = 12.0  # sideways in one step; more is no lane change either
-_TURN = 2.0  # rad in one step; more is no bend that a cubic describes
-_STEP_M = 1e-3  # of relative motion; what overlaps for less is not looked for
-_TOUCH = 1e-9  # m; less is rounding
-_FRONT = math.cos(math.pi / 4)  # within 45° of straight ahead, the other is in front
-_CURVE = 1 / 32  # of distance times turn: a quarter of how far a bend is from its chord
-_SLACK_M = 0.4  # at most
-_KINK, _NO_TURN = 0.02, 0.01  # of distance, where it turns by rad: lanes have corners, no bends
+_JUMP_M = 1.5  # sideways in one step: less is drift within a lane, more is an instantaneous lane change
+_LANES_M = 12.0  # sideways in one step: more is a teleport, not a lane change
+_TURN = 2.0  # rad in one step: more is not a bend that a cubic describes
+_STEP_M = 1e-3  # of relative motion: shorter overlaps are not searched for
+_TOUCH = 1e-9  # m: smaller overlaps are rounding errors
+_FRONT = math.cos(math.pi / 4)  # an actor within 45° of straight ahead is in front
+_CURVE = 1 / 32  # of distance times turn: a quarter of the height of a bend above its chord
+_SLACK_M = 0.4  # upper bound of the tolerance for unknown ways between scenes
+_KINK, _NO_TURN = 0.02, 0.01  # tolerance as a share of the distance, reached at this turn in rad: lanes have corners
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +41,13 @@ class Touch:
     """The first contact of two actors.
 
     Args:
-        time_s: simulation time.
-        share: of the step; 1 is the present scene.
-        drives_into: whether the first one drives into the second; otherwise it is the other way round.
-        x: of the first one's front bumper, in m.
+        time_s: simulation time, in s.
+        share: of the step, from 0 to 1; 1 is the present scene.
+        drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
+        x: of the first actor's front bumper, in m.
         y: likewise.
-        speed: of the first one, in m/s.
-        other_speed: likewise.
+        speed: of the first actor, in m/s.
+        other_speed: of the second actor, in m/s.
     """
 
     time_s: float
@@ -52,16 +60,16 @@ class Touch:
 
 
 _Party = tuple["Rectangle", bool, tuple[float, float]]
-"""What touches, whether it is the front part of its vehicle, and which way it moves."""
+"""A rectangle in contact, whether it is the front part of its vehicle, and its direction of motion."""
 
 
 class _Way:
-    """How one rectangle gets from one scene to the next.
+    """The motion of one rectangle from one scene to the next.
 
-    Its centre follows a cubic with the headings at both ends as tangents: the heading of a vehicle is the direction of
-    the lane below its centre rather than below its bumper. Where the end is further off to the side than any bend
-    explains, the vehicle has changed lanes at once: as in SUMO, it moves in its old lane first, and is in the new one
-    at the end.
+    Its centre follows a cubic with the headings at both ends as tangents. The heading of a vehicle is the direction of
+    the lane below its centre rather than below its bumper. Where the end is further to the side than any bend
+    explains, the vehicle has changed lanes instantaneously. As in SUMO, it then moves in its old lane first, and jumps
+    to the new one at the end.
     """
 
     __slots__ = ("_heading", "_size", "end", "jump", "legs", "points", "reach", "slack", "turn")
@@ -75,16 +83,16 @@ class _Way:
         middle = start[2] + turn / 2
         dx, dy = x1 - x0, y1 - y0
         self.jump = (0.0, 0.0)
-        if bends and abs(_beside(dx, dy, start[2], turn)) > _JUMP_M:
+        if bends and abs(_sideways_excess(dx, dy, start[2], turn)) > _JUMP_M:
             side = dy * math.cos(middle) - dx * math.sin(middle)
             self.jump = (-side * math.sin(middle), side * math.cos(middle))
             dx, dy = dx - self.jump[0], dy - self.jump[1]
         distance = math.hypot(dx, dy)
         self.slack = _SLACK_M if any(self.jump) else 0.0
         first, second = (x0 + dx / 3, y0 + dy / 3), (x0 + 2 * dx / 3, y0 + 2 * dy / 3)
-        # Who stands, reverses, or turns round on the spot, as persons do, goes straight.
+        # Vehicles that stand, reverse or turn on the spot, as persons do, go straight.
         if bends and abs(turn) < _TURN and dx * math.cos(middle) + dy * math.sin(middle) > 0:
-            # These handles make it all but an arc of a circle where it is one.
+            # With these handles the cubic is almost exactly an arc where the motion is one.
             third = distance * (2 / 3 * math.tan(turn / 4) / math.sin(turn / 2) if abs(turn) > _TOUCH else 1 / 3)
             first = (x0 + third * math.cos(start[2]), y0 + third * math.sin(start[2]))
             second = (x0 + dx - third * math.cos(end[2]), y0 + dy - third * math.sin(end[2]))
@@ -93,7 +101,7 @@ class _Way:
         self.legs = tuple((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(self.points))
 
     def at(self, share: float) -> Rectangle:
-        """Where it is; at 1, after the jump."""
+        """Return the rectangle at a share of the step; at 1, after the jump."""
         if share >= 1.0:
             return self.end
         rest = 1 - share
@@ -105,7 +113,7 @@ class _Way:
         return x, y, heading, length, width
 
     def moving(self, share: float) -> tuple[float, float]:
-        """Which way and how fast its centre moves, in m a step; where it jumps, the jump."""
+        """Return direction and speed of the centre, in m per step; at a jump, the jump."""
         if share >= 1.0 and any(self.jump):
             return self.jump
         rest = 1 - share
@@ -167,12 +175,12 @@ def first_contact(previous: Scene | None, present: Scene, row: int, other: int) 
 
 
 def reachable_m(speed: float, time_s: float) -> float:
-    """How far who drives so fast gets in a step at most; who is further away has been put there."""
+    """Return the distance that an actor of this speed can cover in a step; after a larger one it has been moved."""
     return 1.5 * speed * time_s + 1.0
 
 
 def _rows_before(previous: Scene | None, present: Scene, pair: tuple[int, int]) -> tuple[int, int] | None:
-    """Both rows in the previous scene; None where one was not there, or was moved and did not drive."""
+    """Return both rows in the previous scene; None where an actor was absent, or was moved instead of driving."""
     if previous is None:
         return None
     found = []
@@ -195,8 +203,8 @@ def _pieces(scene: Scene, row: int) -> int:
     return 1 if spine is None else len(spine) - 1
 
 
-def _beside(dx: float, dy: float, heading: float, turn: float) -> float:
-    """How far a displacement is outside of all that a bend from a heading by a turn can lead to, to the left."""
+def _sideways_excess(dx: float, dy: float, heading: float, turn: float) -> float:
+    """Return how far to the left, in m, a displacement is outside of the ends of all bends by a turn."""
     across = dy * math.cos(heading) - dx * math.sin(heading)
     end = heading + turn
     across_end = dy * math.cos(end) - dx * math.sin(end)
@@ -211,10 +219,9 @@ def _same_level(scene: Scene, pair: tuple[int, int], ways: tuple[_Way, _Way], on
 
 
 def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float | None:
-    """When two rectangles first overlap; None where they do not.
+    """Return the share of the step at which two rectangles first overlap; None where they do not.
 
-    Conservative advancement (B. Mirtich, Impulse-based dynamic simulation of rigid body systems, 1996): as long as
-    they are so far apart, and come nearer no faster than so, nothing can happen.
+    Conservative advancement: during the gap divided by a bound of the approach speed, no contact is possible.
     """
     touching = separation(way.end, other.end)[0] < -_TOUCH
     if still:
@@ -224,7 +231,7 @@ def _first_share(way: _Way, other: _Way, *, until: float, still: bool) -> float 
     )
     for each in (way, other):
         fastest += abs(each.turn) * each.reach
-    # Between the scenes nobody knows the way to the millimetre: what brushes past in a bend has not touched.
+    # The way between scenes is known to some centimetres only, so ignore grazing contacts in bends.
     slack = _TOUCH if touching else _TOUCH + way.slack + other.slack
     share, apart_at = 0.0, 0.0
     while share < until:
@@ -250,13 +257,13 @@ def _bisect(way: _Way, other: _Way, apart: float, together: float) -> float:
 
 
 def _drives_into(first: _Party, second: _Party) -> bool:
-    """Whether the first one drives into the other: it has the other in front of it, or else moves towards it more."""
+    """Return whether the first drives into the second: the second is in front of it, or it moves towards it faster."""
     (own, own_leads, own_moving), (other, other_leads, other_moving) = first, second
     _, x, y = separation(own, other)
     own_front = own_leads and x * math.cos(own[2]) + y * math.sin(own[2]) > _FRONT
     other_front = other_leads and -x * math.cos(other[2]) - y * math.sin(other[2]) > _FRONT
     if own_front or other_front:
-        return own_front  # head on, it is the one that was asked about
+        return own_front  # head-on: the actor in question drives into the other
     more = (own_moving[0] + other_moving[0]) * x + (own_moving[1] + other_moving[1]) * y
     if abs(more) > _STEP_M:
         return more > 0

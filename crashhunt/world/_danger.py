@@ -1,25 +1,30 @@
-"""How dangerous steps and trials were: by the ways that were really driven, how little it would have taken.
+"""Criticality of steps and trials, from 0 (nothing near) to 1 (touched), measured along the ways really driven.
 
-Two things are asked of every step, and the greater answer is its danger, from 0 (nothing near) to 1 (touched):
+The criticality of a step is the greater of two measures:
 
-- How soon before or after another one was the agent where that one is? This is the post-encroachment time (PET; B. L.
-  Allen, B. T. Shin and P. J. Cooper, Analysis of traffic conflicts and collisions, 1978), taken along the way that the
-  agent really drove, so that oncoming traffic in a bend is no danger; of the one ahead in a queue it is the time gap.
-  For t s the danger is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
-- Had the agent been blind from here on, and kept its speed along that way, how hard would it have had to brake at
-  least, constantly, so as not to touch anybody where they really went? This is the deceleration rate to avoid a crash
-  (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976) with real ways in place of constant
-  velocities, within 4 s; the danger is its share of 12 m/s², which no brakes exceed. As responsibility-sensitive safety
-  (RSS; S. Shalev-Shwartz, S. Shammah and A. Shashua, On a formal model of safe and scalable self-driving cars, 2017)
-  it asks what comes of an agent that responds too late.
+- Post-encroachment time (PET; B. L. Allen, B. T. Shin and P. J. Cooper, Analysis of traffic conflicts and collisions,
+  1978): the time between the agent and another actor at the same place. It is taken along the way that the agent
+  really drove, so oncoming traffic in a bend does not count. For the vehicle ahead in a queue it is the time gap. For
+  t s the criticality is exp(-t / 1.2 s): 0.92 for 0.1 s, 0.43 for 1 s, 0.19 for 2 s.
+- Deceleration rate to avoid a crash (DRAC; D. F. Cooper and N. Ferguson, Traffic studies at T-junctions, 1976): the
+  least constant deceleration with which the agent, otherwise at constant speed on its way, touches no actor within
+  4 s. Actors move along their real ways, not at constant velocities. The criticality is its share of 12 m/s², which
+  exceeds the braking of any vehicle.
+  As in responsibility-sensitive safety (RSS; S. Shalev-Shwartz, S. Shammah and
+  A. Shashua, On a formal model of safe and scalable self-driving cars, 2017), the agent is assumed to respond late.
 
-The danger of a trial grows with the time integral of that of its steps, in s, as the time integrated time to collision
-does (TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment,
-2001): integral / (integral + 10 s), and 1 where somebody was touched. Of several agents it is that of the one in the
-greatest danger. The integral ranks trials better than the greatest danger of a step; `scripts/danger` measures that.
+The criticality of a trial grows with the time integral over its steps, in s, like the time integrated time to collision
+(TIT; M. M. Minderhoud and P. H. L. Bovy, Extended time-to-collision measures for road traffic safety assessment,
+2001): integral / (integral + 10 s), and 1 after a touch. The maximum over agents counts.
 
-Whoever comes from behind on the same way is left out: that is the danger that others are to the agent, and a number of
-its own (`followers_danger`), which has no part in the danger of a trial.
+Why the integral: it ranks trials better than the maximum over steps, as `scripts/danger` measures. Why real ways:
+constant velocities report a collision course with every oncoming vehicle in a bend.
+
+Invariant: actors that approach from behind on the same way do not count. That is rear criticality, a separate number
+(`followers_danger`).
+
+Cost: only actors within reach of the way are tested, at places 1 m to 4 m apart (0.8 of the agent's length). Each
+first touch is refined by bisection. Long episodes are summed in windows of 4096 scenes, so memory stays bounded.
 """
 
 from __future__ import annotations
@@ -28,44 +33,54 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from crashhunt.world._outlines import LEVEL_M
-from crashhunt.world._tracks import Reach, spacing_s, ways
+from crashhunt.world._geometry import LEVEL_M
+from crashhunt.world._tracks import Others, Reach, Track, spacing_s, ways
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from crashhunt.world._scene import Frame
-    from crashhunt.world._tracks import Others, Track
 
     Array = NDArray[np.float64]
 
-__all__ = ["AHEAD_M", "DangerMeter", "DangerousMoment", "by_step", "dangers", "measured_along", "summed_danger"]
 
-_HALF_S = 10.0  # a trial whose dangers add up to this has 0.5
-_DECAY_S = 1.2  # in which the danger of a time gap falls to 1/e
-_HARDEST = 12.0  # m/s²
-_BLIND_S = 4.0  # how long the agent is taken to go on
-AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way; further off is no danger worth the time
-_MOVES_M = 0.01  # from sample to sample
-_UNKNOWN_M = 10.0  # at the end of the way: straight on is a guess
-_SAME_WAY = np.cos(np.pi / 6)  # of directions that differ by less than 30°
-_PLACES = 3  # that are looked at together
-_NOWHERE = 1 << 30
-_HALVINGS = 5  # of the stretch in which two first touch: 4 m become 13 cm
-_MOST = 0.999  # without having touched
-_WINDOW, _TAIL = 4096, 128  # scenes; of longer episodes a window at a time, and what comes after the tail is seen then
+__all__ = [
+    "AHEAD_M",
+    "DangerMeter",
+    "DangerousMoment",
+    "by_step",
+    "dangers",
+    "followers_danger",
+    "measured_along",
+    "summed_danger",
+]
+
+
+_HALF_S = 10.0  # integral at which a trial has criticality 0.5
+_DECAY_S = 1.2  # time gap at which the criticality falls to 1/e
+_HARDEST = 12.0  # m/s²: more than any vehicle can brake
+_BLIND_S = 4.0  # time for which the agent is assumed to keep its speed
+AHEAD_M, _BEHIND_M = 100.0, 30.0  # along the way: actors beyond that add almost nothing and cost time
+_MOVES_M = 0.01  # from sample to sample: less counts as standing
+_UNKNOWN_M = 10.0  # beyond the end of the way: continuing straight on is a guess
+_SAME_WAY = np.cos(np.pi / 6)  # directions that differ by less than 30° are the same
+_PLACES = 3  # places that are tested in one call
+_NOWHERE = 1 << 30  # index beyond all samples
+_HALVINGS = 5  # bisections of the stretch of a first touch: 4 m become 13 cm
+_MOST = 0.999  # upper bound without a touch
+_WINDOW, _TAIL = 4096, 128  # scenes: long episodes are summed per window; the tail waits for the ways that follow
 
 
 class DangerousMoment(NamedTuple):
-    """The most dangerous moment.
+    """The most critical moment of an episode.
 
     Args:
-        danger: from 0 to 1.
-        step: when.
-        agent: which of the controlled vehicles.
-        other: who else; empty where nobody was near.
+        danger: criticality, from 0 to 1.
+        step: its step.
+        agent: the controlled vehicle.
+        other: the other actor; empty where none was near.
     """
 
     danger: float
@@ -75,7 +90,7 @@ class DangerousMoment(NamedTuple):
 
 
 class DangerMeter:
-    """Measures the danger of an episode, after the fact, many scenes at a time.
+    """Measures the criticality of an episode, after the fact, many scenes at a time.
 
     Args:
         agents: the controlled vehicles.
@@ -85,12 +100,12 @@ class DangerMeter:
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
         self._dt = step_length_s
         self._frames: list[Frame] = []
-        self._count = 0  # of scenes that are here
-        self._done = 0  # of them, those that are summed up already
+        self._count = 0  # of scenes in memory
+        self._done = 0  # of these, the scenes that are in the sums already
         self._sums: dict[str, float | None] = dict.fromkeys(agents)
 
     def add(self, frames: Sequence[Frame]) -> None:
-        """Take scenes in."""
+        """Add scenes, and sum up complete windows."""
         self._frames += frames
         self._count += sum(len(frame.columns) for frame in frames)
         if self._count >= _WINDOW:
@@ -102,14 +117,14 @@ class DangerMeter:
 
     @property
     def danger(self) -> float | None:
-        """That of all scenes so far; None where no agent was in any of them."""
+        """Return the criticality of all scenes so far; None where no agent was in any of them."""
         found = [total for total in self._summed(self._count).values() if total is not None]
         return summed_danger(max(found)) if found else None
 
     def _summed(self, until: int) -> dict[str, float | None]:
         sums = dict(self._sums)
         for agent, before in self._sums.items():
-            # Whoever is not touched adds nothing to the sum.
+            # Actors that the agent does not touch add nothing to the sum.
             measured = _measured(self._frames, agent, self._dt, Reach(AHEAD_M, _BEHIND_M, _UNKNOWN_M))
             if measured is not None:
                 times, found, *_ = measured
@@ -119,10 +134,10 @@ class DangerMeter:
 
 
 def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float) -> tuple[Array, DangerousMoment]:
-    """Return the danger of each scene, shape (scenes,), and the most dangerous moment.
+    """Return the criticality of each scene, shape (scenes,), and the most critical moment.
 
     Args:
-        frames: of the whole episode, in order; what comes after a scene tells how dangerous it was.
+        frames: of the whole episode, in order; later scenes determine the criticality of earlier ones.
         agents: the controlled vehicles.
         step_length_s: in s.
     """
@@ -142,7 +157,7 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
 
 
 def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Array:
-    """Return the danger of so many scenes, each: that of the sample before it, or the greatest one within its step."""
+    """Return the criticality of `count` scenes: that of the sample before each, or the greatest one within its step."""
     steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
     held = np.zeros(count)
     np.maximum.at(held, steps, found)
@@ -155,17 +170,17 @@ def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Arr
 
 
 def summed_danger(integral_s: float) -> float:
-    """Return the danger of a trial, from the time integral of that of its steps."""
+    """Return the criticality of a trial from the time integral over its steps, in s."""
     return integral_s / (integral_s + _HALF_S)
 
 
 def _measured(
     frames: Sequence[Frame], agent: str, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Array, Array, NDArray[np.intp], list[str]] | None:
-    """Times, dangers and who else, of each sample; and the names of these."""
+    """Return times, criticalities and other actor (-1 for none) of each sample, and the names of the actors."""
     seen = ways(frames, agent, AHEAD_M, step_length_s, reach)
     if seen is not None and reach is not None and _forwards(seen[0]) < 0:
-        seen = ways(frames, agent, AHEAD_M, step_length_s)  # the core leaves out whom it would not touch straight on
+        seen = ways(frames, agent, AHEAD_M, step_length_s)  # the core skips actors that are off the way
     if seen is None:
         return None
     track, others, names = seen
@@ -174,12 +189,12 @@ def _measured(
 
 
 def measured_along(track: Track, others: Others, *, same_way: bool = False) -> tuple[Array, NDArray[np.intp]]:
-    """Return the danger of each sample of a track, and the number of who else; -1 for nobody.
+    """Return the criticality of each sample of a track, and the number of the other actor (-1 for none).
 
     Args:
-        track: of whom the danger is.
-        others: who came near it.
-        same_way: only those count whom it would reach from behind, going their way.
+        track: the way of the agent.
+        others: the actors near it.
+        same_way: whether only actors count that the agent would hit from behind, driving in the same direction.
     """
     gaps, brakes, who = np.full(len(track.time), np.inf), np.zeros(len(track.time)), np.full(len(track.time), -1)
     if len(others.sample):
@@ -188,7 +203,7 @@ def measured_along(track: Track, others: Others, *, same_way: bool = False) -> t
         late = way.reached(way.along[others.sample] + ahead) - track.time[others.sample]
         early = track.time[others.sample] - way.reached(way.along[others.sample] - behind)
         apart = np.minimum(np.where(np.isfinite(ahead), late, np.inf), np.where(np.isfinite(behind), early, np.inf))
-        order = np.lexsort((ahead, apart))[::-1]  # of each sample, the one that is left last is the nearest
+        order = np.lexsort((ahead, apart))[::-1]  # the last assignment per sample wins, and it is the nearest
         gaps[others.sample[order]], who[others.sample[order]] = apart[order], others.who[order]
         brakes, blockers = _needed_braking(way, track, others, ahead)
         harder = brakes / _HARDEST > np.exp(-gaps / _DECAY_S)
@@ -198,12 +213,12 @@ def measured_along(track: Track, others: Others, *, same_way: bool = False) -> t
 
 
 class _Way:
-    """The way that an agent drove, by how far along it is, straight on at its end, or back where it reversed."""
+    """The way that an agent drove, by distance along it, extended straight beyond its end."""
 
     def __init__(self, track: Track, *, flat: bool) -> None:
         self._track = track
         moved = np.hypot(np.diff(track.x), np.diff(track.y))
-        self.along = np.concatenate(([0.0], np.cumsum(moved))) + 1e-9 * np.arange(len(track.x))  # it never stands still
+        self.along = np.concatenate(([0.0], np.cumsum(moved))) + 1e-9 * np.arange(len(track.x))  # strictly increasing
         seconds = np.diff(track.time)
         self.speed = np.append(moved[:1] / seconds[:1], moved / seconds) if len(moved) else np.zeros(1)
         on, way = _UNKNOWN_M, _UNKNOWN_M * _forwards(track)
@@ -215,14 +230,14 @@ class _Way:
         self._time = np.append(track.time, track.time[-1] + on / max(float(self.speed[-1]), 0.1))
 
     def reached(self, along: Array) -> Array:
-        """When it is there, in s."""
+        """Return when the agent is at a distance along its way, in s."""
         found: Array = np.interp(along, self._at, self._time)
         return found
 
     def first_contacts(self, others: Others) -> tuple[Array, Array]:
-        """How far ahead of it, and behind it, its outline first touches another one; infinite where it does not.
+        """Return how far ahead of and behind the agent its outline first touches each actor; infinite for no touch.
 
-        Behind it, only those count that go another way.
+        Behind it, only actors in other directions count.
         """
         spacing = float(np.clip(1.6 * self._track.half_length.min(), 1.0, 4.0))
         ahead = self._first(others, spacing, AHEAD_M)
@@ -234,7 +249,7 @@ class _Way:
         return ahead, behind
 
     def reaches_from_behind(self, others: Others) -> tuple[Array, Array]:
-        """As `first_contacts`, ahead and with those alone that go the same way there."""
+        """Return the same as `first_contacts`, ahead and only for actors that go in the same direction there."""
         ahead, _ = self.first_contacts(others)
         there = np.isfinite(ahead)
         heading = np.interp(self.along[others.sample[there]] + ahead[there], self._at, self._heading)
@@ -242,14 +257,14 @@ class _Way:
         return ahead, np.full(len(ahead), np.inf)
 
     def _first(self, others: Others, spacing: float, far: float) -> Array:
-        """The first place where it touches each, of places that far apart, and then more closely."""
+        """Return the first place of a touch with each actor: search places at a spacing, then refine by bisection."""
         found = np.full(len(others.sample), np.inf)
         base = self.along[others.sample]
         reach = (
             np.hypot(others.half_length, others.half_width)
             + np.hypot(self._track.half_length, self._track.half_width)[others.sample]
         )
-        # A stretch of several places at a time; those of the agent are the same for all who are near it at one instant.
+        # Test several places at a time; all actors of one instant share the places of the agent.
         stretch = _PLACES * spacing
         middles = stretch * (np.arange(int(far / abs(stretch)) + 1) + 0.5) - spacing / 2
         samples, of = np.unique(others.sample, return_inverse=True)
@@ -279,7 +294,7 @@ class _Way:
         return found
 
     def _apart(self, others: Others, pair: NDArray[np.intp], along: Array, reach: Array | None = None) -> Array:
-        """How far apart the agent, somewhere on its way, and another one are; negative where they overlap.
+        """Return the distance between the agent at places along its way and other actors; negative where they overlap.
 
         Beyond a reach, where one is given, it is infinite.
         """
@@ -306,7 +321,7 @@ class _Way:
             )
         )
         x, y = dx * c + dy * s, dy * c - dx * s
-        # As `rectangle_gap` does it, by the axis on which they are furthest apart.
+        # Separating axis, as in `rectangle_gap`.
         found: Array = np.abs(x) - own_l - its_l * long - its_w * wide
         np.maximum(found, np.abs(y) - own_w - its_l * wide - its_w * long, out=found)
         np.maximum(found, np.abs(x * along_turn + y * across_turn) - its_l - own_l * long - own_w * wide, out=found)
@@ -329,10 +344,10 @@ def _forwards(track: Track) -> float:
 
 
 def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tuple[Array, NDArray[np.intp]]:
-    """The least constant deceleration (m/s²) with which an agent that kept its speed would touch nobody, and whom."""
+    """Return the least constant deceleration (m/s²) that avoids all touches, and the actor that requires it."""
     count = len(track.time)
     block, depth, who = np.full(count, np.inf), np.zeros(count), np.full(count, -1)
-    order = np.argsort(-ahead, kind="stable")  # of each sample, the one that is left last is the nearest
+    order = np.argsort(-ahead, kind="stable")  # the last assignment per sample wins, and it is the nearest
     order = order[np.isfinite(ahead[order])]
     if not len(order):
         return depth, who
@@ -351,9 +366,87 @@ def _needed_braking(way: _Way, track: Track, others: Others, ahead: Array) -> tu
         short = met[here] & (gone > room)
         safe = np.maximum(room, 1e-3)
         brake = 2 * (gone - safe) / seconds**2
-        # Who stands before that has to stop within the room.
+        # An actor that stands before then must stop within the room.
         brake = np.where(brake * seconds > way.speed[here], way.speed[here] ** 2 / (2 * safe), brake)
         brake = np.where(short & np.isfinite(room), np.minimum(brake, _HARDEST), 0.0)
         more = brake > needed[here]
         needed[here], blocker[here] = np.where(more, brake, needed[here]), np.where(more, who[there], blocker[here])
     return needed, blocker
+
+
+# Rear criticality: how critical actors were that closed in on an agent from behind, which the agent cannot prevent.
+#
+# The two measures of the head of this module are computed for every other actor with regard to the agent alone. They
+# count only where the actor's way leads into the back of the agent, both in the same direction. Crossing and oncoming
+# actors belong to the agent's own criticality.
+
+_LEAST = 2  # samples: a single one has no speed
+_SIDEWAYS_M = 10.0  # from the line through the agent: an actor never within it is not behind the agent
+
+
+def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) -> tuple[Array, DangerousMoment, float]:
+    """Return the rear criticality of an agent: that of the actors that close in on it from behind.
+
+    It is measured after the fact, from a recording. Of long vehicles that bend, the first part counts.
+
+    Args:
+        frames: of the whole episode, in order.
+        agent: the controlled vehicle.
+        step_length_s: in s.
+
+    Returns:
+        The rear criticality of each scene, shape (scenes,); the most critical moment; and the value of the trial,
+        from 0 to below 1. The ``other`` of the moment is the actor that closed in.
+    """
+    count = sum(len(frame.columns) for frame in frames)
+    nothing = DangerousMoment(0.0, 0, agent, "")
+    seen = ways(frames, agent, AHEAD_M, step_length_s)
+    if seen is None or not len(seen[0].time):
+        return np.zeros(count), nothing, 0.0
+    track, others, names = seen
+    found, who = np.zeros(len(track.time)), np.full(len(track.time), -1)
+    for number in _behind(track, others):
+        for samples, theirs, own in _pieces(track, others, number):
+            danger, _ = measured_along(theirs, own, same_way=True)
+            more = danger > found[samples]
+            found[samples[more]], who[samples[more]] = danger[more], number
+    whole = by_step(track.time, found, count, step_length_s)
+    total = summed_danger(float(found.sum()) * spacing_s(step_length_s))
+    at = int(found.argmax())
+    if who[at] < 0:
+        return whole, nothing, total
+    return whole, DangerousMoment(float(found[at]), round(track.time[at] / step_length_s), agent, names[who[at]]), total
+
+
+def _behind(track: Track, others: Others) -> list[int]:
+    """Return the numbers of actors that were behind the agent at any time, near its line and in its direction."""
+    at = others.sample
+    c, s = np.cos(track.heading[at]), np.sin(track.heading[at])
+    x, y = others.x - track.x[at], others.y - track.y[at]
+    ahead, aside = x * c + y * s, np.abs(y * c - x * s)
+    # In a bend, an actor behind is to the side as well.
+    near = (ahead < 0) & (aside < _SIDEWAYS_M - ahead) & (np.cos(others.heading - track.heading[at]) > 0)
+    return [int(number) for number in np.unique(others.who[near])]
+
+
+def _pieces(track: Track, others: Others, number: int) -> Iterator[tuple[NDArray[np.intp], Track, Others]]:
+    """Yield the ways of an actor while it was near, with the samples of the agent as the only actor to reach."""
+    rows = np.flatnonzero(others.who == number)
+    samples, first = np.unique(others.sample[rows], return_index=True)
+    rows = rows[first]
+    for part in np.split(np.arange(len(samples)), np.flatnonzero(np.diff(samples) > 1) + 1):
+        if len(part) < _LEAST:
+            continue
+        here, these = samples[part], rows[part]
+        theirs = Track(
+            track.time[here],
+            others.x[these],
+            others.y[these],
+            np.unwrap(others.heading[these]),
+            others.z[these],
+            others.half_length[these],
+            others.half_width[these],
+            others.height[these],
+        )
+        own = Others(np.arange(len(here)), np.zeros(len(here), np.intp), *(column[here] for column in track[1:]))
+        yield here, theirs, own

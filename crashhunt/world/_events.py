@@ -1,18 +1,18 @@
-"""Traffic events: what a traffic engineer wants to be told even where nobody crashed."""
+"""Traffic events that matter to a traffic engineer even without a crash."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypedDict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from crashhunt.base.codec import Serializable, null_is
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
-    from crashhunt.base.plain import Plain
 
-# Imports that are not for the words stand inside: --help needs the words alone.
-__all__ = ["EVENT_WORDS", "LIMITS", "Event", "EventData", "event_counts"]
+__all__ = ["EVENT_WORDS", "LIMITS", "Event", "Link", "RightOfWay", "event_counts"]
 
 EVENT_WORDS = {
     "red_light": ("red light run", "red lights run"),
@@ -26,25 +26,12 @@ EVENT_WORDS = {
 """Each kind, in words: of one and of several."""
 
 LIMITS: Mapping[str, tuple[float, str]] = {"not_moving": (60.0, "s"), "hard_braking": (math.nan, "m/s²")}
-"""The kinds that have a limit, which may be asked for as ``KIND:LIMIT``: what it is by default, and its unit. NaN
-stands for the ``decel`` of the braking vehicle's own type."""
-
-
-class EventData(TypedDict):
-    """The plain data of an `Event`."""
-
-    kind: str
-    agent: str
-    what: str
-    others: Sequence[str]
-    lane: str
-    x: float | None
-    y: float | None
-    speed: float | None
+"""The event types with a limit, written ``KIND:LIMIT``: the default limit and its unit. NaN means the ``decel`` of the
+braking vehicle's own type."""
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class Event(Serializable):
     """Something that happened in the traffic around a controlled vehicle.
 
     Args:
@@ -63,32 +50,9 @@ class Event:
     what: str
     others: tuple[str, ...] = ()
     lane: str = ""
-    x: float = math.nan
-    y: float = math.nan
-    speed: float = math.nan
-
-    def to_json(self) -> EventData:
-        """Return plain strings and numbers; what is not a finite number is null."""
-        from crashhunt.base.plain import finite
-
-        return {
-            "kind": self.kind,
-            "agent": self.agent,
-            "what": self.what,
-            "others": list(self.others),
-            "lane": self.lane,
-            "x": finite(self.x),
-            "y": finite(self.y),
-            "speed": finite(self.speed),
-        }
-
-    @classmethod
-    def from_json(cls, data: Plain) -> Event:
-        """Rebuild what `to_json` returned; what a later version has added is left out."""
-        from crashhunt.base.tolerance import known_values
-
-        known = known_values(cls, data, null=math.nan)
-        return cls(**{**known, "others": tuple(known.get("others", ()))})
+    x: float = field(default=math.nan, metadata=null_is(math.nan))
+    y: float = field(default=math.nan, metadata=null_is(math.nan))
+    speed: float = field(default=math.nan, metadata=null_is(math.nan))
 
 
 def event_counts(counts: Mapping[str, int]) -> str:
@@ -96,3 +60,80 @@ def event_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(
         f"{count} {EVENT_WORDS.get(kind, (kind, kind))[count != 1]}" for kind, count in counts.items() if count
     )
+
+
+# Right of way at junctions, from the map.
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A way across a junction, from a lane that leads to it to one that leads away.
+
+    Args:
+        junction: its name.
+        source: the lane from which it comes.
+        target: the lane to which it leads.
+        inside: the lanes inside the junction.
+        signalised: whether a traffic light says when.
+        shape: the centre line inside the junction, as (x, y) pairs in m.
+    """
+
+    junction: str
+    source: str
+    target: str
+    inside: tuple[str, ...]
+    signalised: bool
+    shape: tuple[tuple[float, float], ...]
+
+    def distance(self, x: float, y: float) -> float:
+        """How far a point is from it, in m."""
+        found = math.inf
+        for (x0, y0), (x1, y1) in zip(self.shape, self.shape[1:], strict=False):
+            dx, dy = x1 - x0, y1 - y0
+            along = dx * dx + dy * dy
+            share = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / along)) if along else 0.0
+            found = min(found, math.hypot(x - x0 - share * dx, y - y0 - share * dy))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class RightOfWay:
+    """The ways across all junctions of a map.
+
+    Args:
+        links: all of them.
+        gives_way: pairs of places in ``links``: the first has to give way to the second.
+    """
+
+    links: tuple[Link, ...]
+    gives_way: frozenset[tuple[int, int]]
+
+    def places(self, lanes: tuple[str, ...], x: float, y: float) -> tuple[int, ...]:
+        """Return the places of the links that an actor may be on, or has just been on.
+
+        Args:
+            lanes: on which it was, in this order; the same lane may come again.
+            x: where it is, in m.
+            y: likewise.
+        """
+        for back in range(len(lanes) - 1, -1, -1):
+            lane, later = lanes[back], lanes[back + 1 :]
+            through = [place for place, link in enumerate(self.links) if lane in link.inside]
+            if through:
+                return tuple(through)
+            leaving = [
+                place
+                for place, link in enumerate(self.links)
+                if link.source == lane and all(one in (lane, link.target) for one in later)
+            ]
+            if leaving and (later or self._is_near(leaving, x, y)):
+                if later and any(one != lane for one in later):
+                    return tuple(place for place in leaving if self.links[place].target in later)
+                return tuple(place for place in leaving if self.links[place].distance(x, y) < _ON_IT_M)
+        return ()
+
+    def _is_near(self, places: list[int], x: float, y: float) -> bool:
+        return any(self.links[place].distance(x, y) < _ON_IT_M for place in places)
+
+
+_ON_IT_M = 1.5

@@ -41,14 +41,14 @@ Spine = tuple[tuple[float, float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """What does not change about an actor.
+    """The constant properties of an actor.
 
     Args:
-        id: unique within the episode; that of a person is ``person`` and its name, with a blank between.
-        kind: the simulator's word for it, such as SUMO's class (``passenger``, ``truck``, ``pedestrian``).
+        id: unique within the episode; that of a person is ``person``, a blank and its name.
+        kind: the simulator's class, such as SUMO's ``passenger``, ``truck``, ``pedestrian``.
         length: in m.
         width: in m.
-        height: in m; 0 where the map is flat and nobody needs it.
+        height: in m; 0 where the map is flat.
     """
 
     id: str
@@ -95,7 +95,7 @@ class Lane:
 
 
 class Roster:
-    """The actors of a scene, in the order of its rows. One roster serves every step until somebody enters or leaves.
+    """The actors of a scene, in the order of its rows. A roster is shared by all steps between two changes of actors.
 
     Args:
         actors: all actors.
@@ -143,7 +143,7 @@ class Roster:
         return len(self.actors)
 
 
-_NO_SPINES: Mapping[int, Spine] = {}  # nobody writes to it
+_NO_SPINES: Mapping[int, Spine] = {}  # shared, so never written to
 _LATER: Any = None  # in place of what is made of the core's columns when it is asked for
 
 
@@ -204,7 +204,7 @@ def joined_frame(
     Args:
         roster: of all of them.
         columns: as in `Frame`.
-        scenes: each one; None where nobody is high or bent.
+        scenes: each one; None where no actor has a height or bends.
         core: what computes with it faster.
     """
     heights = spines = None
@@ -232,10 +232,10 @@ class Scene:
         heights: z of each front bumper, in m; empty where the map is flat.
         grades: how far the road rises a metre where each of them is, ahead of it; empty where the map is flat.
         spines: row to centre line, of the long vehicles that are bent.
-        swept: whether everybody has driven here from the previous scene along the way that the headings say, so that
-            contacts between the two scenes can be found; a jump sideways, as SUMO changes lanes, comes at the end.
+        swept: whether all actors have driven here from the previous scene along the way that the headings describe.
+            Contacts between the two scenes can then be found. A lane change of SUMO, a jump sideways, is at the end.
         core: what computes with it faster, where there is such a thing; the results are the same.
-        columns: points, headings and speeds as the core has them, which may be left out then.
+        columns: points, headings and speeds as arrays of the core; they replace the three arguments.
 
     Attributes:
         events: what else happened in this step.

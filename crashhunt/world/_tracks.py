@@ -1,42 +1,61 @@
-"""Who was where when, as bare columns: the way of one agent, and everybody who came near it."""
+"""Positions over time as arrays: the way of one agent, and of every actor that came near it."""
 
 from __future__ import annotations
 
+import base64
+import json
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+import zlib
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from crashhunt.world._outlines import levels, outlines
-from crashhunt.world._scene import core_of, part_of
+from crashhunt.base.codec import JsonObject, Serializable
+from crashhunt.world._geometry import levels, outlines
+from crashhunt.world._scene import Actor, core_of, part_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from crashhunt.world._scene import Frame
+    from crashhunt.world._scene import Frame, Scene, Spine
 
     Array = NDArray[np.float64]
 
-__all__ = ["Others", "Reach", "Track", "sampled", "spacing_s", "tracks", "ways"]
 
-_APART_S = 0.3  # of the samples, at least: nobody gets far in it, and every step costs time
-_AT_MOST_S = 0.3  # where a step is longer, there are samples between two scenes
+__all__ = [
+    "Others",
+    "Path",
+    "Paths",
+    "Reach",
+    "State",
+    "Track",
+    "paths_of",
+    "sampled",
+    "spacing_s",
+    "tracks",
+    "ways",
+]
+
+
+_APART_S = 0.3  # lower bound between samples: actors move little in that time, and every sample costs time
+_AT_MOST_S = 0.3  # longer steps get samples between two scenes
 
 
 def spacing_s(step_length_s: float) -> float:
-    """Return how far apart samples are, in s."""
+    """Return the time between samples, in s."""
     return _every(step_length_s) * step_length_s / _between_steps(step_length_s)
 
 
 def _every(step_length_s: float) -> int:
-    """Of how many steps one is looked at, where they are short."""
+    """Return the stride of sampled steps, more than 1 where steps are short."""
     return max(1, round(_APART_S / step_length_s))
 
 
 def _between_steps(step_length_s: float) -> int:
-    """How many samples a step has, where it is long."""
+    """Return the number of samples per step, more than 1 where steps are long."""
     return max(1, math.ceil(step_length_s / _AT_MOST_S - 1e-9))
 
 
@@ -65,11 +84,11 @@ class Track(NamedTuple):
 
 
 class Others(NamedTuple):
-    """Those near an agent, each of shape (pairs,): fields as in `Track`.
+    """The actors near an agent, each of shape (pairs,): fields as in `Track`.
 
     Args:
-        sample: of the track.
-        who: the number of the actor, as `tracks` names them.
+        sample: index in the track.
+        who: the number of the actor, as `tracks` numbers them.
     """
 
     sample: NDArray[np.intp]
@@ -84,7 +103,7 @@ class Others(NamedTuple):
 
 
 def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Frame, Array]]:
-    """Yield the scenes that are looked at, not all where steps are short, and the times of their rows, in s."""
+    """Yield the sampled scenes and the times of their rows, in s; where steps are short, not all scenes are sampled."""
     every, step = _every(step_length_s), 0
     for frame in frames:
         steps = np.arange(step, step + len(frame.columns))
@@ -99,12 +118,12 @@ def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Fra
 
 
 class Reach(NamedTuple):
-    """Who is of no interest: whoever does not touch the agent's way.
+    """The part of an agent's way in which other actors matter; actors that do not touch it are irrelevant.
 
     Args:
-        ahead: how far along it, in m; 0 where everybody is.
+        ahead: how far along the way, in m; 0 where all actors matter.
         behind: how far back, in m.
-        unknown: how far straight on it is taken to go at its end, in m.
+        unknown: how far straight on the way is extended at its end, in m.
     """
 
     ahead: float = 0.0
@@ -115,20 +134,20 @@ class Reach(NamedTuple):
 def ways(
     frames: Sequence[Frame], agent: str, within_m: float, step_length_s: float, reach: Reach | None = None
 ) -> tuple[Track, Others, list[str]] | None:
-    """Return what `tracks` returns of instants that are `spacing_s` apart, from the core where it can.
+    """Return the result of `tracks` for instants that are `spacing_s` apart, computed by the core where possible.
 
-    Where steps are long, what was between two scenes is put in, as if everybody who is in both had gone straight.
+    Where steps are long, samples between two scenes are interpolated along straight lines.
 
     Args:
         frames: of an episode.
         agent: the controlled vehicle.
-        within_m: as of `tracks`.
+        within_m: as for `tracks`.
         step_length_s: in s.
-        reach: the core may leave out whoever is of no interest, and numbers nobody.
+        reach: permits the core to skip irrelevant actors, and then to number none.
     """
     between = _between_steps(step_length_s)
     if between > 1:
-        reach = None  # whoever is not on the agent's way in two scenes may be on it between them
+        reach = None  # an actor off the agent's way in two scenes may be on it in between
     seen = _fronts_from_core(frames, agent, within_m, step_length_s, reach)
     seen = seen or _fronts(list(sampled(frames, step_length_s)), agent, within_m)
     if not len(seen.time):
@@ -139,28 +158,28 @@ def ways(
 
 
 def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) -> tuple[Track, Others, list[str]] | None:
-    """Return the way of an agent, those who came within a distance of it, and the names of these.
+    """Return the way of an agent, the ways of the actors that came within a distance of it, and their names.
 
     Args:
         parts: as `sampled` yields them.
         agent: the controlled vehicle.
-        within_m: between centres; whoever is a little further away may be among them.
+        within_m: between centres; actors slightly further away may be included.
 
     Returns:
-        None where it is in no scene.
+        None where the agent is in no scene.
     """
     seen = _fronts(parts, agent, within_m)
     return (_track(seen.time, seen.own), _others(seen.theirs), seen.names) if len(seen.time) else None
 
 
 class _Fronts(NamedTuple):
-    """What a track is made of, with fronts in place of centres.
+    """The data of tracks, with fronts in place of centres.
 
     Args:
         time: in s, shape (samples,).
         own: shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent.
-        theirs: sample and who, and the same seven of each who is near, each of shape (pairs,).
-        names: of whom they number.
+        theirs: sample and actor number, and the same seven of each near actor, each of shape (pairs,).
+        names: of the numbered actors.
     """
 
     time: Array
@@ -181,7 +200,7 @@ def _fronts_from_core(
     for frame in frames:
         whose = frame.roster.rows
         after = step + len(frame.columns)
-        # Where it has a sample; who somebody is says nothing where only some are of interest.
+        # Only where the agent has a sample; actor numbers are undefined where a reach is given.
         if reach is None and agent in frame.roster.index and -(-step // every) * every < after:
             whose = [numbers.setdefault(actor.id, len(numbers)) for actor in frame.roster.actors]
         parts.append(part_of(frame, agent, whose))
@@ -229,9 +248,9 @@ _NOWHERE = _Fronts(np.zeros(0), np.zeros((7, 0)), [np.zeros(0)] * 9, [])
 
 
 def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
-    """Put in what was between two scenes: of everybody who is in both, as if they had gone straight."""
+    """Return fronts with samples between two scenes added, on straight lines for each actor that is in both."""
     time, own, theirs, names = seen
-    joined = np.diff(time) < 1.5 * step_length_s  # the agent may have been away for some steps
+    joined = np.diff(time) < 1.5 * step_length_s  # the agent may have been absent for some steps
     size = np.append(np.where(joined, between, 1), 1)
     first = np.cumsum(size) - size
     share = np.arange(1, between) / between
@@ -241,7 +260,7 @@ def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
     whole[:, (first[start, None] + np.arange(1, between)).ravel()] = _between(
         whole[:, first], start, start + 1, share, 3
     )
-    # Of long vehicles in bends each part counts, from front to back: the last one stands for those that it has not.
+    # Each part of a long vehicle in a bend counts, from front to back; missing parts are equal to the last one.
     sample, who, *_ = theirs
     order = np.lexsort((sample, who))
     pairs = np.array([np.asarray(column, float)[order] for column in theirs])
@@ -260,7 +279,7 @@ def _filled(seen: _Fronts, between: int, step_length_s: float) -> _Fronts:
 
 
 def _between(columns: Array, old: NDArray[np.intp], new: NDArray[np.intp], share: Array, heading: int) -> Array:
-    """Return what is so far from old columns to new ones, each as often as there are shares; a row has headings."""
+    """Return old columns interpolated to new ones, repeated for each share; one row holds headings."""
     before, after = columns[:, old, None], columns[:, new, None].copy()
     turned = after[heading] - before[heading]
     after[heading] -= math.tau * np.round(turned / math.tau)  # the short way round
@@ -281,7 +300,7 @@ def _others(fronts: Sequence[NDArray[Any]]) -> Others:
 
 
 def _straight(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> tuple[Array, tuple[Any, ...]]:
-    """The agent and those near it, by their fronts."""
+    """Return the agent and the actors near it, by their fronts."""
     roster, columns, count = frame.roster, frame.columns, len(frame.roster)
     half = roster.half_sizes
     places = columns[:, : 2 * count].reshape(-1, count, 2)
@@ -309,7 +328,7 @@ def _straight(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) 
 
 
 def _bent(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> tuple[Array, tuple[Any, ...]]:
-    """The same where long vehicles are in bends: each of their parts counts as one; of the agent, the first."""
+    """Return the same where long vehicles are in bends: each part counts as an actor; of the agent, only the first."""
     own: list[tuple[float, ...]] = []
     theirs: list[tuple[float, ...]] = []
     for sample in range(len(frame.columns)):
@@ -326,3 +345,219 @@ def _bent(frame: Frame, row: int, names: NDArray[np.intp], within_m: float) -> t
     at = rest[0].astype(int)
     near = np.hypot(rest[2] - mine[0, at], rest[3] - mine[1, at]) < within_m + 2 * rest[6] + 2 * mine[4, at]
     return mine, tuple(rest[:, near])
+
+
+# Recorded ways of actors: pose and speed at each step, and size.
+
+_MOST_BYTES = 1 << 28  # of unpacked data: more is damage or an attack, not a recording
+
+
+class State(NamedTuple):
+    """The state of an actor after a step.
+
+    Args:
+        x: of the centre of the front bumper, in m.
+        y: likewise.
+        heading: in rad, counter-clockwise from the x axis.
+        speed: in m/s.
+        z: of the front bumper, in m; 0 where the map is flat.
+        grade: rise of the road per metre.
+    """
+
+    x: float
+    y: float
+    heading: float
+    speed: float
+    z: float = 0.0
+    grade: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """The way of an actor while it was visible; an actor that returns has several.
+
+    Args:
+        actor: its id, kind and size.
+        first: the step after which it was first visible; 0 is before the first step.
+        states: after that step and each that followed.
+        lanes: its lanes as (step, lane), after the steps for which they were recorded.
+        spines: the centre lines of a long vehicle in bends, as (step, centre line).
+    """
+
+    actor: Actor
+    first: int
+    states: tuple[State, ...]
+    lanes: tuple[tuple[int, str], ...] = ()
+    spines: tuple[tuple[int, Spine], ...] = ()
+
+    @property
+    def last(self) -> int:
+        """The step after which it was last visible."""
+        return self.first + len(self.states) - 1
+
+    def at(self, step: int, step_length_s: float) -> State:
+        """Return its state after a step; after its last one, straight on at constant speed."""
+        state = self.states[min(step, self.last) - self.first]
+        if step <= self.last:
+            return state
+        away = state.speed * (step - self.last) * step_length_s
+        return state._replace(x=state.x + away * math.cos(state.heading), y=state.y + away * math.sin(state.heading))
+
+    def cut(self, begin: int, end: int) -> Path | None:
+        """Return its part after the steps ``begin`` to ``end``, counted from ``begin``; None if that is empty."""
+        first, last = max(self.first, begin), min(self.last, end)
+        if first > last:
+            return None
+        before = [lane for step, lane in self.lanes if step <= first][-1:]
+        return Path(
+            self.actor,
+            first - begin,
+            self.states[first - self.first : last - self.first + 1],
+            (
+                *((first - begin, lane) for lane in before),
+                *((step - begin, lane) for step, lane in self.lanes if first < step <= last),
+            ),
+            tuple((step - begin, spine) for step, spine in self.spines if first <= step <= last),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Paths(Serializable):
+    """The recorded ways of several actors.
+
+    Args:
+        time_s: simulation time before the first step, in s.
+        steps: their number; there is one state more, before the first step.
+        agents: of the controlled vehicles.
+        others: of all other actors, in order of appearance.
+    """
+
+    time_s: float
+    steps: int
+    agents: tuple[Path, ...]
+    others: tuple[Path, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the other actors, each once."""
+        return tuple(dict.fromkeys(path.actor.id for path in self.others))
+
+    def only(self, names: Collection[str]) -> Paths:
+        """Return the paths with only those other actors that are named."""
+        return replace(self, others=tuple(path for path in self.others if path.actor.id in names))
+
+    def driven_by(self, agents: Collection[str]) -> Paths:
+        """Return the paths with only the named agents as agents; the rest are among the others."""
+        more = tuple(path for path in self.agents if path.actor.id not in agents)
+        left = tuple(path for path in self.agents if path.actor.id in agents)
+        return replace(self, agents=left, others=(*more, *self.others))
+
+    def cut(self, begin: int, end: int, step_length_s: float) -> Paths:
+        """Return the part from after step ``begin`` to after step ``end``, counted from ``begin``."""
+        parts = [[part for path in some if (part := path.cut(begin, end))] for some in (self.agents, self.others)]
+        time_s = self.time_s + begin * step_length_s
+        return Paths(time_s, min(end, self.steps) - begin, tuple(parts[0]), tuple(parts[1]))
+
+    def placing(self) -> Paths:
+        """Return the paths with only the first states of the agents."""
+        starts = (replace(path, states=path.states[:1], lanes=path.lanes[:1], spines=()) for path in self.agents)
+        return replace(self, agents=tuple(starts))
+
+    def to_json(self) -> JsonObject:
+        """Return plain data: what a person may want to read, and the rest as compressed JSON; numbers stay exact."""
+        plain = [[_plain(path) for path in some] for some in (self.agents, self.others)]
+        text = json.dumps(plain, separators=(",", ":"))
+        return {
+            "time_s": self.time_s,
+            "steps": self.steps,
+            "agents": [path.actor.id for path in self.agents],
+            "others": list(self.names),
+            "packed": base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Rebuild what `to_json` returned.
+
+        Raises:
+            ValueError: the data are damaged.
+        """
+        try:
+            unpacking = zlib.decompressobj()
+            text = unpacking.decompress(base64.b64decode(data["packed"], validate=True), _MOST_BYTES)
+            agents, others = ([_path(*plain) for plain in some] for some in json.loads(text))
+            return cls(float(data["time_s"]), int(data["steps"]), tuple(agents), tuple(others))
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, zlib.error, RecursionError) as error:
+            raise ValueError(f"recorded paths are damaged: {error}") from None
+
+
+def paths_of(scenes: Sequence[Scene], agents: Collection[str]) -> Paths:
+    """Return the ways of all actors in successive scenes.
+
+    Args:
+        scenes: before the first step and after each.
+        agents: the ids of the controlled vehicles.
+    """
+    found: list[_Open] = []
+    current: dict[str, _Open] = {}
+    for step, scene in enumerate(scenes):
+        present: dict[str, _Open] = {}
+        for row, actor in enumerate(scene.roster.actors):
+            way = current.get(actor.id)
+            if way is None:
+                way = _Open(actor, step)
+                found.append(way)
+            present[actor.id] = way
+            way.add(scene, row, step)
+        current = present
+    paths = [way.path() for way in found]
+    mine = [path for path in paths if path.actor.id in agents]
+    others = [path for path in paths if path.actor.id not in agents]
+    return Paths(scenes[0].time_s if scenes else 0.0, max(0, len(scenes) - 1), tuple(mine), tuple(others))
+
+
+class _Open:
+    """The way of an actor that is still visible."""
+
+    def __init__(self, actor: Actor, first: int) -> None:
+        self._actor, self._first = actor, first
+        self._states: list[State] = []
+        self._lanes: list[tuple[int, str]] = []
+        self._spines: list[tuple[int, Spine]] = []
+
+    def add(self, scene: Scene, row: int, step: int) -> None:
+        x, y = scene.points[row]
+        high = (float(scene.heights[row]), float(scene.grades[row])) if scene.heights else (0.0, 0.0)
+        self._states.append(State(float(x), float(y), float(scene.headings[row]), float(scene.speeds[row]), *high))
+        if scene.lanes:
+            self._lanes.append((step, scene.lanes[row]))
+        if row in scene.spines:
+            self._spines.append((step, tuple(tuple(map(float, point)) for point in scene.spines[row])))  # type: ignore[misc]
+
+    def path(self) -> Path:
+        return Path(self._actor, self._first, tuple(self._states), tuple(self._lanes), tuple(self._spines))
+
+
+def _plain(path: Path) -> list[object]:
+    actor = path.actor
+    who = [actor.id, actor.kind, actor.length, actor.width, actor.height]
+    is_flat = not any(state.z or state.grade for state in path.states)
+    states = [state[:4] if is_flat else state for state in path.states]
+    return [who, path.first, states, path.lanes, path.spines]
+
+
+def _path(
+    who: Sequence[str | float],
+    first: int,
+    states: Iterable[Iterable[float]],
+    lanes: Iterable[tuple[int, str]],
+    spines: Iterable[tuple[int, Iterable[Iterable[float]]]],
+) -> Path:
+    name, kind, *size = who
+    actor = Actor(str(name), str(kind), *map(float, size))
+    centre_lines = tuple((int(step), tuple(tuple(map(float, point)) for point in line)) for step, line in spines)
+    where = tuple((int(step), str(lane)) for step, lane in lanes)
+    seen = tuple(State(*map(float, state)) for state in states)
+    if not seen:
+        raise ValueError(f"{name} is nowhere")
+    return Path(actor, int(first), seen, where, centre_lines)  # type: ignore[arg-type]

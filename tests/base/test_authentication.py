@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base.authentication import authentication_code, is_authentic, state_folders, user_key
+from crashhunt.base.integrity import authentication_code, is_authentic, state_folders, user_key
 
 STATEMENT = {"digest": "x", "arguments": {"ego": {"speed": 1.0}}}
 
@@ -38,7 +38,7 @@ def test_what_is_no_code_proves_nothing(code):
 
 
 def test_key_is_made_once_for_this_user_alone(home):
-    words = [sys.executable, "-c", "from crashhunt.base.authentication import user_key; print(user_key().hex())"]
+    words = [sys.executable, "-c", "from crashhunt.base.integrity import user_key; print(user_key().hex())"]
     at_once = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     keys = {process.communicate()[0].strip() for process in at_once}
     assert keys == {user_key().hex()}

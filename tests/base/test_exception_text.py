@@ -10,8 +10,7 @@ import traceback
 
 import pytest
 
-from crashhunt.base.blame import in_words
-from crashhunt.base.exception_text import MAX_TRACEBACK_CHARACTERS, class_name, format_error, message_of
+from crashhunt.base.exceptions import MAX_TRACEBACK_CHARACTERS, class_name, format_error, in_words, message_of
 
 MANY = 50_000
 LONG = 30_000_000  # characters
@@ -127,7 +126,7 @@ def test_ordinary_exception_is_formatted_as_python_does(make):
             ["several (50000 sub-exceptions)\n  1 of 50000: ValueError: 0\n", "(49990 more exceptions are"],
         ),
         (lambda: with_note(ValueError("x"), ["note"] * MANY), ["ValueError: x\nnote\n", "(49990 more notes"]),
-        (lambda: with_note(ValueError("x"), ["n" * LONG]), ["ValueError: x\nnn", "characters are left out)"]),
+        (lambda: with_note(ValueError("x"), ["n" * LONG]), ["ValueError: x\nnn", "characters are omitted)"]),
         (lambda: with_note(ValueError("x"), Liar), ["ValueError: x\n"]),
         (lambda: fail(type("N" * LONG, (Exception,), {})("x")), ["N" * 200 + ": x\n"]),
         (lambda: fail(SyntaxError("bad", ("f.py", 1, 1, "x " * LONG, 1, 2))), ["SyntaxError: bad (f.py"]),
@@ -157,7 +156,7 @@ def test_long_chain_shows_both_ends_in_order(count, left_out):
     text = format_error(raised(lambda: chained(count, how="__context__")))
     numbers = [int(line.removeprefix("ValueError: ")) for line in text.splitlines() if line.startswith("ValueError")]
     assert numbers == [*range(8), *range(count - 8, count)]
-    assert f"… ({left_out} exceptions in between are left out) …" in text
+    assert f"… ({left_out} exceptions in between are omitted) …" in text
     assert text.count("During handling of the above exception") == 15
 
 
@@ -189,7 +188,7 @@ def test_long_traceback_shows_both_ends():
     assert time.process_time() - began < 0.5
     assert text.startswith('Traceback (most recent call last):\n  File "')
     assert "in raised\n" in text
-    assert "… (49903 frames are left out) …\n" in text
+    assert "… (49903 frames are omitted) …\n" in text
     assert text.endswith('    raise ValueError("bottom")\nValueError: bottom\n')
 
 

@@ -7,7 +7,7 @@ import resource
 
 import pytest
 
-from crashhunt.base.limits import limit_behind
+from crashhunt.base.resources import limit_behind
 from crashhunt.episode._failures import failure_of
 
 MEMORY = (

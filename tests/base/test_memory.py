@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.base.memory import free_memory
+from crashhunt.base.resources import free_memory
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import crashhunt
-from crashhunt.base.names import did_you_mean, listed, near_path, one_of
+from crashhunt.base.text import did_you_mean, listed, near_path, one_of
 from crashhunt.cli import main
 from crashhunt.crashes import Bundle, find_bundle
 from crashhunt.errors import BundleError, CallError, CrashhuntError, PluginError, UsageError

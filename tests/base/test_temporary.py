@@ -16,19 +16,23 @@ from pathlib import Path
 
 import pytest
 
-from crashhunt.base import owners, shared_memory as segments, temporary
+from crashhunt.base import temporary, temporary as segments
 from crashhunt.base.files import exchange, put_in_place, whole_file
-from crashhunt.base.owners import Owner, has_ended, owner_in, start_time, this_process
 from crashhunt.base.temporary import (
+    Owner,
     TemporaryFolder,
+    has_ended,
+    owner_in,
     remove_at_once,
     remove_ended,
     remove_leftovers,
     remove_scratch,
     remove_tree,
+    start_time,
     temporary_beside,
     temporary_folder,
     temporary_name,
+    this_process,
 )
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="owners are known by /proc")
@@ -199,7 +203,7 @@ def test_a_process_id_that_was_given_to_another_process_is_not_taken_for_the_own
 def test_a_process_that_proc_does_not_show_counts_as_alive(monkeypatch):
     other = Owner(os.getppid(), 5, this_process().boot, this_process().namespace)
     assert has_ended(other)
-    monkeypatch.setattr(owners, "start_time", lambda pid: -1)
+    monkeypatch.setattr(temporary, "start_time", lambda pid: -1)
     assert not has_ended(other)
 
 
@@ -221,7 +225,7 @@ def test_what_another_host_boot_or_container_has_stays(place, field):
 def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place, monkeypatch):
     here = this_process()
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(owners, "_BOOT_ID", "/nowhere")
+        patched.setattr(temporary, "_BOOT_ID", "/nowhere")
         assert this_process().boot == "0" * 12
         folder = owned(place, Owner(here.pid, 1, here.boot, here.namespace))
         unknown = owned(place, Owner(here.pid + 1, 0, "0" * 12, "0" * 8))
@@ -237,11 +241,11 @@ def test_where_a_process_does_not_know_itself_it_removes_nothing_of_others(place
 @contextmanager
 def fresh():
     """Nothing is remembered of this process, before and after."""
-    owners._owner.cache_clear()
+    temporary._owner.cache_clear()
     try:
         yield
     finally:
-        owners._owner.cache_clear()
+        temporary._owner.cache_clear()
 
 
 def ended() -> Owner:
@@ -338,7 +342,7 @@ def test_a_kernel_without_time_namespaces_has_owners_too(tmp_path, monkeypatch):
     before = this_process()
     (tmp_path / "pid").symlink_to(os.readlink("/proc/self/ns/pid"))  # noqa: PTH115 - it is no path
     with monkeypatch.context() as patched, fresh():
-        patched.setattr(owners, "_NAMESPACES", str(tmp_path))
+        patched.setattr(temporary, "_NAMESPACES", str(tmp_path))
         here = this_process()
         assert (here.pid, here.started, here.boot) == (before.pid, before.started, before.boot)
         assert here.namespace not in (before.namespace, "0" * 8)

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from crashhunt.crashes import Factor, LeftOut, Why
-from crashhunt.crashes._why import why_from, wilson
+from crashhunt.crashes._judgement import why_from, wilson
 
 
 def factor(*endings):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.base.plugins import locate, registered
-from crashhunt.disturbances import Choices, Disturber, Drawn, brake, cut_in, disturber_of, parse_rates
+from crashhunt.disturbances import Choices, DisturbanceSampler, Drawn, brake, cut_in, disturber_of, parse_rates
 from crashhunt.errors import PluginError, UsageError
 from crashhunt.testing import DisturbanceContract
 from crashhunt.trial import KINDS, Disturbance, TrialResult
@@ -160,7 +160,7 @@ def test_the_likelihood_is_the_product_of_what_was_drawn(seed, steps):
 def test_the_probabilities_of_all_that_can_happen_add_up():
     """Of two steps and a model with two possibilities: nothing, or one of two, in each."""
     model = Choices("brake", {"ahead": 1.0}, {2.0: 3.0, 4.0: 1.0}, {1.0: 1.0})
-    disturber = Disturber({"brake": model}, {"brake": 3.0}, ("ego",), DT)
+    disturber = DisturbanceSampler({"brake": model}, {"brake": 3.0}, ("ego",), DT)
     possible = [None, 2.0, 4.0]
     total = 0.0
     for first in possible:
@@ -176,7 +176,7 @@ def test_what_the_models_never_draw_is_impossible():
     odd = Disturbance(1, "ahead", "brake", 3.5, 1.0, "ego")
     assert disturber.log_likelihood([odd], 5) == -math.inf
     assert disturber.log_likelihood([Disturbance(1, "ahead", "stop", 3.0, 8.0, "ego")], 5) == -math.inf
-    always = Disturber({"brake": brake()}, {"brake": 10.0}, ("ego",), DT)
+    always = DisturbanceSampler({"brake": brake()}, {"brake": 10.0}, ("ego",), DT)
     assert always.log_likelihood([], 1) == -math.inf
     assert math.isfinite(always.log_likelihood(always.draw(1, 5), 5))
 
@@ -206,7 +206,7 @@ def test_a_model_that_draws_nonsense_is_named():
             return 0.0
 
     with pytest.raises(PluginError, match="'odd' has drawn"):
-        Disturber({"odd": Odd()}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
+        DisturbanceSampler({"odd": Odd()}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
 
 
 @pytest.mark.parametrize(
@@ -221,9 +221,9 @@ def test_a_model_that_draws_nonsense_is_named():
 def test_a_model_draws_only_what_its_kind_may_be(what, who, strong):
     model = Choices(what, {who: 1.0}, {strong: 1.0}, {1.0: 1.0})
     with pytest.raises(PluginError, match=f"'odd' has drawn .*who='{who}'"):
-        Disturber({"odd": model}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
+        DisturbanceSampler({"odd": model}, {"odd": 5.0}, ("ego",), DT).draw(1, 100)
     own = Choices("lean", {who: 1.0}, {strong: 1.0}, {1.0: 1.0})  # a kind of a simulator's of somebody's own
-    assert Disturber({"own": own}, {"own": 5.0}, ("ego",), DT).draw(1, 100)
+    assert DisturbanceSampler({"own": own}, {"own": 5.0}, ("ego",), DT).draw(1, 100)
 
 
 def test_weights_are_shares():

@@ -12,7 +12,7 @@ import pytest
 
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.hunts._audit import Audit
+from crashhunt.hunts._verification import Audit
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
@@ -73,12 +73,12 @@ def test_audits_of_a_hunt_that_was_stopped_are_made_up_for_when_it_is_resumed(to
     ended = [TrialResult(TrialSpec(number, 1, {}, {}, 9), Outcome.SURVIVED) for number in range(6)]
     sample = sum(map(settings.is_audited, ended))
     process = toy.start(*words)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while len(list((toy.folder / "h").glob(".scratch-*/audit/recorded-*"))) < 2:
         assert time.monotonic() < deadline, "no trial waits for its audit"
         time.sleep(0.002)
     process.send_signal(how)
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=300)
     if how == signal.SIGINT:
         audit = json.loads(out)["audit"]
         assert audit["not_finished"] == len(left(toy)) > 0

@@ -39,7 +39,7 @@ def go_on(pids: list[int]) -> list[int]:
     return found
 
 
-def wait_for(condition, timeout_s=60.0):
+def wait_for(condition, timeout_s=300.0):
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, "it did not come to that"
@@ -65,11 +65,11 @@ def test_whoever_is_killed_nothing_goes_on_and_the_hunt_comes_to_its_end(toy, le
     os.kill(victim, signal.SIGKILL)
     below = [pid for level_of in levels[1:] for pid in level_of]
     if level:
-        _, err = process.communicate(timeout=90)
+        _, err = process.communicate(timeout=300)
         assert process.returncode == 0, err
         assert "Traceback" not in err
     else:
-        process.communicate(timeout=90)
+        process.communicate(timeout=300)
         wait_for(lambda: not go_on(below), timeout_s=60.0)
         (state,) = toy.crashhunt("status", "h", "--json").json["hunts"]
         assert (state["state"], state["branches"]["run_again"]) == ("killed", None)

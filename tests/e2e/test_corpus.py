@@ -169,7 +169,7 @@ def test_a_strangers_crash_is_added_only_with_trust(kept):
 
 
 def test_a_large_log_is_left_out_and_the_case_still_runs(kept, monkeypatch):
-    monkeypatch.setattr("crashhunt.corpus._store._MOST", 1000)
+    monkeypatch.setattr("crashhunt.corpus._cases._MOST", 1000)
     added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
     assert not list(added.case.path.rglob("log.mcap"))
     (report,) = run_cases([added.case.path])
@@ -180,7 +180,7 @@ def test_a_full_disk_leaves_nothing_half_done(kept, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("crashhunt.corpus._store.write_log", full)
+    monkeypatch.setattr("crashhunt.corpus._cases.write_log", full)
     with pytest.raises(HuntDirectoryError, match="No space left") as raised:
         add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "full")
     assert "free some space" in raised.value.fix
@@ -188,16 +188,16 @@ def test_a_full_disk_leaves_nothing_half_done(kept, monkeypatch):
 
 
 def test_two_add_the_same_at_once(kept, monkeypatch):
-    from crashhunt.corpus import _store
+    from crashhunt.corpus import _cases
 
-    build, corpus = _store._build, kept.folder / "both"
+    build, corpus = _cases._build, kept.folder / "both"
 
     def overtaken(bundle, case, folder):
         build(bundle, case, folder)
         if not corpus.joinpath(case.name).exists():
             shutil.copytree(folder, corpus / case.name)
 
-    monkeypatch.setattr(_store, "_build", overtaken)
+    monkeypatch.setattr(_cases, "_build", overtaken)
     assert not add_case(find_bundle(kept.folder / "h", "0"), corpus).new
     assert [path.name for path in corpus.iterdir()] == [path.name for path in find_cases([corpus])]
 
@@ -206,12 +206,12 @@ def test_ctrl_c_ends_all_and_tells_what_has_ended(kept):
     begun = kept.folder / "begun"
     drive(kept, DRIVER.replace("return", f"import time; open({str(begun)!r}, 'w'); time.sleep(60); return"))
     running = kept.begin("corpus", "run", "kept crashes", "--parallel", "1")
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not begun.exists():
         assert time.monotonic() < deadline
         time.sleep(0.02)
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=120)
+    out, err = running.communicate(timeout=300)
     assert running.returncode == 130, err
     assert "2 cases: none has ended; interrupted after 0" in out
 

@@ -25,12 +25,12 @@ def typed(shell, text: str, *words: str, fork: bool = False, expect: int | None 
     """
     if fork and shell.environment == shell.unmeasured:
         begun = shell.begin("replay", "h", *words, typed=text)
-        out, err = begun.communicate(timeout=150)
+        out, err = begun.communicate(timeout=300)
         done = Done(begun.returncode, out, err)
     else:
         process = subprocess.run(
             [CRASHHUNT, "replay", "h", *words], cwd=shell.folder, env=shell.unmeasured, input=text,
-            capture_output=True, text=True, timeout=150, check=False,
+            capture_output=True, text=True, timeout=300, check=False,
         )  # fmt: skip
         done = Done(process.returncode, process.stdout, process.stderr)
     assert "Traceback" not in done.err, done.err

@@ -61,7 +61,7 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
 def test_they_are_listed(toy):
     found = toy.crashhunt("disturbances", "--json").json["disturbances"]
     assert {entry["name"] for entry in found} >= {"brake", "cut_in", "late_action"}
-    assert "Whoever is ahead brakes hard, and lets go again." in toy.crashhunt("disturbances").out
+    assert "The vehicle ahead brakes hard for a while." in toy.crashhunt("disturbances").out
 
 
 def test_what_is_not_asked_for_is_nowhere(toy):

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from crashhunt.errors import UsageError
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, RunSettings
 
 HUNT = ("--scenario", "toy", "--seed", "4", "--arg", "speed=1", "--set", "step_wall_s=0.001")

@@ -135,6 +135,25 @@ def test_a_crash_that_kills_the_process_is_filmed_up_to_it(toy, agent, where):
     assert done["written"] == {"f": 14 + 1 + 10}
 
 
+@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
+def test_film_of_a_replay_that_is_killed_once_is_made(toy, number):
+    (toy.folder / "killed.py").write_text(
+        "import os, signal\nfrom pathlib import Path\nfrom faulty import Raises\n"
+        "class Killed(Raises):\n"
+        "    def act(self, observation):\n"
+        "        if (place := os.environ.get('KILLED')) and not Path(place).exists():\n"
+        "            Path(place).touch()\n"
+        f"            os.kill(os.getpid(), signal.{number})\n"
+        "        return super().act(observation)\n"
+    )
+    toy.crashhunt("run", "h", "1", "1", "40", "--scenario", "toy", "--agent", "killed:Killed", "--arg", "at=5",
+                  "--seed", "1")  # fmt: skip
+    toy.environment["KILLED"] = str(toy.folder / "was killed")
+    done = toy.crashhunt("replay", "h", "--frames", "f", "--size", "128x128", "--json")
+    assert done.json["verdict"] == "reproduced"
+    assert done.err.count("crashhunt runs it again") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -189,7 +208,7 @@ def test_a_full_disk_leaves_no_half_film(crash):
         "replay", "h", "--from-log", "--video", "a.mp4", "--fps", "100", "--json",
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)),
     )  # fmt: skip
-    out, _ = done.communicate(timeout=100)
+    out, _ = done.communicate(timeout=300)
     assert done.returncode == 2, out
     assert "cannot be written" in json.loads(out)["error"]["message"]
     assert not list(crash.folder.glob("*.mp4")) + list(crash.folder.glob(".*.mp4"))

@@ -69,6 +69,10 @@ COMMANDS = (
     "judge h",
     "judge h --all",
     "shrink h",
+    "whatif h --from-step 1 --futures",
+    "whatif h --agent theirs:Agent --arg speed=3",
+    "whatif h --from-step 1 --set speed=3",
+    "whatif their.zip --set speed=3",
     "corpus add h/crashes/000000-collision --to new",
     "corpus run corpus",
     "corpus run corpus --keep kept",
@@ -261,7 +265,7 @@ def test_suite_that_goes_on_in_a_foreign_folder_is_refused(theirs):
     theirs.environment["XDG_STATE_HOME"] = str(theirs.folder / "their state")
     theirs.crashhunt("suite", "run", "suite.toml", "out", "--json")
     theirs.crashhunt("rerun", "out", "--all", "--json")
-    from crashhunt.hunts import Ledger
+    from crashhunt.ledger import Ledger
 
     with closing(Ledger(theirs.folder / "out/a/0/ledger.sqlite", writable=True)) as ledger:
         ledger.enter("interrupted", "")

@@ -146,7 +146,7 @@ def test_every_module_is_listed_with_what_it_is_about():
     modules = [file for file in files if file.name != "__init__.py"]
     assert sum(line.startswith("- `") for line in text.splitlines()) == len(modules)
     assert "## crashhunt/base\n" in text
-    assert "\n- `files.py`: Files that are there as a whole or not at all, also after the power went.\n" in text
+    assert "\n- `files.py`: Files that are complete or absent, even after a power failure.\n" in text
 
 
 def test_every_file_that_the_architecture_names_is_there():

@@ -15,7 +15,8 @@ import pytest
 from conftest import mostly_nightly
 
 FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
-ON_SUMO = ("--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
+LONG = ("30", *FINE[:-1], "step_wall_s=0.005")  # 0.15 s a trial, most of it asleep
+ON_SUMO = ("300", "--agent", "faulty:Fine", "--set", "vehicles=10", "--seed", "5")
 
 
 def ledger(folder: Path) -> dict[int, str]:
@@ -30,7 +31,7 @@ def digests(folder: Path) -> dict[int, str]:
     return {number: json.loads(result)["digest"] for number, result in ledger(folder).items()}
 
 
-def wait_for(condition, timeout_s=120.0):
+def wait_for(condition, timeout_s=300.0):
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
@@ -102,7 +103,7 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     words = (*words, "--sampler", "grid", "--points", "101", "--scenario", "toy", "--set", "gap_m=30")
     process = toy.begin(*words, "--timeout", "120", "--json")
     crashes = toy.folder / "h" / "crashes"
-    out, err = process.communicate(timeout=90)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     report = json.loads(out)
     assert [crash["trial"] for crash in report["crashes"]] == [0]
@@ -113,14 +114,14 @@ def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
 
 @pytest.mark.parametrize(
     ("number", "hunted", "trials"),
-    [(signal.SIGINT, FINE, 30), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
+    [(signal.SIGINT, LONG, 30), pytest.param(signal.SIGTERM, ON_SUMO, 24, marks=pytest.mark.nightly)],
 )
 def test_an_interrupt_keeps_what_has_finished_and_the_same_command_goes_on(toy, number, hunted, trials):
-    words = ("run", "h", "2", str(trials), "300", *hunted, "--json")
+    words = ("run", "h", "2", str(trials), *hunted, "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.send_signal(number)
-    out, err = process.communicate(timeout=90)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert json.loads(out)["stopped_because"] == "interrupted"
     wait_for(lambda: session_is_gone(process.pid))
@@ -146,13 +147,13 @@ def test_an_interrupt_while_it_starts_is_not_lost(toy, libraries):
     # Before that, Python itself starts, and where it imports `site`, it fails with an exit code of its own.
     wait_for(lambda: libraries_of(process.pid) >= libraries or (toy.folder / "h").exists())
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=90)
+    process.communicate(timeout=300)
     assert process.returncode in (130, -signal.SIGINT)  # the latter where Python itself had not started yet
     wait_for(lambda: session_is_gone(process.pid))
 
 
 def test_a_killed_hunt_leaves_no_process_and_goes_on(toy):
-    words = ("run", "h", "2", "30", "300", *FINE, "--json")
+    words = ("run", "h", "2", "30", *LONG, "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 4)
     process.kill()
@@ -165,11 +166,11 @@ def test_a_killed_hunt_leaves_no_process_and_goes_on(toy):
 
 
 def test_a_killed_worker_costs_its_own_trial_only(toy):
-    words = ("run", "h", "2", "30", "300", *FINE, "--crash-on", "hang", "--json")
+    words = ("run", "h", "2", "30", *LONG, "--crash-on", "hang", "--json")
     process = toy.begin(*words, start_new_session=True)
     wait_for(lambda: count(toy.folder / "h") >= 3)
     os.kill(running_worker(toy.folder / "h"), signal.SIGKILL)
-    out, err = process.communicate(timeout=90)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     report = json.loads(out)
     assert report["trials_run"] == 30

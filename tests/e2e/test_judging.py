@@ -10,8 +10,8 @@ import pytest
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
 from crashhunt.errors import UsageError
 from crashhunt.replays import ReplayOptions, judge, prepare
-from crashhunt.replays._avoiding import Search
-from crashhunt.replays._why import _Search
+from crashhunt.replays._avoidability import Search
+from crashhunt.replays._causes import _Search
 from crashhunt.trial import Outcome
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")

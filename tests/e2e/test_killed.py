@@ -25,12 +25,12 @@ from conftest import keeps_going, mostly_nightly
 from test_bisect import git
 from test_corpus import DRIVER, MENDED
 
-from crashhunt.base.owners import Owner, owner_in, start_time, this_process
-from crashhunt.base.temporary import remove_leftovers, remove_tree
+from crashhunt.base.temporary import Owner, owner_in, remove_leftovers, remove_tree, start_time, this_process
 from crashhunt.corpus import _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Hunt, Ledger, check, hunt_state, salvage
+from crashhunt.hunts import Hunt, check, hunt_state, salvage
+from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, plan
 from crashhunt.suites import _processes, _rerun
 
@@ -159,6 +159,14 @@ def rows(hunt: Path) -> list[int]:
     with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
         return [number for (number,) in database.execute("SELECT number FROM trials")]
     return []
+
+
+def rows_by_digest(hunt: Path) -> dict[int, str]:
+    """The committed rows of a hunt: number to trace digest."""
+    with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{hunt}/ledger.sqlite?mode=ro", uri=True)) as database:
+        found = database.execute("SELECT number, result FROM trials")
+        return {number: json.loads(row)["digest"] for number, row in found}
+    return {}
 
 
 def test_salvage_refuses_a_directory_with_anything_else(damaged):
@@ -361,7 +369,7 @@ def test_what_bisect_runs_ends_with_it(tmp_path):
     pid = os.fork()
     if pid == 0:
         with suppress(BaseException):
-            _bisect._ran(["sh", "-c", f"echo $$ > '{said}'; exec sleep 60"], None, os.environ)
+            _bisect._ran(["sh", "-c", f"echo $$ > '{said}'; exec sleep 600"], None, os.environ)
         os._exit(0)
     wait_for(lambda: said.exists() and said.read_text())
     os.kill(pid, signal.SIGKILL)
@@ -375,12 +383,12 @@ def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once,
     process = toy.start("replay", "h")
     wait_for(lambda: [*temporary_files.glob("crashhunt-temporary-*/*/replay-1/*")])
     process.terminate()
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     assert process.returncode == -signal.SIGTERM
     assert left_in(toy.folder) == []
 
 
-def wait_for(condition, timeout_s: float = 60.0):
+def wait_for(condition, timeout_s: float = 300.0):
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, "it did not come to that"
@@ -413,7 +421,7 @@ def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(t
     assert process.poll() is None  # what a trial left does not stay until the end of a long hunt
     wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")])
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     wait_for(lambda: not processes_of(toy.folder), timeout_s=10.0)
     assert len([*toy.folder.glob("h/.scratch-*")]) == 1
     toy.crashhunt("oracles")
@@ -582,7 +590,7 @@ def test_whatever_is_killed_whenever_nothing_is_lost_and_nothing_left(toy, made_
             with suppress(subprocess.TimeoutExpired):
                 process.wait(generator.uniform(0.15, 1.0) * took_s)
             process.kill()
-        process.communicate(timeout=60)
+        process.communicate(timeout=300)
         nothing_is_left()
         if name == "film" and (base / "frames").exists():  # which takes no folder that has anything in it
             assert facts(base) == right

@@ -15,7 +15,7 @@ from contextlib import closing
 import pytest
 from conftest import CRASHHUNT, keeps_going
 
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
@@ -27,7 +27,7 @@ def state(shell, hunt: str = "h") -> dict:
 
 def started(shell, *words: str):
     process = shell.begin("run", "h", "2", "50000", "50", *KEEP, "--set", "step_wall_s=0.001", *words)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not (shell.folder / "h/ledger.sqlite").exists() or state(shell)["trials_run"] < 5:
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -100,8 +100,8 @@ def test_watching_ends_with_the_hunt(toy):
     time.sleep(1.5)
     assert watching.poll() is None
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=150)
-    out, _ = watching.communicate(timeout=150)
+    process.communicate(timeout=300)
+    out, _ = watching.communicate(timeout=300)
     assert watching.returncode == 0
     assert "interrupted" in out
 
@@ -135,8 +135,8 @@ def test_logs_follow_what_runs(toy):
         assert line, out
         out += line
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=150)
-    out += following.communicate(timeout=150)[0]
+    process.communicate(timeout=300)
+    out += following.communicate(timeout=300)[0]
     assert out.count("running") == 1
     assert "interrupted" in out
 
@@ -249,6 +249,9 @@ def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
     (group,) = toy.crashhunt("crashes", "k", "--json").json["groups"]
     assert (group["count"], len(group["members"])) == (len(crashes), 2)
     assert "2 crashes are as written" in toy.crashhunt("check", "k").out
+    told = toy.crashhunt("run", "k", "2", "25", "99", "--scenario", "toy", "--seed", "4", *KEEP[-1:], "--keep", "1")
+    assert len(list(folder.iterdir())) == 1
+    assert f"{len(crashes)} crashes of 1 kind" in told.out
     shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up
     assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out
 

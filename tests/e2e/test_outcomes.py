@@ -104,14 +104,12 @@ def test_an_agent_that_does_not_start_is_refused_at_once(toy):
     assert "no weights" in hunt["detail"]
 
 
-def test_a_start_up_failure_is_no_crash(toy):
-    done = toy.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, "--json", expect=3)
-    report = done.json
-    assert report["stopped_because"] == "no_valid_trial"
-    assert set(report["outcomes"]) == {"invalid"}
-    assert report["trials_run"] < 50
-    assert report["crashes"] == []
-    assert "exited with 7" in done.err
+def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
+    done = toy.crashhunt("run", "h", "2", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, "--json", expect=2)
+    message = done.json["error"]["message"]
+    assert message.startswith("faulty:DiesAtStart does not start: ")
+    assert "exited with 7" in message
+    assert not [*toy.folder.glob("h/crashes/*")]
 
 
 def test_a_traffic_crash_says_who_hit_whom(shell):

@@ -16,7 +16,7 @@ from crashhunt.base.version import __version__
 from crashhunt.corpus._run import _begin
 from crashhunt.crashes import find_bundle
 from crashhunt.replays import ReplayOptions, prepare
-from crashhunt.replays._verdict import judged
+from crashhunt.replays._replay import judged
 from crashhunt.scenario.backends.sumo import SumoSetup
 from crashhunt.trial import Outcome
 

@@ -207,7 +207,7 @@ def test_gymnasium_may_import_nothing_either(tmp_path):
 
 
 def test_a_compressed_file_without_end_is_refused(tmp_path, monkeypatch):
-    from crashhunt.scenario.backends.sumo import _xml as _sumo_xml
+    from crashhunt.scenario.backends.sumo import _files as _sumo_xml
 
     monkeypatch.setattr(_sumo_xml, "_MAX_BYTES", 1000)
     (tmp_path / "a.xml.gz").write_bytes(gzip.compress(bytes(10_000)))

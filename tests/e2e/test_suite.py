@@ -13,7 +13,7 @@ import pytest
 SUITE = """
 [defaults]
 scenario = "toy"
-trials = 30
+trials = 8
 max_steps = 100
 seed = 3
 
@@ -74,7 +74,7 @@ def numbers(shell, hunt: str) -> list[int]:
     return [int(line.partition(",")[0]) for line in shell.crashhunt("trials", hunt).out.splitlines()[1:]]
 
 
-def wait_for(condition, timeout_s: float = 120.0) -> None:
+def wait_for(condition, timeout_s: float = 300.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
@@ -88,7 +88,7 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     assert {name: hunt["state"] for name, hunt in found.items()} == {
         "fast/0": "crashed", "fast/1": "crashed", "slow/0": "finished",
     }  # fmt: skip
-    assert found["slow/0"]["trials_run"] == found["slow/0"]["trials_planned"] == 30
+    assert found["slow/0"]["trials_run"] == found["slow/0"]["trials_planned"] == 8
     seeds = {tomllib.loads((toy.folder / f"out/{name}/hunt.toml").read_text())["seed"] for name in found}
     assert len(seeds) == 2  # a seed a run; the same seed for equal numbers
     assert toy.crashhunt("replay", "out/fast/1", "--json").json["verdict"] == "reproduced"
@@ -115,7 +115,7 @@ def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
     assert "unimportable/0: error" in logs
     compared = toy.crashhunt("compare", "out", "--json")
     assert [hunt["dir"] for hunt in compared.json["hunts"]] == ["out/fast/0", "out/fast/1", "out/slow/0"]
-    assert "out/unimportable/0 has not begun, and is left out" in compared.err
+    assert "out/unimportable/0 has not begun, and is excluded" in compared.err
     table = toy.crashhunt("status", "out").out
     assert "out/a-word/0: --arg speed: 'fast' is not a number" in " ".join(table.split())
 
@@ -142,7 +142,7 @@ def test_what_failed_runs_again_and_nothing_else(toy):
 
 @pytest.mark.long
 def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
-    written(toy, SLOW.replace("80", "36"))
+    written(toy, SLOW.replace("80", "16"))
     process = toy.begin("suite", "run", "suite.toml", "out", "2")
     wait_for(lambda: (toy.folder / "out/a/0/ledger.sqlite").exists() and len(numbers(toy, "out/a/0")) > 3)
     os.kill(process.pid, signal.SIGKILL)
@@ -155,7 +155,7 @@ def test_killed_and_resumed_without_losing_or_repeating_a_trial(toy):
     toy.crashhunt("suite", "run", "suite.toml", "out", "2")
     assert set(states(toy).values()) == {"finished"}
     for name in "abc":
-        assert numbers(toy, f"out/{name}/0") == list(range(36))
+        assert numbers(toy, f"out/{name}/0") == list(range(16))
     for name, rows in before.items():
         after = digests(toy, f"out/{name}/0")
         assert {number: after[number] for number in rows} == rows
@@ -180,7 +180,7 @@ def test_two_at_once_do_not_disturb_each_other(toy):
     first = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
     second = toy.begin("suite", "run", "suite.toml", "out", "2", "--json")
     for process in (first, second):
-        _, err = process.communicate(timeout=120)
+        _, err = process.communicate(timeout=300)
         assert process.returncode == 0, err
     assert set(states(toy).values()) == {"finished"}
     for name in "ab":
@@ -198,7 +198,7 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     process = toy.start("suite", "run", "suite.toml", "out", "2", "--json")
     wait_for(lambda: (toy.folder / "out/b/0/ledger.sqlite").exists() and len(numbers(toy, "out/b/0")) > 3)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=150)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert len(json.loads(out)["hunts"]) == 3
     assert "the same command goes on from here" in err

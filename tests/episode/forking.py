@@ -178,7 +178,7 @@ def ends(stage):
             work = lambda _copy, how=how: (subprocess.Popen(["sleep", "600"]), how())  # noqa: E731
             assert episode.fork(work).answer(0.5) is None
             assert episode.fork(lambda copy: {}).answer(60.0) == {}
-        sleeper = episode.leave_asleep(lambda copy, job: os.kill(os.getppid(), signal.SIGKILL) or time.sleep(600))
+        sleeper = episode.suspend_fork(lambda copy, job: os.kill(os.getppid(), signal.SIGKILL) or time.sleep(600))
         assert sleeper.ask({}, 60.0) is None
         whys["sleeper"] = [sleeper.no_answer.why, sleeper.no_answer.is_from_outside, sleeper.is_usable]
         sleeper.end()

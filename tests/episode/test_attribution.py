@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crashhunt.episode import Episode, _attribution, run_episode
-from crashhunt.episode._attribution import Attribution, attribute_error, record_originals
+from crashhunt.episode import Episode, _failures, run_episode
+from crashhunt.episode._failures import Attribution, attribute_error, record_originals
 from crashhunt.errors import RecorderError
 from crashhunt.recording import BlackBox
 from crashhunt.scenario import AgentSetup, Scenario, scenario_from_dict
@@ -68,7 +68,7 @@ class Env(gymnasium.Env):
 
 @pytest.fixture(autouse=True)
 def nothing_recorded(monkeypatch):
-    monkeypatch.setattr(_attribution, "_originals", [])
+    monkeypatch.setattr(_failures, "_originals", [])
 
 
 @pytest.fixture

@@ -323,7 +323,7 @@ def test_what_is_told_of_an_exception_is_bounded():
     assert long.message == "x" * 10_000 + "… (4990000 more characters are left out)"
     assert len(long.traceback) < 101_000
     assert long.traceback.startswith("Traceback")
-    assert "characters are left out) …" in long.traceback
+    assert "characters are omitted) …" in long.traceback
     assert long.traceback.endswith("xxx\n")
 
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.errors import InvalidEpisodeError, RecorderError, SimulatorError
-from crashhunt.episode import Braking, overruled_agent, run_episode, words_of
+from crashhunt.episode import Braking, message_of_error, overruled_agent, run_episode
 from crashhunt.oracles import Finding, OffRoad, Overlap, ReportedCollision
 from crashhunt.recording import BlackBox, Phase, Recording, Tag, digest_of, read_black_box, read_header
 from crashhunt.simulators import FullBraking, MetaAction, SpeedAndLaneChange
@@ -479,8 +479,8 @@ def test_a_message_that_cannot_be_had_is_no_obstacle(run):
         def __str__(self):
             raise ValueError("not even this")
 
-    assert words_of(Silent()) == "(its message cannot be had: ValueError)"
-    assert words_of(KeyError("x")) == "'x'"
+    assert message_of_error(Silent()) == "(its message cannot be had: ValueError)"
+    assert message_of_error(KeyError("x")) == "'x'"
     result = run(drivers={"ego": Driver({1: RuntimeError("two\n  lines")})})
     assert result.failure.message == "two lines"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import Parts, WorkerSettings, _parts, require_origin, seal
+from crashhunt.episode import Parts, WorkerSettings, _run, require_origin, seal
 from crashhunt.scenario import load_scenario
 
 AGENT = """
@@ -43,6 +43,8 @@ agent = "{module}:Plain"
 def made(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.chdir(tmp_path)
+    # Later tests in this process replace functions of crashhunt, which is then taken for an agent's doing.
+    monkeypatch.setattr(_run, "record_originals", lambda: None)
     before = set(sys.modules)
 
     def make(module="snapshot_agent", **more):
@@ -124,7 +126,7 @@ def test_a_module_of_the_snapshot_may_come_from_nowhere_else(made, tmp_path):
 
 def test_a_strangers_code_is_confined_to_its_scratch_folder(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(_parts, "confine", lambda folder, readable: asked.append((folder, list(readable))))
+    monkeypatch.setattr(_run, "confine", lambda folder, readable: asked.append((folder, list(readable))))
     monkeypatch.setattr(os, "environ", dict(os.environ))
     monkeypatch.chdir(tmp_path)
     scratch = tmp_path / "scratch"

@@ -8,11 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.base.answers import NoAnswer
-from crashhunt.base.faculties import members
-from crashhunt.base.forks import CannotForkError, NoProcessError
+from crashhunt.base.capabilities import members
+from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
 from crashhunt.episode import BUDGET_BESIDE, Prober, _questions
-from crashhunt.simulators import Disturbs
+from crashhunt.simulators import SupportsDisturbances
 from crashhunt.trial import CRASHES, Disturbance, Outcome, Stress, TrialResult, TrialSpec
 
 DT = 0.1
@@ -51,9 +50,11 @@ class Road:
 
     @property
     def simulator(self):
-        able = {**dict.fromkeys(members(Disturbs), True), "disturbing_kinds": self.kinds} if self.kinds else {}
+        able = (
+            {**dict.fromkeys(members(SupportsDisturbances), True), "disturbing_kinds": self.kinds} if self.kinds else {}
+        )
         if self.kinds:
-            able["whom"] = lambda one: "" if one.what in self.away else "somebody"
+            able["resolve_target"] = lambda one: "" if one.what in self.away else "somebody"
         return SimpleNamespace(step_length_s=DT, **able)
 
     def fork(self, work, *, observed=True):

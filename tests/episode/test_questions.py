@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.base.answers import NoAnswer
-from crashhunt.base.forks import CannotForkError, NoProcessError
+from crashhunt.base.forks import CannotForkError, NoAnswer, NoProcessError
 from crashhunt.episode import _questions
 from crashhunt.episode._questions import Questions
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from crashhunt.episode._recursion import MAX_RECURSION_LIMIT, bound_recursion
+from crashhunt.episode._run import MAX_RECURSION_LIMIT, bound_recursion
 
 
 @pytest.fixture(autouse=True)

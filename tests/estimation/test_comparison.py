@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 
 import crashhunt
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, write_settings
 from crashhunt.report import describe_comparison
 from crashhunt.trial import Outcome, TrialResult, TrialSpec

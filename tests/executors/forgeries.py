@@ -8,7 +8,7 @@ import struct
 import time
 from pathlib import Path
 
-from crashhunt.executors._evidence import encode_report
+from crashhunt.executors._postmortem import encode_report
 from crashhunt.recording import BlackBox
 from crashhunt.recording._blackbox import FIRST, HEADER, REPORT, REPORT_OFFSET
 

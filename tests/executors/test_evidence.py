@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings as examples, strategies as st
 
 from crashhunt.episode import Parts, WorkerSettings, run_episode
-from crashhunt.executors._evidence import check_report, encode_report
+from crashhunt.executors._postmortem import check_report, encode_report
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialSpec

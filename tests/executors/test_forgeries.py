@@ -74,7 +74,7 @@ def run(tmp_path, monkeypatch, kind: type[Executor]) -> dict[str, TrialResult]:
     try:
         for number, how in enumerate(asked):
             executor.submit(TrialSpec(number, 7, {"ego": {"how": how}}, {}, max_steps=12))
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while len(found) < len(asked):
             assert time.monotonic() < deadline, [asked[number] for number in range(len(asked)) if number not in found]
             found |= {result.spec.number: result for result in executor.completed(0.2)}

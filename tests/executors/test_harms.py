@@ -14,7 +14,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, TrialResult, TrialSpec
+from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -34,7 +34,7 @@ EXPECTED: dict[str, dict[str, tuple[str, bool]]] = {
         "child": (SURVIVED, False), "exit": (SURVIVED, False),
     },
     "dies": {
-        "constructor": (INVALID, False), "reset": (INVALID, False),
+        "constructor": (INVALID, NAMED), "reset": (INVALID, NAMED),
         "first act": (DIED, NAMED), "fifth act": (DIED, NAMED), "thread": (DIED, NAMED),
         "close": (DIED, NAMED), "finalizer": (DIED, NAMED),
         "signal handler": (DIED, False),  # while the simulator runs; nothing is left that says more
@@ -47,9 +47,18 @@ EXPECTED["hangs"] = {
     "thread": (SURVIVED, False),
 }
 _DAMAGED = dict.fromkeys(harms.MOMENTS[:-2], (ERROR, NAMED))  # the process cannot report what came of its trial
+SHOWN_IN_STACK = (
+    "segfaults",
+    "aborts",
+    "overflows_stack",
+    "divides_in_c",
+    "frees_what_is_not_its_own",
+)
 EXCEPTIONS: dict[str, dict[str, tuple[str, bool]]] = {
     "no_json": {**_DAMAGED, "constructor": (INVALID, NAMED), "reset": (INVALID, NAMED)},
     "no_os": _DAMAGED,
+    # The stack shows whose handler it was.
+    **{name: {"signal handler": (DIED, NAMED)} for name in SHOWN_IN_STACK},
     "terminates_group": {"child": (DIED, NAMED)},  # to which its parent belongs
     "sleeps_in_c": {"thread": (HANG, NAMED)},  # it holds the interpreter
     "stops_itself": {"thread": (HANG, NAMED)},  # with all its threads
@@ -105,16 +114,17 @@ def run(tmp_path, monkeypatch) -> Callable[..., dict[int, TrialResult]]:
     return run_trials
 
 
+AT_IMPORT = "the module 'imported' of agent ego cannot be imported:"
 IMPORTED = {
     "raises_bare": "harms.py, line {line}: BareError: harm, which keeps 'imported:Agent' from being imported",
-    "exits_at_once": "the process that starts the workers exited with 3",
+    "exits_at_once": f"{AT_IMPORT} its process exited with 3 meanwhile",
     "raises_error": "harms.py, line {line}: ValueError: harm, which keeps 'imported:Agent' from being imported",
     "raises_mute": "(its message cannot be had: RuntimeError), which keeps",
     "raises_long_message": "more characters are left out), which keeps 'imported:Agent' from being imported",
     "recurses": "RecursionError: maximum recursion depth exceeded",
-    "segfaults": "the process that starts the workers was killed by SIGSEGV",
-    "becomes_another_program": "the process that starts the workers exited with 0",
-    "closes_everything": "the process that starts the workers exited with 1",
+    "segfaults": f"{AT_IMPORT} its process was killed by SIGSEGV meanwhile",
+    "becomes_another_program": f"{AT_IMPORT} its process exited with 0 meanwhile",
+    "closes_everything": f"{AT_IMPORT} its process exited with 1 meanwhile",
     **dict.fromkeys(("deaf", "no_output", "starts_threads", "starts_daemon", "forks", "stops_itself")),
 }
 
@@ -137,7 +147,7 @@ def test_harm_at_import_ends_in_a_message_or_in_nothing(tmp_path, monkeypatch, w
     settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=20.0)
     found: list[TrialResult] = []
     pool = PoolExecutor(settings, parallel=2)
-    said, deadline = None, time.monotonic() + 100
+    said, deadline = None, time.monotonic() + 300
     try:
         for number in range(3):
             pool.submit(TrialSpec(number, 7, {"ego": {}}, {}, MAX_STEPS))
@@ -214,11 +224,19 @@ def test_handler_that_raises_again_and_again_is_the_agents(run):
     assert {(str(result.outcome), result.failure.agent) for result in found.values()} == {(ERROR, "ego")}
 
 
+def test_fatal_signal_in_a_signal_handler_is_named_as_the_agents(run):
+    (result,) = run([("segfaults", "signal handler")]).values()
+    assert (str(result.outcome), result.failure.agent) == (DIED, "ego")
+    assert result.failure.message.startswith("the process died of SIGSEGV in ego's code at step ")
+
+
 MESSAGES = {
     ("exits_with_79", "fifth act"): "the process exited with 79 in ego's act() of step 5",
     ("exits_with_78", "fifth act"): "the process exited with 78 in ego's act() of step 5",
     ("exits_with_success", "first act"): "the process exited with 0 in ego's act() of step 1",
     ("segfaults", "close"): "the process died of SIGSEGV after the last step",
+    ("exits_with_79", "constructor"): "the process exited with 79 in ego's constructor or reset() while the episode was"
+    " being set up",
     ("overflows_stack", "fifth act"): "the process died of SIGSEGV in ego's act() of step 5",
     ("recurses", "fifth act"): "maximum recursion depth exceeded",
     ("raises_error", "signal handler"): "harm",
@@ -232,4 +250,4 @@ def test_trial_says_what_happened(run):
     found = run(MESSAGES)
     said = {pair: found[number].failure and found[number].failure.message for number, pair in enumerate(MESSAGES)}
     assert said == MESSAGES
-    assert all(result.digest for result in found.values())
+    assert all(result.digest or result.outcome is Outcome.INVALID for result in found.values())

@@ -84,7 +84,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[T
             for number in range(count):
                 executor.submit(TrialSpec(number, 5, {}, argument_values(scenario), max_steps=3))
             found: list[TrialResult] = []
-            deadline = time.monotonic() + 120
+            deadline = time.monotonic() + 300
             while len(found) < count:
                 assert time.monotonic() < deadline
                 found += executor.completed(0.2)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
+from pathlib import Path
 
 import pytest
+from conftest import FAULTY
 
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
@@ -17,35 +20,39 @@ STEPS = 60
 
 
 @pytest.fixture
-def settings(tmp_path):
+def settings(tmp_path, monkeypatch):
+    shutil.copy(FAULTY, tmp_path)
+    monkeypatch.chdir(tmp_path)
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    ego = AgentSetup(agent="crashhunt.agents:KeepLaneWithSpeed")
+    ego = AgentSetup(agent="faulty:Waits")
     scenario = Scenario(simulator="toy", folder=tmp_path, agents={"ego": ego})
     return WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch)
 
 
 def run_and_kill(executor, spec, steps):
-    """Run a trial whose process gets SIGKILL as soon as it has passed each of some steps, once each."""
+    """Run a trial whose process gets SIGKILL when it has done each of some numbers of steps, at which it waits."""
+    steps, waits = list(steps), Path("waits")
+    Path("wait-at").write_text(str(steps[0]))
     executor.submit(spec)
-    steps, killed = list(steps), set()
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         found = list(executor.completed(0.0))
         if found:
             return found[0]
         header = executor.where().get(spec.number)
-        if steps and header is not None and header.step >= steps[0] and header.pid not in killed:
-            killed.add(header.pid)
-            os.kill(header.pid, signal.SIGKILL)
+        if waits.exists() and header is not None and header.pid == int(waits.read_text()):
+            waits.unlink()
             steps.pop(0)
+            Path("wait-at").write_text(str(steps[0]) if steps else "")
+            os.kill(header.pid, signal.SIGKILL)
         time.sleep(0.002)
     raise AssertionError("the trial did not end")
 
 
 @pytest.mark.parametrize("kind", [PoolExecutor, pytest.param(FreshProcessExecutor, marks=pytest.mark.nightly)])
 def test_trial_killed_three_times_at_different_steps_is_invalid_and_no_crash(settings, kind):
-    spec = TrialSpec(4, 7, {"ego": {"speed": 5.0}}, {"step_wall_s": 0.01}, max_steps=STEPS)
+    spec = TrialSpec(4, 7, {"ego": {"speed": 5.0}}, {}, max_steps=STEPS)
     executor = kind(settings, parallel=1)
     try:
         result = run_and_kill(executor, spec, (4, 16, 30))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from functools import partial
 
 import pytest
 
-from crashhunt.base import layout
-from crashhunt.episode import scratch_of
-from crashhunt.executors._hang import START_UP_S, has_hung
+from crashhunt.executors._fresh import _has_words
+from crashhunt.executors._time_limits import START_UP_S, has_hung
+from crashhunt.recording import BlackBoxHeader, Phase
 
 LIMIT_S = 5.0
 
@@ -26,11 +28,20 @@ LIMIT_S = 5.0
     ],
 )
 def test_it_has_a_moment_and_a_while_where_the_machine_is_busy(tmp_path, stack, over_s, ended):
-    folder = scratch_of(tmp_path, 3)
-    folder.mkdir()
+    path = tmp_path / "stack"
     if stack is not None:
-        (folder / layout.STACK).write_text(stack)
-    # Neither has begun, as far as its black box says, so both have the time in which a process starts as well.
-    given_at = time.monotonic() - START_UP_S - LIMIT_S - over_s
-    assert has_hung(tmp_path, 3, given_at=given_at, limit_s=LIMIT_S) is ended
-    assert has_hung(tmp_path, 4, given_at=given_at, limit_s=LIMIT_S) is (over_s > 3)  # which has no folder
+        path.write_text(stack)
+    now = time.monotonic()
+    has_words = partial(_has_words, path)
+
+    def hangs(header, *, begun, given_s):
+        return has_hung(header, begun=begun, given_at=now - given_s - over_s, limit_s=LIMIT_S, has_words=has_words)
+
+    # One that has not begun, as far as its black box says, has the time in which a process starts as well.
+    assert hangs(None, begun=False, given_s=START_UP_S + LIMIT_S) is ended
+    header = BlackBoxHeader(1, 3, now - LIMIT_S - over_s, 0, 0, Phase.SETUP, 0)
+    assert hangs(header, begun=False, given_s=START_UP_S + LIMIT_S) is ended
+    assert hangs(header, begun=True, given_s=START_UP_S + LIMIT_S) is ended
+    # A start in the future, or before the trial was given, is forged.
+    for forged in (now + 1e6, 0.0):
+        assert hangs(replace(header, started=forged), begun=True, given_s=LIMIT_S) is ended

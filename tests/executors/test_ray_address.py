@@ -15,7 +15,7 @@ import pytest
 from crashhunt.base.errors import PluginError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._address import OLDEST, cluster_of, require_ray
+from crashhunt.executors.ray._cluster import OLDEST, cluster_of, require_ray
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES
 
@@ -96,7 +96,7 @@ def test_an_address_that_leads_nowhere_is_one_line(settings, argument, message):
     ],
 )
 def test_whoever_answers_and_is_no_cluster_is_told_from_one(monkeypatch, answer, message):
-    monkeypatch.setattr("crashhunt.executors.ray._address._ANSWER_S", 0.5)
+    monkeypatch.setattr("crashhunt.executors.ray._cluster._ANSWER_S", 0.5)
     with listener(answer) as address:
         with pytest.raises(UsageError) as raised:
             cluster_of(address)
@@ -149,7 +149,7 @@ def test_a_token_goes_to_nobody_but_a_cluster_that_runs_here(monkeypatch, tmp_pa
     assert cluster_of("").address == "", "one that has ended is none"
     monkeypatch.delenv("RAY_AUTH_MODE")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "secret")
-    monkeypatch.setattr("crashhunt.executors.ray._address.silent", lambda address: "")
+    monkeypatch.setattr("crashhunt.executors.ray._cluster.silent", lambda address: "")
     assert cluster_of("127.0.0.1:6379").spare == if_asked
     assert cluster_of("198.51.100.7:6379").spare == {}, "another machine"
 

@@ -13,8 +13,7 @@ import pytest
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor, _bridge, _executor
-from crashhunt.executors.ray._address import Meant
-from crashhunt.executors.ray._cluster import Found, Lost
+from crashhunt.executors.ray._cluster import Found, Lost, Meant
 from crashhunt.executors.ray._messages import Ended, News
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
@@ -104,7 +103,7 @@ def clock(monkeypatch):
     found = SimpleNamespace(now=100.0, sleep=lambda seconds: None)
     found.monotonic = lambda: found.now
     monkeypatch.setattr(_bridge, "time", found)
-    monkeypatch.setattr("crashhunt.executors.ray._roster.time", found)
+    monkeypatch.setattr("crashhunt.executors.ray._bridge.time", found)
     return found
 
 
@@ -329,6 +328,9 @@ def test_whoever_ends_every_node_is_told_apart_from_who_was_there(begin):
     (culprit,) = results
     assert culprit["spec"]["number"] == 0
     assert "was lost 3 times, at last with this trial alone on it" in json.dumps(culprit)
+    # A node that is lost from outside is no crash of the agent, and a resumed hunt runs the trial again.
+    result = TrialResult.from_json(culprit)
+    assert (result.outcome, result.was_killed_from_outside) == (Outcome.INVALID, True)
     after()
     (node,) = bridge._roster.nodes.values()
     assert [trial.number for trial in node.running.values()] == [1]

@@ -20,12 +20,10 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._folder import Folder
-from crashhunt.executors.ray._parcel import Parcel, settings_in, unpack
-from crashhunt.executors.ray._roster import Node, Roster, Trial, shares
-from crashhunt.executors.ray._site import Site, code_digest
-from crashhunt.executors.ray._store import Store
-from crashhunt.executors.ray._work import Work
+from crashhunt.executors.ray._bridge import Node, Roster, Trial, shares
+from crashhunt.executors.ray._code_archive import Folder, Parcel, Store, settings_in, unpack
+from crashhunt.executors.ray._node_actor import Site, code_digest
+from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBox, Tag, read_black_box
 from crashhunt.scenario import Scenario
 from crashhunt.snapshots import versions
@@ -189,12 +187,12 @@ def test_a_node_says_what_differs(monkeypatch):
     ):
         with monkeypatch.context() as context:
             context.setattr(
-                "crashhunt.executors.ray._site.importlib.util.find_spec",
+                "crashhunt.executors.ray._node_actor.importlib.util.find_spec",
                 lambda asked, name=name: find(name if asked == "_crashhunt_link_order" else asked),
             )
             assert Site().differs(lacks, code_digest()) == said
     assert Site().differs(here, "other") == "crashhunt has the same version and other code there"
-    monkeypatch.setattr("crashhunt.executors.ray._site.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("crashhunt.executors.ray._node_actor.importlib.util.find_spec", lambda name: None)
     assert Site().differs(here, code_digest.__name__) == "crashhunt cannot be found there (no such package)"
 
 
@@ -254,7 +252,7 @@ def work(settings, tmp_path, monkeypatch):
     """Makes what runs trials on a node, four at a time, with such a pool."""
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")  # which is set
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr("crashhunt.executors.ray._work._GATHER_S", 60.0)
+    monkeypatch.setattr("crashhunt.executors.ray._node_worker._GATHER_S", 60.0)
 
     made = []
 

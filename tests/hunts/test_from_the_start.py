@@ -9,9 +9,9 @@ import pytest
 
 from crashhunt.base.errors import SimulatorError
 from crashhunt.disturbances import disturber_of, parse_rates
-from crashhunt.hunts._copied_crashes import CopiedCrashes
-from crashhunt.hunts._from_the_start import Found, FromTheStart
+from crashhunt.hunts._fork_results import CopiedCrashes
 from crashhunt.hunts._progress import Progress
+from crashhunt.hunts._verification import Found, VerificationRuns
 from crashhunt.trial import Branch, Branches, Disturbance, Outcome, Stress, TrialResult, TrialSpec
 
 FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
@@ -23,7 +23,7 @@ def runs(tmp_path, stops, run):
 
 
 def test_whoever_stops_keeps_what_there_was(tmp_path):
-    copies = FromTheStart(runs(tmp_path, [2], None), None)
+    copies = VerificationRuns(runs(tmp_path, [2], None), None)
     assert (copies.crashes([FOUND], "probes"), copies.is_stopped) == (((), 0), True)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000001-collision"]
 
@@ -35,7 +35,7 @@ def test_what_cannot_be_run_is_told_and_the_hunt_has_ended_well(tmp_path):
         raise SimulatorError("no room")
 
     again = runs(tmp_path, [], fails)
-    assert FromTheStart(again, None).crashes([FOUND], "probes") == ((), 1)
+    assert VerificationRuns(again, None).crashes([FOUND], "probes") == ((), 1)
     assert again.notes == ["what copies have found could not be run from the start: no room"]
     assert not (tmp_path / "probes").exists()
 
@@ -47,7 +47,7 @@ def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
             yield SimpleNamespace(result=TrialResult(spec, Outcome(outcome), steps=step))
 
     again = runs(tmp_path, [], another)
-    assert FromTheStart(again, None).crashes([FOUND], "probes") == ((), 0)
+    assert VerificationRuns(again, None).crashes([FOUND], "probes") == ((), 0)
     assert [result.steps for result in again.failed] == [step]
 
 
@@ -146,6 +146,6 @@ def test_what_is_kept_is_not_run_again_and_stays(tmp_path):
     again = runs(tmp_path, [], lambda specs, folder: iter([] if not specs else 1 / 0))
     kept.mkdir()
     bundle = SimpleNamespace(path=kept, result=SimpleNamespace(spec=FOUND.spec))
-    copies = FromTheStart(again, None, {"probes": {3: bundle}})
+    copies = VerificationRuns(again, None, {"probes": {3: bundle}})
     assert copies.crashes([FOUND], "probes") == ((bundle,), 0)
     assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000003-collision"]

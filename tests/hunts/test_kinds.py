@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import UsageError
-from crashhunt.hunts import _kinds
-from crashhunt.hunts._kinds import Kinds, kind_data
+from crashhunt.hunts import _progress
+from crashhunt.hunts._progress import Kinds, kind_data
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
@@ -80,7 +80,7 @@ def test_who_is_killed_while_giving_bundles_up_counts_none_twice():
 
 
 def test_what_was_hunted_for_is_kept_before_what_is_shorter(monkeypatch):
-    monkeypatch.setattr(_kinds, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
+    monkeypatch.setattr(_progress, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id != "c1"))
     kinds = Kinds(1, [crash(1, "KeyError", 4), crash(2, "KeyError", 9), crash(3, "KeyError", 6)], only_at_fault=True)
     assert [bundle.id for bundle in kinds.surplus(1)] == ["c2", "c1"]
     assert kinds.at_fault == (3,)  # of those that are kept
@@ -95,7 +95,7 @@ def test_whoever_wants_several_kinds_goes_on_after_the_first_crash():
 
 
 def test_only_the_agents_own_crashes_count_where_that_was_asked(monkeypatch):
-    monkeypatch.setattr(_kinds, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
+    monkeypatch.setattr(_progress, "fault_of", lambda bundle, _: SimpleNamespace(is_egos=bundle.id in ("c4", "c6")))
     kinds = Kinds(1, only_at_fault=True)
     kinds.add(crash(3, "KeyError"), 1)
     assert (kinds.until, kinds.at_fault) == (None, ())

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger, TrialRow, has_begun
-from crashhunt.hunts._copies import sums_of_branches, sums_of_probes
-from crashhunt.hunts._unanswered import find_unanswered
+from crashhunt.hunts import TrialRow
+from crashhunt.hunts._next_trials import find_unanswered
+from crashhunt.hunts._state import sums_of_branches, sums_of_probes
+from crashhunt.ledger import Ledger, has_begun
 from crashhunt.trial import KILLED, Branches, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -122,7 +123,7 @@ READS_WHEN_THERE = """
 import sys, time
 from pathlib import Path
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 
 print("ready", flush=True)
 end = time.monotonic() + 60
@@ -145,7 +146,7 @@ def test_whoever_sees_a_ledger_can_read_it(tmp_path):
             assert reader.stdout.readline() == "ready\n"
             for number in range(80):
                 Ledger(tmp_path / f"{number}.sqlite", writable=True).close()
-            assert reader.communicate(timeout=90) == ("", None)
+            assert reader.communicate(timeout=300) == ("", None)
         finally:
             reader.kill()
     assert reader.returncode == 0
@@ -205,7 +206,7 @@ def test_what_a_killed_writer_recorded_is_there(tmp_path):
     path = tmp_path / "ledger.sqlite"
     script = (
         "import sys, time; from pathlib import Path\n"
-        "from crashhunt.hunts import Ledger; from crashhunt.trial import Outcome, TrialResult, TrialSpec\n"
+        "from crashhunt.ledger import Ledger; from crashhunt.trial import Outcome, TrialResult, TrialSpec\n"
         "ledger = Ledger(Path(sys.argv[1]), writable=True)\n"
         "for number in range(100):\n"
         "    ledger.record(TrialResult(TrialSpec(number, 1, {}, {}, max_steps=9), Outcome.SURVIVED), snapshot='')\n"

@@ -13,8 +13,7 @@ import pytest
 from columns import FEWER_COLUMNS
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger, has_begun
-from crashhunt.hunts._ledger_reader import Turn
+from crashhunt.ledger import Ledger, Turn, has_begun
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -287,7 +286,7 @@ def test_reads_are_the_same_in_pieces(path, monkeypatch):
             )
     with closing(Ledger(path)) as reader:
         whole = list(reader.table())
-        monkeypatch.setattr("crashhunt.hunts._ledger_reader._CHUNK", 3)
+        monkeypatch.setattr("crashhunt.ledger._reader._CHUNK", 3)
         assert list(reader.table()) == whole
         assert sorted(whole)[4] == (4, 28, "collision", 10, 5.0 - 4 / 3)
 

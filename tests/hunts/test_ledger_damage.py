@@ -11,7 +11,7 @@ import pytest
 from columns import FEWER_COLUMNS
 
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 

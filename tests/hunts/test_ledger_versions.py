@@ -13,8 +13,8 @@ import pytest
 
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import Ledger, Turn
-from crashhunt.hunts._ledger_schema import FIRST
+from crashhunt.ledger import Ledger, Turn
+from crashhunt.ledger._schema import FIRST
 from crashhunt.trial import Branches, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 
@@ -112,17 +112,17 @@ def test_trials_with_traffic_events_are_found_without_reading_the_others(tmp_pat
 
 @pytest.mark.parametrize("copy", FROZEN, indirect=True, ids=[path.stem for path in FROZEN])
 def test_a_migration_that_fails_leaves_the_ledger_as_it_was(copy, monkeypatch):
-    from crashhunt.hunts import _migrations
+    from crashhunt.ledger import _schema
 
     def fail(database):
         database.execute("CREATE TABLE half (number)")
         raise sqlite3.OperationalError("database or disk is full")
 
     was = version(copy)
-    last = max(_migrations.MIGRATIONS)
+    last = max(_schema.MIGRATIONS)
     if was > last:
         return
-    monkeypatch.setitem(_migrations.MIGRATIONS, last, fail)
+    monkeypatch.setitem(_schema.MIGRATIONS, last, fail)
     with pytest.raises(HuntDirectoryError, match="the disk is full"):
         Ledger(copy, writable=True)
     assert version(copy) == was

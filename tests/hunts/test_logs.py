@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from crashhunt.hunts import Ledger, LogReader
+from crashhunt.hunts import LogReader
+from crashhunt.ledger import Ledger
 
 
 def test_only_what_is_new_is_read_however_long_a_log_is(tmp_path):

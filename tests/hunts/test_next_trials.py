@@ -15,7 +15,8 @@ from hypothesis import given, settings as how, strategies as st
 
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.errors import PluginError
-from crashhunt.hunts import Ledger, Trials, spec_of
+from crashhunt.hunts import Trials, spec_of
+from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings
 from crashhunt.samplers import NamedSampler, RandomSampler, Sampler
 from crashhunt.trial import Outcome, TrialResult

@@ -23,24 +23,24 @@ def result(number, message="there is no file 'x'", *, outcome=Outcome.INVALID, a
 
 def test_what_fails_in_every_trial_in_the_same_way_is_refused():
     preflight = Preflight(settings_of(speed="15"), 20, code=("/s/code",))
-    assert [preflight.sift(result(number, kind="KeyError")) for number in range(3)] == [[], [], []]
+    assert [preflight.filter_setup_failures(result(number, kind="KeyError")) for number in range(3)] == [[], [], []]
     with pytest.raises(
         ArgumentError, match="KeepLaneWithSpeed does not start: KeyError: there is no file 'x'"
     ) as caught:
-        preflight.sift(result(3, kind="KeyError"))
+        preflight.filter_setup_failures(result(3, kind="KeyError"))
     assert caught.value.where == "my.py:7"
     assert caught.value.exit_code == 2
 
 
 def test_a_hunt_of_one_trial_is_refused_after_one():
     with pytest.raises(ArgumentError, match="there is no file 'x'; mend the agent"):
-        Preflight(settings_of(speed="15"), 1).sift(result(0))
+        Preflight(settings_of(speed="15"), 1).filter_setup_failures(result(0))
 
 
 def test_files_are_named_as_they_were_given():
     preflight = Preflight(settings_of(speed="15"), 1, files={"w.onnx": "/s/files/0-w.onnx"})
     with pytest.raises(ArgumentError, match=r"'w.onnx' has nine outputs"):
-        preflight.sift(result(0, "'/s/files/0-w.onnx' has nine outputs"))
+        preflight.filter_setup_failures(result(0, "'/s/files/0-w.onnx' has nine outputs"))
 
 
 @pytest.mark.parametrize(
@@ -50,11 +50,11 @@ def test_files_are_named_as_they_were_given():
 def test_as_soon_as_one_is_otherwise_all_are_accounted_for(other):
     preflight = Preflight(settings_of(speed="15"), 20)
     held = [result(number) for number in range(3)]
-    assert [preflight.sift(one) for one in held] == [[], [], []]
-    assert preflight.sift(other) == [*held, other]
-    assert preflight.sift(held[0]) == [held[0]]
+    assert [preflight.filter_setup_failures(one) for one in held] == [[], [], []]
+    assert preflight.filter_setup_failures(other) == [*held, other]
+    assert preflight.filter_setup_failures(held[0]) == [held[0]]
 
 
 def test_where_an_argument_varies_another_value_may_do():
     preflight = Preflight(settings_of(speed="5:15"), 20)
-    assert preflight.sift(result(0)) == [result(0)]
+    assert preflight.filter_setup_failures(result(0)) == [result(0)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import signal
 import time
@@ -11,10 +12,14 @@ import tomllib
 
 import pytest
 
-from crashhunt.hunts import TrafficSurveyor, _traffic_survey
-from crashhunt.plans import plan, request_of
+from crashhunt.base.processes import children_of
+from crashhunt.base.reaper import Kept
+from crashhunt.hunts import TrafficSurveyor, _preflight
+from crashhunt.plans import plan, request_of, write_settings
 from crashhunt.plans._options import HuntOptions
-from crashhunt.scenario import shipped_folder
+from crashhunt.scenario import as_plain_data, shipped_folder
+from crashhunt.snapshots import SnapshotOptions, take_snapshot
+from crashhunt.suites._processes import _planned
 
 WAY = '<route id="way" edges="south east north west"/>'
 # It stands where `blocked` departs, and for longer than trials wait.
@@ -85,7 +90,7 @@ def test_a_hunt_of_before_goes_on_with_the_vehicles_that_its_files_promised(town
 
 
 def test_no_survey_where_the_user_names_the_vehicle(town, monkeypatch):
-    monkeypatch.setattr(_traffic_survey, "_survey", lambda *_: pytest.fail("simulated"))
+    monkeypatch.setattr(_preflight, "_survey", lambda *_: pytest.fail("simulated"))
     for options in ({"ego": "free.1"}, {"ego": "route=way"}, {"scenario_arguments": {"vehicle": "blocked.1"}},
                     {"scenario_arguments": {"scenario.vehicle": "blocked.1"}}):  # fmt: skip
         surveyed(town.folder, **options)
@@ -101,7 +106,7 @@ def test_the_demand_is_simulated_at_both_ends_of_its_range(town, monkeypatch):
         return [{"begin_s": 0.0, "end_s": 9.0, "steps": 9, "entries": [("free.0", 2.0, "passenger", False)],
                  "gridlock": None, "cut_short": False}]  # fmt: skip
 
-    monkeypatch.setattr(_traffic_survey, "_survey", survey)
+    monkeypatch.setattr(_preflight, "_survey", survey)
     _, settings = surveyed(town.folder, scenario_arguments={"scale": "0.5:2"})
     assert [run["values"] for run in asked] == [{"scale": 0.5}, {"scale": 2.0}]
     assert len({run["seed"] for run in asked}) == 2
@@ -147,15 +152,31 @@ def test_where_sumo_refuses_its_input_the_hunt_says_so(town):
 
 
 def test_a_survey_that_takes_too_long_is_given_up(town, monkeypatch):
-    monkeypatch.setattr(_traffic_survey, "MAX_WALL_TIME_S", 0.0)
-    monkeypatch.setattr(_traffic_survey, "LOADING_WALL_TIME_S", 0.0)
+    monkeypatch.setattr(_preflight, "MAX_WALL_TIME_S", 0.0)
     scenario, settings = surveyed(town.folder)
     assert "took over 0 s of wall time" in scenario.notes[1]
     assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
 
 
+def test_survey_without_processor_time_warns_that_candidates_depend_on_the_machine(town, monkeypatch):
+    assert not [note for note in surveyed(town.folder)[0].notes if "processor time" in note]
+    monkeypatch.setattr(_preflight, "MAX_PROCESSOR_TIME_S", 0.0)
+    (note,) = [note for note in surveyed(town.folder)[0].notes if "processor time" in note]
+    assert note.startswith("warning: the look ahead ended at 5 s")
+
+
+def test_busy_machine_finds_the_same_candidates(town, monkeypatch):
+    before, _ = surveyed(town.folder)
+    monkeypatch.setattr(_preflight, "MAX_PROCESSOR_TIME_S", 20.0)
+    # As if other processes took the processor: wall time passes a thousand times as fast.
+    fast = "import time\nreal = time.monotonic\ntime.monotonic = lambda: 1000 * real()\n"
+    (town.folder / "sitecustomize.py").write_text(fast)
+    monkeypatch.setenv("PYTHONPATH", str(town.folder), prepend=os.pathsep)
+    assert surveyed(town.folder)[0].arguments == before.arguments
+
+
 def test_without_room_for_the_survey_the_hunt_goes_on(town, monkeypatch):
-    monkeypatch.setattr(_traffic_survey, "Kept", lambda *_, **__: raise_full())
+    monkeypatch.setattr(_preflight, "Kept", lambda *_, **__: raise_full())
     scenario, settings = surveyed(town.folder)
     assert "the survey cannot run: [Errno 28]" in scenario.notes[1]
     assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
@@ -165,6 +186,78 @@ def raise_full():
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
+def kill_surveys(monkeypatch, number, *, first, child=False):
+    """Send a signal to the processes of the first surveys, or to their reapers; return a list of all that begin."""
+    begun = []
+
+    def begin(*words, **options):
+        kept = Kept(*words, **options)
+        begun.append(kept)
+        if len(begun) <= first:
+            while child and not children_of(kept.process.pid):
+                time.sleep(0.001)
+            os.kill(children_of(kept.process.pid)[0] if child else kept.process.pid, number)
+        return kept
+
+    monkeypatch.setattr(_preflight, "Kept", begin)
+    return begun
+
+
+@pytest.mark.parametrize(("number", "child"), [(signal.SIGKILL, False), (signal.SIGKILL, True), (signal.SIGTERM, True)])
+def test_survey_that_is_killed_from_outside_is_run_again(town, monkeypatch, number, child):
+    undisturbed = surveyed(town.folder, seed=1)
+    begun = kill_surveys(monkeypatch, number, first=2, child=child)
+    assert surveyed(town.folder, seed=1) == undisturbed
+    assert [kept.process.returncode for kept in begun] == [-number, -number, 0]
+
+
+def test_survey_that_is_killed_each_time_is_abandoned(town, monkeypatch):
+    begun = kill_surveys(monkeypatch, signal.SIGKILL, first=9)
+    scenario, settings = surveyed(town.folder)
+    assert len(begun) == _preflight.MAX_ATTEMPTS
+    assert scenario.notes[1].endswith("simulating the plain traffic failed: signal 9")
+    assert settings == surveyed(town.folder, survey=False, seed=settings.seed)[1]
+
+
+def test_survey_that_fails_by_itself_is_run_once(town, monkeypatch):
+    (town.folder / "r.rou.xml").write_text(f'<routes>{WAY}<vehicle id="a" route="gone" depart="1"/></routes>')
+    begun = kill_surveys(monkeypatch, signal.SIGKILL, first=0)
+    scenario, _ = surveyed(town.folder)
+    assert "simulating the plain traffic failed" in scenario.notes[1]
+    assert len(begun) == 1
+
+
+@pytest.mark.parametrize("has_snapshot", [True, False])
+def test_resumed_hunt_keeps_the_candidates_with_which_it_began_although_its_survey_was_killed(
+    town, monkeypatch, has_snapshot
+):
+    with monkeypatch.context() as killing:
+        kill_surveys(killing, signal.SIGKILL, first=9)
+        begun, settings = surveyed(town.folder, seed=1)
+    assert "blocked." in settings.scenario_arguments["vehicle"].spec
+    # As a hunt that is killed right after it has written hunt.toml, or after it has taken its snapshot.
+    (town.folder / "h").mkdir()
+    write_settings(town.folder / "h" / "hunt.toml", settings, ["crashhunt", "run", "h"])
+    if has_snapshot:
+        take_snapshot(town.folder / "h" / "snapshots", begun, settings, SnapshotOptions(code=False))
+    resumed, again = surveyed(town.folder, seed=1)
+    assert again == settings
+    assert as_plain_data(resumed) == as_plain_data(begun)
+    other, _ = surveyed(town.folder, hunt="other", seed=1)  # the scenario of which a survey excludes the blocked ones
+    assert as_plain_data(other) != as_plain_data(begun)
+
+
+def test_hunt_of_a_suite_that_was_killed_before_its_snapshot_keeps_its_candidates(town):
+    options = HuntOptions(scenario=str(town.folder / "town.sumocfg"), seed=1)
+    request = request_of(options, trials=2, max_steps=9)
+    begun, settings = surveyed(town.folder, seed=1)
+    (town.folder / "h").mkdir()
+    write_settings(town.folder / "h" / "hunt.toml", settings, ["crashhunt", "suite", "run"])
+    resumed, again = _planned(town.folder / "h", request, {})
+    assert again == settings
+    assert as_plain_data(resumed) == as_plain_data(begun)
+
+
 def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
     far = '<trip id="a" depart="99999999" from="south" to="east"/>'
     write(shell.folder, far)
@@ -172,14 +265,32 @@ def test_ctrl_c_ends_the_survey_and_leaves_nothing_behind(shell):
     temporary.mkdir()
     shell.environment["TMPDIR"] = str(temporary)
     process = shell.start("run", "h", "1", "4", "20", *WORDS)
-    deadline = time.monotonic() + 60
-    while not list(temporary.glob("crashhunt-survey-*/stage")):
+    deadline = time.monotonic() + 300
+    while not list(temporary.glob("crashhunt-temporary-*/*/survey-*/stage")):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert json.loads(out)["error"]["message"] == "interrupted before the hunt began"
-    assert not list(temporary.glob("crashhunt-survey-*"))
+    assert not list(temporary.iterdir())
     assert not (shell.folder / "h").exists()
+
+
+def test_next_command_removes_what_a_killed_survey_left(shell):
+    write(shell.folder, '<trip id="a" depart="99999999" from="south" to="east"/>')
+    temporary = shell.folder / "tmp"
+    temporary.mkdir()
+    shell.environment["TMPDIR"] = str(temporary)
+    process = shell.start("run", "h", "1", "4", "20", *WORDS)
+    deadline = time.monotonic() + 300
+    while not list(temporary.rglob("stage")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.kill()
+    process.communicate(timeout=300)
+    assert list(temporary.rglob("stage"))
+    shell.crashhunt("oracles")
+    assert not list(temporary.iterdir())

@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 
 from crashhunt.hunts import FACTS, TrialRow
-from crashhunt.hunts._row import BRANCHES, STRESS
+from crashhunt.hunts._results import BRANCHES, STRESS
 from crashhunt.trial import EVENTS, Branches, Collision, Escape, Failure, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach, Event
 

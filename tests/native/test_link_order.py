@@ -328,9 +328,12 @@ def test_other_addresses_give_the_same_result(heap_orders, tmp_path):
         )  # fmt: skip
 
     (ordinary,) = results(0, fix=False, loads=1)
-    assert set(results(1, fix=True, loads=8)) == {ordinary}
+    assert set(results(1, fix=True, loads=4)) == {ordinary}
     if metadata.version("libsumo") == "1.28.0":  # a load has other addresses, and the other order in one of four
-        assert len({*results(1, fix=False, loads=8), *results(2, fix=False, loads=8)}) == 2
+        unordered = set(results(1, fix=False, loads=4))
+        if len(unordered) == 1:  # on a machine where these four have the same order
+            unordered |= {*results(1, fix=False, loads=8), *results(2, fix=False, loads=8)}
+        assert len(unordered) == 2
 
 
 NETWORKS = sorted([*NETS.glob("*.net.xml"), *(ROOT / "scenarios").glob("*/*.net.xml")])

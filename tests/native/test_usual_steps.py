@@ -13,13 +13,13 @@ import pytest
 from saying import Says
 
 from crashhunt.base.errors import RecorderError
+from crashhunt.crashes import own_frames
 from crashhunt.episode import Episode, Nearness, Observer, Recorder
 from crashhunt.native import ANSWERED, ASK, DONE, REFUSED, SIMULATED
 from crashhunt.oracles import OffRoad, Overlap, RedLight, ReportedCollision, TooClose
 from crashhunt.recording import BlackBox, Tag
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import SpeedAndLaneChange
-from crashhunt.triage import own_frames
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")

@@ -82,7 +82,7 @@ def test_chosen_oracles_come_after_the_default_ones_unless_none_drops_these():
     assert chosen_oracles([]) == DEFAULT_ORACLES
     assert chosen_oracles(["too-close", "overlap"]) == (*DEFAULT_ORACLES, "too-close")
     assert chosen_oracles(["none", "overlap"]) == ("overlap",)
-    with pytest.raises(CrashhuntError, match="leaves nobody"):
+    with pytest.raises(CrashhuntError, match="leaves no oracle"):
         chosen_oracles(["none"])
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from crashhunt.errors import ScenarioError, UsageError
-from crashhunt.hunts import Ledger
+from crashhunt.ledger import Ledger
 from crashhunt.plans import Request, parse_crash_on, plan, read_settings, with_settings, write_settings
 from crashhunt.scenario import load_scenario, shipped_folder
 from crashhunt.trial import CRASHES, EVENTS, Outcome, TrialResult, TrialSpec

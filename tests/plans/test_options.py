@@ -89,7 +89,7 @@ def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
     def asked(*words):
         done = subprocess.run(
             [sys.executable, "-P", *words], cwd=toy.folder, env=environment, capture_output=True, text=True,
-            timeout=100, check=False,
+            timeout=300, check=False,
         )  # fmt: skip
         assert not done.returncode, done.stderr
         return done.stdout

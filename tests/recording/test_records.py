@@ -27,7 +27,7 @@ from crashhunt.recording import (
     values_around,
     write_log,
 )
-from crashhunt.recording._digest import FIRST_ASIDE, is_evidence
+from crashhunt.recording._blackbox import FIRST_ASIDE, is_evidence
 from crashhunt.recording.records._type import BytesForm, RecordType, TextForm
 from crashhunt.world import Actor, Roster, Scene
 

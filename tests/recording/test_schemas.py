@@ -4,9 +4,8 @@ import math
 
 import pytest
 
-from crashhunt.recording._schemas import MESSAGES
-from crashhunt.recording._writer import to_ns
-from crashhunt.recording.records._arrays import message_of
+from crashhunt.recording._mcap import MESSAGES, to_ns
+from crashhunt.recording.records._agents import message_of
 
 
 @pytest.mark.parametrize(

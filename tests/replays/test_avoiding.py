@@ -7,7 +7,7 @@ import random
 import pytest
 
 from crashhunt.crashes import Attempt, Judgement
-from crashhunt.replays._avoiding import CannotError, Search, Tried
+from crashhunt.replays._avoidability import CannotError, Search, Tried
 
 
 class Runs:

@@ -15,7 +15,7 @@ import pytest
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.crashes import list_bundles
 from crashhunt.episode import answer_file
-from crashhunt.executors import _snapshot_executor
+from crashhunt.executors import _fresh
 from crashhunt.recording import read_header
 from crashhunt.replays import ReplayOptions, confirm, replay
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult
@@ -56,7 +56,7 @@ class Killed:
 
 def test_replay_that_is_killed_leaves_a_crash_unconfirmed(bundle, monkeypatch, toy):
     with monkeypatch.context() as patched:
-        patched.setattr(_snapshot_executor, "FreshProcessExecutor", Killed)
+        patched.setattr(_fresh, "FreshProcessExecutor", Killed)
         failed = []
         found = confirm(replace(bundle, confirmed=None), failed=failed)
         assert (found.confirmed, found.divergence, failed) == (None, None, [])

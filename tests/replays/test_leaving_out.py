@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Factor
-from crashhunt.replays._why import _Asked, _Search
+from crashhunt.replays._causes import _Asked, _Search
 from crashhunt.trial import Choice, Disturbance, Outcome, Range, TrialSpec
 
 SPEC = TrialSpec(7, 1, {"ego": {}}, {}, 99)

@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.replays import judge
-from crashhunt.replays._warm import NotUnderstoodError, _see_that_it_was_run
+from crashhunt.replays._prepare import NotUnderstoodError, _see_that_it_was_run
 from crashhunt.trial import Disturbance, Overruled, TrialSpec
 
 SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)

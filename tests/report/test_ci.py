@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from crashhunt.corpus import Case, CaseReport, known_kinds
-from crashhunt.crashes import Bundle
+from crashhunt.crashes import Bundle, Group, Signature
 from crashhunt.report import (
     corpus_annotations,
     corpus_summary,
@@ -18,7 +18,6 @@ from crashhunt.report import (
     findings_of,
     write_sarif,
 )
-from crashhunt.triage import Group, Signature
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 
 CODE = "hunts/h/snapshots/abc/code"

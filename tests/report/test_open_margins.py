@@ -5,11 +5,10 @@ from __future__ import annotations
 from contextlib import closing
 from types import SimpleNamespace
 
-from crashhunt.hunts import Ledger
-from crashhunt.hunts._branched import BranchReport
-from crashhunt.hunts._probed import ProbeReport
+from crashhunt.hunts._fork_results import BranchReport, ProbeReport
+from crashhunt.ledger import Ledger
 from crashhunt.report._page import _trials
-from crashhunt.report._probes import describe_branches, describe_probes
+from crashhunt.report._words import describe_branches, describe_probes
 from crashhunt.trial import Outcome, Stress, TrialResult, TrialSpec
 
 WHY = "a copy was killed by SIGKILL"

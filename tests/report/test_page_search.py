@@ -9,9 +9,10 @@ import pytest
 
 from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
-from crashhunt.hunts import HuntResults, Ledger
+from crashhunt.hunts import HuntResults
+from crashhunt.ledger import Ledger
 from crashhunt.report import _page, report_data
-from crashhunt.report._search import importance_of, lineage_of
+from crashhunt.report._page import importance_of, lineage_of
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashhunt.crashes import Attempt, Factor, Judgement, LeftOut, Why
-from crashhunt.report._judgement import about_judgement
-from crashhunt.report._why import about_why
+from crashhunt.report._words import about_judgement, about_why
 
 
 @pytest.mark.parametrize("drawn", [(), ("unclear", "unclear")])

@@ -7,10 +7,9 @@ import pytest
 from spaces import ask, spec_of
 
 from crashhunt.samplers import Cube, GuidedSampler, HuntFacts
-from crashhunt.samplers._guided import Portfolio
+from crashhunt.samplers._guided import Niches, Portfolio
 from crashhunt.samplers._model import Model
-from crashhunt.samplers._niches import Niches
-from crashhunt.samplers._told import Told
+from crashhunt.samplers._strategy import ScoredTrial
 from crashhunt.space import Choice, Range
 from crashhunt.trial import Outcome, TrialResult
 
@@ -22,7 +21,7 @@ def portfolio_told(*trials):
     """One that was told origins and scores, each trial somewhere else."""
     made = Portfolio(Cube(SPACE), SPACE, HuntFacts())
     for number, (origin, score) in enumerate(trials):
-        made.tell(Told(number, PLACES[number], number, score, origin))
+        made.tell(ScoredTrial(number, PLACES[number], number, score, origin))
     return made
 
 
@@ -54,7 +53,7 @@ def test_after_a_crash_strategies_begin_anew_with_what_is_not_near_to_it():
     made = portfolio_told(*[("random", 0.02 * number) for number in range(40)])
     model, mutation = made._strategies.values()
     middle = PLACES[7]
-    made.tell(Told(40, middle, 40, 1.0, "model"))
+    made.tell(ScoredTrial(40, middle, 40, 1.0, "model"))
     assert not {model, mutation} & {*made._strategies.values()}
     assert made._model._parameters is model._parameters  # what was fitted stays
     outside = [number for number in range(40) if np.linalg.norm(PLACES[number] - middle) >= 0.1 * 2**0.5]
@@ -62,9 +61,9 @@ def test_after_a_crash_strategies_begin_anew_with_what_is_not_near_to_it():
     for strategy in (made._strategies["mutation"]._corpus, made._strategies["model"]._best):
         assert sorted(told.number for told in strategy) == outside
     again = [*made._strategies.values()]
-    made.tell(Told(41, middle + 0.05, 41, 1.0, "model"))  # nothing new
+    made.tell(ScoredTrial(41, middle + 0.05, 41, 1.0, "model"))  # nothing new
     assert [*made._strategies.values()] == again
-    made.tell(Told(42, middle + 0.02, 42, 0.9, "random"))
+    made.tell(ScoredTrial(42, middle + 0.02, 42, 0.9, "random"))
     assert all(told.number != 42 for told in made._strategies["mutation"]._corpus)
 
 
@@ -84,22 +83,22 @@ def test_after_a_crash_strategies_have_the_less_the_fewer_new_kinds_they_find_th
     made = portfolio_told(*[("random", 0.01 * number) for number in range(10)], *[("model", 0.45)] * 12)
     made._earned["mutation"] = (0.0, 1.0)  # it has probes
     assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)
-    made.tell(Told(22, PLACES[22], 22, 1.0, "random", kind="rear end"))
-    made.tell(Told(23, PLACES[23], 23, 1.0, "model", kind="rear end"))  # nothing new
+    made.tell(ScoredTrial(22, PLACES[22], 22, 1.0, "random", kind="rear end"))
+    made.tell(ScoredTrial(23, PLACES[23], 23, 1.0, "model", kind="rear end"))  # nothing new
     few = (0.5 / 38) / (1.5 / 36)  # with half a kind in 25 trials, with which everybody begins
     assert made._shares() == pytest.approx({"model": 0.35 * few**2, "mutation": 0.02}, rel=0.01)
-    made.tell(Told(24, PLACES[24], 24, 1.0, "niche", kind="side swipe"))
-    made.tell(Told(25, PLACES[25], 25, 1.0, "niche", kind="head-on"))
+    made.tell(ScoredTrial(24, PLACES[24], 24, 1.0, "niche", kind="side swipe"))
+    made.tell(ScoredTrial(25, PLACES[25], 25, 1.0, "niche", kind="head-on"))
     assert made._shares() == pytest.approx({"model": 0.35, "mutation": 0.02}, rel=0.01)  # no more than without
     for number in range(26, 41):
-        made.tell(Told(number, PLACES[number], number, 1.0, "halton", kind=f"{number}"))
+        made.tell(ScoredTrial(number, PLACES[number], number, 1.0, "halton", kind=f"{number}"))
     assert made._shares() == {"model": 0.02, "mutation": 0.02}
 
 
 def test_without_manner_and_place_a_crash_is_new_where_none_is_known_near_to_it():
     made = portfolio_told(*[("random", 0.01 * number) for number in range(60)])
     for number, place in enumerate((PLACES[7], PLACES[7] + 0.01, np.array([0.99, 0.99]) - PLACES[7]), start=60):
-        made.tell(Told(number, place, number, 1.0, "model"))
+        made.tell(ScoredTrial(number, place, number, 1.0, "model"))
     assert made._kinds == {True: (2.5, 28.0), False: (0.5, 85.0)}
 
 
@@ -110,17 +109,17 @@ def test_nothing_keeps_the_traffic_of_a_crash_that_is_known():
         return [made.propose(place, np.random.default_rng(place)).seed for place in range(first, first + 60)]
 
     assert 7 in seeds(40)
-    made.tell(Told(40, np.clip(PLACES[7] + 0.4, 0.0, 1.0), 7, 1.0, "model", parent=7, kind="rear end"))
+    made.tell(ScoredTrial(40, np.clip(PLACES[7] + 0.4, 0.0, 1.0), 7, 1.0, "model", parent=7, kind="rear end"))
     assert not made._known.cover(PLACES[7])
-    made.tell(Told(41, PLACES[7] + 0.05, 7, 0.9, "model", parent=7))  # which was under way
+    made.tell(ScoredTrial(41, PLACES[7] + 0.05, 7, 0.9, "model", parent=7))  # which was under way
     assert {7, 41}.isdisjoint(told.number for told in made._strategies["mutation"]._corpus)
     again = seeds(42)
     assert any(seed is not None for seed in again)
     assert 7 not in again
-    made.tell(Told(42, PLACES[9], 100, 0.95, "random"))
+    made.tell(ScoredTrial(42, PLACES[9], 100, 0.95, "random"))
     assert 100 in seeds(43)
     strategies = [*made._strategies.values()]
-    made.tell(Told(43, np.clip(PLACES[7] + 0.41, 0.0, 1.0), 100, 1.0, "model", parent=42, kind="rear end"))
+    made.tell(ScoredTrial(43, np.clip(PLACES[7] + 0.41, 0.0, 1.0), 100, 1.0, "model", parent=42, kind="rear end"))
     assert [*made._strategies.values()] == strategies  # nothing new, so that they go on
     assert 100 not in seeds(44)
 
@@ -129,7 +128,7 @@ def test_where_all_trials_are_as_dangerous_there_is_no_other_peak():
     cube = Cube(SPACE)
     niches = Niches(cube, Model(cube))
     for number in range(40):
-        niches.tell(Told(number, PLACES[number], number, 0.0))
+        niches.tell(ScoredTrial(number, PLACES[number], number, 0.0))
     niches.begin()
     assert niches.propose(40, np.random.default_rng(1)) is None
 

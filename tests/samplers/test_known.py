@@ -6,8 +6,8 @@ import numpy as np
 from spaces import ask, spec_of
 
 from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, RandomSampler
-from crashhunt.samplers._known import KnownCrashes
-from crashhunt.samplers._told import Told, told_of
+from crashhunt.samplers._guided import KnownCrashes
+from crashhunt.samplers._strategy import ScoredTrial, scored_trial
 from crashhunt.space import Range
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult
 from crashhunt.world import Event
@@ -16,7 +16,7 @@ UNIT = {("ego", f"x{index}"): Range(0.0, 1.0) for index in range(4)}
 
 
 def crash(x, kind="", seed=0):
-    return Told(0, np.array([x, x, x, x]), seed, 1.0, kind=kind)
+    return ScoredTrial(0, np.array([x, x, x, x]), seed, 1.0, kind=kind)
 
 
 def at(x):
@@ -111,7 +111,7 @@ def test_the_traffic_of_a_crash_is_known_wherever_its_arguments_are():
 def kind_of(**evidence):
     outcome = evidence.pop("outcome", Outcome.COLLISION)
     spec = spec_of(0, ask(RandomSampler(UNIT), 0))
-    return told_of(TrialResult(spec, outcome, danger=0.5, **evidence), Cube(UNIT), HuntFacts()).kind
+    return scored_trial(TrialResult(spec, outcome, danger=0.5, **evidence), Cube(UNIT), HuntFacts()).kind
 
 
 def test_kinds_are_told_by_manner_and_road_and_by_what_was_raised():
@@ -139,10 +139,10 @@ def test_a_danger_is_never_a_crash_and_a_crash_is_the_greatest_danger():
         (Outcome.COLLISION, None, 1.0),
         (Outcome.HANG, 0.2, 1.0),
     ):
-        told = told_of(TrialResult(spec, outcome, danger=danger), Cube(UNIT), HuntFacts())
+        told = scored_trial(TrialResult(spec, outcome, danger=danger), Cube(UNIT), HuntFacts())
         assert (told.score, told.crashed) == (score, score == 1.0)
-    assert told_of(TrialResult(spec, Outcome.SURVIVED), Cube(UNIT), HuntFacts()) is None
-    assert told_of(TrialResult(spec, Outcome.INVALID), Cube(UNIT), HuntFacts()) is None
+    assert scored_trial(TrialResult(spec, Outcome.SURVIVED), Cube(UNIT), HuntFacts()) is None
+    assert scored_trial(TrialResult(spec, Outcome.INVALID), Cube(UNIT), HuntFacts()) is None
 
 
 def test_a_hunt_that_goes_on_comes_back_to_arguments_that_lead_to_several_kinds():

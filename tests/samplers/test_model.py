@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from crashhunt.samplers import Cube
-from crashhunt.samplers._model import Model
-from crashhunt.samplers._niches import Niches
-from crashhunt.samplers._process import Process
-from crashhunt.samplers._told import Told
+from crashhunt.samplers._guided import Niches
+from crashhunt.samplers._model import Model, Process
+from crashhunt.samplers._strategy import ScoredTrial
 from crashhunt.space import Choice, Range
 
 PLANE = Cube({("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)})
@@ -62,7 +61,7 @@ def trials(danger_of, count, seeds=None):
     rng = np.random.default_rng(3)
     for number in range(count):
         point = rng.random(2)
-        yield Told(number, point, number if seeds is None else number % seeds, danger_of(point, number))
+        yield ScoredTrial(number, point, number if seeds is None else number % seeds, danger_of(point, number))
 
 
 def test_noise_and_arguments_are_told_apart():
@@ -86,7 +85,7 @@ def test_a_model_proposes_what_leads_uphill():
 
 def test_what_is_most_dangerous_has_most_neighbours_and_each_candidate_is_one_of_its_parent():
     model = Model(PLANE)
-    best = [Told(place, np.full(2, (place + 0.5) / 12), place, 0.9 - place / 20) for place in range(12)]
+    best = [ScoredTrial(place, np.full(2, (place + 0.5) / 12), place, 0.9 - place / 20) for place in range(12)]
     points, places, kept = model._candidates(best, np.random.default_rng(1))
     assert places.mean() < 5
     away = np.array([np.abs(point - best[place].point).min() for point, place in zip(points, places, strict=True)])
@@ -107,10 +106,10 @@ def test_another_peak_is_climbed_where_the_highest_leads_nowhere():
     away = [np.linalg.norm(draft.point - 0.2) for draft in drafts if draft is not None]
     assert np.median(away) < 0.25
     assert not niches.climbs
-    niches.tell(Told(59, np.array([0.8, 0.81]), 59, 0.95, "model"))
+    niches.tell(ScoredTrial(59, np.array([0.8, 0.81]), 59, 0.95, "model"))
     assert not niches.climbs  # that is another peak
-    niches.tell(Told(60, np.array([0.2, 0.21]), 60, 0.7, "niche"))
+    niches.tell(ScoredTrial(60, np.array([0.2, 0.21]), 60, 0.7, "niche"))
     assert niches.climbs
     for number in range(61, 70):
-        niches.tell(Told(number, np.array([0.21, 0.2]), number, 0.5, "niche"))
+        niches.tell(ScoredTrial(number, np.array([0.21, 0.2]), number, 0.5, "niche"))
     assert niches.propose(70, np.random.default_rng(0)) is None  # it came no nearer, and so it was left

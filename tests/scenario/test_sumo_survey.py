@@ -8,7 +8,7 @@ import pytest
 
 from crashhunt.base.errors import NoValidTrialError, ScenarioError
 from crashhunt.scenario import load_scenario, shipped_folder
-from crashhunt.scenario.backends.sumo._survey import refine, restore
+from crashhunt.scenario.backends.sumo._ego import refine, restore
 
 TRIPS = "".join(f'<trip id="t{at}" depart="{at}" from="south" to="east"/>' for at in range(0, 1000, 50))
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from conftest import mostly_nightly
 from highway_env.envs.common import observation
+from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.road.lane import CircularLane, SineLane, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
@@ -29,12 +30,12 @@ from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.simulators.accelerator import (
+from crashhunt.accelerator import (
     Frame,
     Network,
     Onlooker,
-    _known,
     _switch as accelerator,
+    _versions,
     kind_of,
     reason_against,
     switch_off,
@@ -374,7 +375,7 @@ def test_it_steps_aside_for_another_version(monkeypatch):
 
 
 def test_it_steps_aside_for_a_changed_installation(monkeypatch):
-    monkeypatch.setattr(_known, "ACCELERATED", {highway_env.__version__: "0123"})
+    monkeypatch.setattr(_versions, "ACCELERATED", {highway_env.__version__: "0123"})
     assert "not the published one" in reason_against()
 
 
@@ -384,7 +385,7 @@ def test_it_steps_aside_for_an_older_numpy(monkeypatch):
 
 
 def test_it_steps_aside_where_arrays_give_other_bits(monkeypatch):
-    monkeypatch.setattr(_known, "_arrays_equal_scalars", lambda: False)
+    monkeypatch.setattr(_versions, "_arrays_equal_scalars", lambda: False)
     assert "on this processor" in switch_on()
 
 
@@ -398,7 +399,7 @@ def mine(self, *words): ...
 for name in sys.argv[1:]:
     if os.fork() == 0:
         exec(f"{name} = mine")
-        from crashhunt.simulators.accelerator import switch_on
+        from crashhunt.accelerator import switch_on
         print(name, switch_on(), flush=True)
         os._exit(0)
     os.wait()
@@ -426,8 +427,23 @@ def test_it_is_undone():
     assert Vehicle.act.__module__ == "highway_env.vehicle.kinematics"
 
 
+@pytest.mark.parametrize(("owner", "name"), [(Road, "act"), (AbstractEnv, "_simulate")])
+def test_method_that_a_module_puts_back_too_late_is_not_taken_for_an_original(monkeypatch, owner, name):
+    assert not switch_on()
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, name, lambda *_: None)
+        switch_off()  # leaves the module's own method where it is
+    assert not switch_on()
+    try:
+        env = gymnasium.make("highway-v0").unwrapped
+        env.reset(seed=1)
+        env.step(1)  # which called itself without end
+    finally:
+        switch_off()
+
+
 PLUGIN = """
-from crashhunt.simulators.accelerator import switch_on
+from crashhunt.accelerator import switch_on
 
 def pytest_configure(config):
     reason = switch_on()

@@ -15,7 +15,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.vehicle import behavior, dynamics
 from highway_env.vehicle.controller import ControlledVehicle
 
-from crashhunt.simulators.accelerator import Onlooker, _roads, kind_of, switch_off, switch_on
+from crashhunt.accelerator import Onlooker, _roads, kind_of, switch_off, switch_on
 from crashhunt.simulators.highway import restore_classes
 
 assert highway_env

@@ -17,8 +17,8 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import Landmark
 from test_highway import drive, simulator_of
 
+from crashhunt.accelerator import Unasked, switch_off, switch_on
 from crashhunt.scenario import ObservationSetup
-from crashhunt.simulators.accelerator import Unasked, switch_off, switch_on
 
 assert HighwaySimulator
 SMALL = {"vehicles_count": 6, "simulation_frequency": 4, "duration": 9}

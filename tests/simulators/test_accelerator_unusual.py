@@ -13,7 +13,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.simulators.accelerator import _roads, switch_off, switch_on
+from crashhunt.accelerator import _roads, switch_off, switch_on
 
 assert highway_env
 NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]

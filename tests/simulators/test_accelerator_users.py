@@ -24,7 +24,7 @@ from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, kinematics, objects
 
 import crashhunt
-from crashhunt.simulators.accelerator import Onlooker, switch_off, switch_on, why_not
+from crashhunt.accelerator import Onlooker, switch_off, switch_on, why_not
 from crashhunt.simulators.highway import restore_classes
 
 assert highway_env

@@ -15,7 +15,7 @@ from crashhunt.disturbances import disturber_of
 from crashhunt.episode import Episode
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
 from crashhunt.scenario.backends.sumo import SumoSetup
-from crashhunt.simulators import Disturbs
+from crashhunt.simulators import SupportsDisturbances
 from crashhunt.simulators.sumo import SumoSimulator
 from crashhunt.trial import Disturbance, TrialSpec
 
@@ -163,7 +163,7 @@ def test_places_are_along_the_lanes(drive, at, who):
     advance(episode, 4)
     assert watch.told[0].vehicle == "left"
     others = [place for place in ("left ahead", "left", "left behind", "right", "right ahead") if place != who]
-    assert [episode.simulator.whom(planned(2, "cut_in", place)) for place in others] == [""] * 4
+    assert [episode.simulator.resolve_target(planned(2, "cut_in", place)) for place in others] == [""] * 4
 
 
 def test_somebody_cuts_in_and_brakes_and_goes_on_as_it_likes(drive):
@@ -211,7 +211,7 @@ def test_an_agent_that_has_left_has_nobody_around_it(drive):
     episode, watch = drive(planned(390, "brake"), agent=Steady(30.0), traffic="")
     advance(episode, 400)
     assert watch.told == []
-    assert episode.simulator.whom(planned(1, "brake")) == ""
+    assert episode.simulator.resolve_target(planned(1, "brake")) == ""
 
 
 def test_who_is_not_seen_is_left_out_of_the_observation_and_nothing_else_changes(drive):
@@ -332,5 +332,5 @@ def test_who_is_taken_off_the_road_is_gone_from_that_step_on(drive):
 
 
 def test_sumo_offers_it():
-    assert all(hasattr(SumoSimulator, name) for name in ("disturbing_kinds", "whom", "disturb"))
-    assert Disturbs is not None
+    assert all(hasattr(SumoSimulator, name) for name in ("disturbing_kinds", "resolve_target", "disturb"))
+    assert SupportsDisturbances is not None

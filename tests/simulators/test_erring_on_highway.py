@@ -130,7 +130,7 @@ def test_places_are_along_the_lanes(begin, lane, ahead, who):
     episode, _ = begin()
     place(episode, lane, float(ahead))
     found = {cell for cell in ("left ahead", "left", "left behind", "ahead", "behind", "right ahead", "right")
-             if episode.simulator.whom(planned(1, "brake", cell))}  # fmt: skip
+             if episode.simulator.resolve_target(planned(1, "brake", cell))}  # fmt: skip
     assert found == {who}
 
 
@@ -209,7 +209,7 @@ def test_somebody_ignores_that_others_have_priority(begin):
 def test_who_crosses_the_agents_way(begin, road, who, found):
     episode, _ = begin(**JUNCTION)
     crossing(episode, road, 70.0)
-    places = {cell for cell in CELLS if episode.simulator.whom(planned(1, "ignore_priority", cell, 1.0))}
+    places = {cell for cell in CELLS if episode.simulator.resolve_target(planned(1, "ignore_priority", cell, 1.0))}
     assert places == ({who} if found else set())
 
 
@@ -230,7 +230,7 @@ def test_who_is_steered_has_no_route_and_its_way_is_crossed_where_its_lane_leads
         crosser.plan_route_to("o3")
         road.vehicles[:] = [agent, crosser]
         episode.simulator._look(())
-        found = [cell for cell in CELLS if episode.simulator.whom(planned(1, "ignore_priority", cell, 1.0))]
+        found = [cell for cell in CELLS if episode.simulator.resolve_target(planned(1, "ignore_priority", cell, 1.0))]
         places[road_of_agent] = found
     assert places == {("o0", "ir0"): [], ("ir0", "il2"): ["left ahead"]}
 

@@ -62,7 +62,7 @@ simulator.step({agent: form.encode(1) for agent, form in simulator.actions.items
 assert not {"matplotlib", "pandas", "numpy.ma"} & sys.modules.keys()
 from highway_env.envs.common import observation
 from highway_env.vehicle import dynamics
-from crashhunt.simulators.accelerator import why_not
+from crashhunt.accelerator import why_not
 import pandas
 assert "numpy.ma" in sys.modules and not why_not()
 assert observation.pd.DataFrame is pandas.DataFrame

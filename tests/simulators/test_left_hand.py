@@ -73,7 +73,7 @@ def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
     with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
         simulator.reset(seed=1, options={})
         cut_in = Disturbance(1, who, "cut_in", 0.0, 2.0, "ego")
-        assert simulator.whom(cut_in) == lane
+        assert simulator.resolve_target(cut_in) == lane
         scene = simulator.scene()
         y = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
         assert side * (y[lane] - y["ego"]) > 3.0  # it drives towards x

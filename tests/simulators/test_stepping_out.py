@@ -17,8 +17,8 @@ from onlookers import Steady, Watch
 from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
 from crashhunt.scenario import load_scenario
-from crashhunt.simulators.sumo import SumoSimulator, _disturbances, _stepping_out
-from crashhunt.simulators.sumo._stepping_out import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
+from crashhunt.simulators.sumo import SumoSimulator, _disturbances
+from crashhunt.simulators.sumo._disturbances import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
 NETS = Path(__file__).parent / "nets"
@@ -238,9 +238,9 @@ def test_the_next_person_steps_out_where_the_nearest_cannot(drive, monkeypatch):
     further = WALKER.removeprefix(STEADY).replace("walker", "further").replace('departPos="60"', 'departPos="70"')
     _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
     assert [one.vehicle for one in watch.told] == ["person walker"]
-    able = _stepping_out.can_step_out
+    able = _disturbances.can_step_out
     monkeypatch.setattr(
-        _stepping_out, "can_step_out", lambda actor, *more: actor != "person walker" and able(actor, *more)
+        _disturbances, "can_step_out", lambda actor, *more: actor != "person walker" and able(actor, *more)
     )
     _, watch = drive(EGO + WALKER + further, stepping(20), steps=30)
     assert [one.vehicle for one in watch.told] == ["person further"]

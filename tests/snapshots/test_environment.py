@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from importlib import metadata
+from importlib import import_module, metadata
 
 from crashhunt.snapshots import environment, environment_changes, versions
 
 
 def test_distributions_and_those_that_are_loaded_are_what_importlib_says():
+    import_module("numpy")  # which other tests have imported, where there are any
     found = environment()
     assert found["distributions"] == {
         distribution.metadata["Name"]: distribution.version for distribution in metadata.distributions()

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import subprocess
 
-from crashhunt.snapshots._sources import find_sources, git
+from crashhunt.snapshots._take import find_sources, git
 
 
 def test_crashhunt_comes_along_without_the_pages_of_its_guide():

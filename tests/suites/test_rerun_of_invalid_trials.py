@@ -7,7 +7,8 @@ from contextlib import closing
 import pytest
 
 from crashhunt.base import layout
-from crashhunt.hunts import HuntState, Ledger
+from crashhunt.hunts import HuntState
+from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, RunSettings, write_settings
 from crashhunt.suites._rerun import _replace_invalid
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec

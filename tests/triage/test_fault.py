@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 
 from crashhunt.crashes import Bundle
+from crashhunt.crashes._fault import fault_in, fault_of, safe_gap_m
+from crashhunt.crashes._lanes import Case, LaneMap
 from crashhunt.scenario import load_scenario
-from crashhunt.triage._case import Case
-from crashhunt.triage._fault import fault_in, fault_of
-from crashhunt.triage._fault_rules import safe_gap_m
-from crashhunt.triage._lanes import LaneMap
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, Event, Link, RightOfWay, Roster, Scene
 
@@ -30,6 +28,35 @@ last seconds of two actors, the lanes around them, and whose fault a person said
 @cache
 def cases():
     return json.loads(gzip.decompress(CASES.read_bytes()))
+
+
+class Map(LaneMap):
+    """A map of lanes that keeps the borders that it was made of, so that it can be rotated."""
+
+    def __init__(self, borders, around):
+        super().__init__(borders, around)
+        self.borders, self.around = borders, around
+
+
+def moved(points, angle):
+    """Rotate points around the origin, and shift them."""
+    c, s = math.cos(angle), math.sin(angle)
+    return [(c * x - s * y + 300.0, s * x + c * y - 700.0) for x, y in points]
+
+
+def rotated(case, angle):
+    """Return the same case where the road lies in another direction, which must change no verdict."""
+    scenes = []
+    for scene in case.scenes:
+        points, headings = moved(scene.points, angle), [heading + angle for heading in scene.headings]
+        scenes.append(Scene(scene.time_s, scene.roster, points, headings, scene.speeds, lanes=scene.lanes))
+    (around,) = moved([case.lanes.around], angle)
+    lanes = Map([tuple(np.array(moved(border, angle)) for border in both) for both in case.lanes.borders], around)
+    rights = case.right_of_way
+    if rights is not None:
+        links = tuple(replace(link, shape=tuple(moved(link.shape, angle))) for link in rights.links)
+        rights = replace(rights, links=links)
+    return replace(case, scenes=scenes, lanes=lanes, right_of_way=rights)
 
 
 def case_of(data):
@@ -54,7 +81,7 @@ def case_of(data):
         [*started, *scenes],
         data["time_s"],
         data["began_s"],
-        LaneMap(borders, scenes[-1].points[0]),
+        Map(borders, scenes[-1].points[0]),
         tuple((time_s, Event(kind, agent, what)) for time_s, kind, agent, what in data["events"]),
         RightOfWay(links, frozenset(map(tuple, data["gives_way"]))) if links else None,
         lane=data["lane"],
@@ -86,7 +113,15 @@ def test_what_is_said_is_what_a_person_says_or_nothing():
     }  # fmt: skip
 
 
-LANES = LaneMap(
+@pytest.mark.parametrize(("angle", "each"), [(0.7, 8), pytest.param(-2.6, 1, marks=pytest.mark.nightly)])
+def test_what_is_said_does_not_depend_on_where_the_road_leads(angle, each):
+    for case in map(case_of, cases()[::each]):
+        said, again = fault_in(case), fault_in(rotated(case, angle))
+        assert again.verdict == said.verdict
+        assert [finding.rule for finding in again.findings] == [finding.rule for finding in said.findings]
+
+
+LANES = Map(
     [(np.array([[-200.0, y - 2], [400.0, y - 2]]), np.array([[-200.0, y + 2], [400.0, y + 2]])) for y in (-4, 0, 4)],
     (0.0, 0.0),
 )
@@ -110,8 +145,14 @@ def straight(speed, at=0.0, y=0.0, *, before=None, since=0.0):
     return lambda t: (at - speed * t, y if before is None or t <= since else before, 0.0, speed)
 
 
+ANGLES = (0.7, 2.2, -2.6)
+
+
 def verdict(case):
-    return fault_in(case).verdict
+    """The verdict, which must be the same wherever the road leads."""
+    found = fault_in(case).verdict
+    assert [fault_in(rotated(case, angle)).verdict for angle in ANGLES] == [found] * len(ANGLES)
+    return found
 
 
 def test_who_drives_into_the_back_of_who_was_long_ahead():
@@ -138,7 +179,7 @@ def test_who_changes_lanes_into_a_gap_that_is_too_short():
     assert verdict(drive(straight(25), straight(15, 5, before=4.0, since=2.9))) == "nobody can tell"
     away = straight(15, 5, before=0.0, since=0.1, y=4.0)
     assert verdict(drive(straight(25), away)) != "the other"
-    assert verdict(drive(straight(25), cuts_in, lanes=LaneMap([], (0.0, 0.0)))) == "nobody can tell"
+    assert verdict(drive(straight(25), cuts_in, lanes=Map([], (0.0, 0.0)))) == "nobody can tell"
 
 
 def test_who_moves_sideways_into_who_is_beside():
@@ -325,3 +366,17 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
 def test_the_safe_gap_is_that_of_rss():
     assert safe_gap_m(20, 20) == pytest.approx(20 + 1.75 + 23.5**2 / 8 - 20**2 / 16)
     assert safe_gap_m(0, 30) == 0
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_distances_of_a_case_are_the_same_in_every_direction(angle):
+    case = drive(straight(20, 1.0, 0.5), turning_left(1.2, at=11.0))
+    again = rotated(case, angle)
+    for actor in ("ego", "other"):
+        for back in (-1, -9, 0):
+            for name in ("ahead_m", "gap_m", "aside_m"):
+                assert getattr(again, name)(actor, back) == pytest.approx(getattr(case, name)(actor, back)), name
+        assert again.in_its_way_s(actor) == pytest.approx(case.in_its_way_s(actor))
+        assert again.meets_sideways(actor) == case.meets_sideways(actor)
+    assert again.turn == pytest.approx(case.turn)
+    assert case.ahead_m("other", 0) == pytest.approx(70.0)  # 4 s before: at -9 m and at -79 m

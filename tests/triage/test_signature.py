@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crashhunt.triage import Signature, group_crashes, signature_of
+from crashhunt.crashes import Signature, group_crashes, signature_of
 from crashhunt.trial import Disturbance, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Event
 

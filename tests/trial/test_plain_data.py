@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.base import errors
 from crashhunt.errors import CrashhuntError
-from crashhunt.trial import CRASHES, Collision, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import CRASHES, Collision, Escape, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Actor, ClosestApproach, Path, Paths, State
 
 ALL_ERRORS = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, CrashhuntError)]
@@ -82,3 +82,13 @@ def test_outcomes_are_told_apart():
 def test_what_never_happened_is_null_in_json():
     assert ClosestApproach().to_json() == {"time_to_collision_s": None, "gap_m": None, "required_deceleration": 0.0}
     assert math.isinf(ClosestApproach.from_json(ClosestApproach().to_json()).gap_m)
+
+
+def test_specification_without_arguments_has_none():
+    found = TrialSpec.from_json({"number": 3, "seed": 7, "max_steps": 9})
+    assert found == TrialSpec(3, 7, {}, {}, max_steps=9)
+
+
+def test_failure_and_escape_of_which_little_is_written_have_empty_values():
+    assert Failure.from_json({}) == Failure("", "")
+    assert Escape.from_json({"step": 3}) == Escape(step=3, too_late=None, braking=None, how="")

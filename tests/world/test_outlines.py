@@ -9,7 +9,7 @@ import pytest
 from scenes import scene
 
 from crashhunt.world import corners, levels, on_one_level, outlines
-from crashhunt.world._outlines import same_level
+from crashhunt.world._geometry import same_level
 
 BUS = {"bus": (12.0, 2.5)}
 SPINE = ((30.0, 5.0, 2.0), (26.0, 5.0, 1.6), (26.0, -3.0, 0.8))  # a right angle, on a ramp of a tenth

@@ -15,13 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.keeper import Kept
-from crashhunt.executors._notes import Notes
-from crashhunt.executors._protocol import NodeFigures
-from crashhunt.executors.ray._address import cluster_of, require_ray, silent
-from crashhunt.executors.ray._folder import Folder
-from crashhunt.executors.ray._parcel import Parcel
-from crashhunt.executors.ray._site import code_digest
+from crashhunt.base.reaper import Kept
+from crashhunt.executors._protocol import NodeFigures, Notes
+from crashhunt.executors.ray._cluster import cluster_of, require_ray, silent
+from crashhunt.executors.ray._code_archive import Folder, Parcel
+from crashhunt.executors.ray._node_actor import code_digest
 from crashhunt.plans import FIXED, load_order_of
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.snapshots import versions

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 if TYPE_CHECKING:
-    from crashhunt.base.plain import ErrorData, ErrorWords
-    from crashhunt.episode import SettingsData
-    from crashhunt.trial import ResultData, SpecData
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import ErrorData, ErrorWords
 
 __all__ = ["BridgeJob", "Ended", "Figures", "FromBridge", "Header", "News", "NodeJob", "Submitted", "ToBridge"]
 
-Submitted = tuple[int, "SpecData"]
+Submitted = tuple[int, "JsonObject"]
 """A trial, and its ticket: a number that tells it from another submission of the same trial."""
 Header = tuple[int, int, float, int, int, int, int]
 """The values of a `BlackBoxHeader`."""
@@ -24,7 +23,7 @@ class BridgeJob(TypedDict):
     and ``code`` are what nodes must have. ``resumed`` where an earlier bridge of the same hunt had nodes.
     """
 
-    settings: SettingsData
+    settings: JsonObject
     parallel: int
     recycle_after: int
     address: str
@@ -41,7 +40,7 @@ class NodeJob(TypedDict):
     ``home`` is the place in the parcel where trials run, as they do in the current folder there; empty for none.
     """
 
-    settings: SettingsData
+    settings: JsonObject
     recycle_after: int
     digest: str
     folders: dict[str, str]
@@ -73,7 +72,7 @@ class FromBridge(TypedDict, total=False):
     """
 
     ticket: int
-    result: ResultData
+    result: JsonObject
     error: ErrorWords
     passing: bool
     token: bool

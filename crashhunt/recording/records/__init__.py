@@ -1,6 +1,7 @@
-"""The types of records, a file each: tag, codec, topic of the evidence in the log, reading and comparison.
+"""The types of records: tag, codec, topic of the evidence in the log, reading and comparison of each.
 
-To add one, write its file and name it here; whoever has something to record calls `BlackBox.append` with its tag.
+To add a type, define a `RecordType` in one of the modules here, list it in `RECORD_TYPES`, and call
+`BlackBox.append` with its tag where there is something to record.
 """
 
 from __future__ import annotations
@@ -8,20 +9,9 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
-from crashhunt.recording.records import (
-    action,
-    actors,
-    disturbances,
-    events,
-    heights,
-    lanes,
-    notes,
-    observation,
-    prologue,
-    roster,
-    spines,
-    step,
-)
+from crashhunt.recording.records._agents import ACTION, OBSERVATION, PROLOGUE
+from crashhunt.recording.records._events import DISTURBANCES, EVENTS, NOTES
+from crashhunt.recording.records._scene import ACTORS, HEIGHTS, LANES, ROSTER, SPINES, STEP
 
 if TYPE_CHECKING:
     from crashhunt.recording.records._type import RecordType
@@ -30,20 +20,20 @@ __all__ = ["RECORD_TYPES", "Tag"]
 
 # In the order in which those of one step are compared: what an agent saw and did, what came of it.
 RECORD_TYPES: dict[int, RecordType] = {
-    module.TYPE.tag: module.TYPE
-    for module in (
-        prologue,
-        actors,
-        roster,
-        disturbances,
-        observation,
-        action,
-        step,
-        events,
-        lanes,
-        heights,
-        spines,
-        notes,
+    kind.tag: kind
+    for kind in (
+        PROLOGUE,
+        ACTORS,
+        ROSTER,
+        DISTURBANCES,
+        OBSERVATION,
+        ACTION,
+        STEP,
+        EVENTS,
+        LANES,
+        HEIGHTS,
+        SPINES,
+        NOTES,
     )
 }
 """Every type by its tag."""
@@ -52,15 +42,15 @@ RECORD_TYPES: dict[int, RecordType] = {
 class Tag(IntEnum):
     """What a record holds, by the names of those that crashhunt itself writes."""
 
-    PROLOGUE = prologue.TYPE.tag
-    ACTORS = actors.TYPE.tag
-    ROSTER = roster.TYPE.tag
-    OBSERVATION = observation.TYPE.tag
-    ACTION = action.TYPE.tag
-    STEP = step.TYPE.tag
-    LANES = lanes.TYPE.tag
-    EVENTS = events.TYPE.tag
-    HEIGHTS = heights.TYPE.tag
-    SPINES = spines.TYPE.tag
-    NOTES = notes.TYPE.tag
-    DISTURBANCE = disturbances.TYPE.tag
+    PROLOGUE = PROLOGUE.tag
+    ACTORS = ACTORS.tag
+    ROSTER = ROSTER.tag
+    OBSERVATION = OBSERVATION.tag
+    ACTION = ACTION.tag
+    STEP = STEP.tag
+    LANES = LANES.tag
+    EVENTS = EVENTS.tag
+    HEIGHTS = HEIGHTS.tag
+    SPINES = SPINES.tag
+    NOTES = NOTES.tag
+    DISTURBANCE = DISTURBANCES.tag

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from crashhunt.recording._reading import Reading, StepRecord
-    from crashhunt.recording.records.prologue import AgentChannel, Prologue
+    from crashhunt.recording.records._agents import AgentChannel, Prologue
 
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 

@@ -6,5 +6,5 @@ Each has a ``BACKEND``, with the dataclass of its table, checks and files. Nothi
 __all__ = ["DEFAULT_SIMULATOR"]
 
 DEFAULT_SIMULATOR = "sumo"
-"""What a ``scenario.toml`` means that names none. Part of the file format, and of what is sent to workers of older
-versions, which leaves out what is at its default: it may never change."""
+"""The simulator of a ``scenario.toml`` without one. It may never change: it is part of the file format, and messages to
+workers of older versions omit default values."""

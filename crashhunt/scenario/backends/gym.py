@@ -44,9 +44,9 @@ class GymSetup:
         id: as `gymnasium.make` takes it, or ``module:factory``, which is called with ``kwargs``.
         kwargs: of the environment.
         crash: what counts as a crash.
-        danger: how dangerous a step is, where no scene says it: ``info.KEY``, a number of the info from 0 to 1, or
-            ``-info.KEY`` of one that is less the more dangerous it is, such as a distance of x: 1 / (1 + x). A trial
-            has the greatest of its steps. Empty for nobody knows.
+        danger: the criticality of a step without a scene. ``info.KEY`` is a number of the info from 0 to 1.
+            ``-info.KEY`` is a number x that falls with criticality, such as a distance, and gives 1 / (1 + x). A trial
+            has the greatest value of its steps. Empty if criticality is unknown.
     """
 
     id: str

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from highway_env.vehicle.objects import RoadObject
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.base.names import did_you_mean
+from crashhunt.base.text import did_you_mean
 from crashhunt.scenario.backends.highway import HighwaySetup
-from crashhunt.simulators._options import as_tables, merge
+from crashhunt.simulators._gymnasium import as_tables, merge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

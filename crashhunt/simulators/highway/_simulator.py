@@ -24,22 +24,18 @@ from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
+from crashhunt.accelerator import Onlooker, Unasked, switch_off, switch_on
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
 from crashhunt.simulators._actions import MetaAction
-from crashhunt.simulators._foreign_spaces import ObservationForm, action_form, native
-from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._gymnasium import ObservationForm, action_form, native, reseed_in_place
+from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators._unseen import Unseen
-from crashhunt.simulators.accelerator import Onlooker, Unasked, switch_off, switch_on
 from crashhunt.simulators.highway._config import configured, mistake, restore_classes
 from crashhunt.simulators.highway._disturbances import HighwayDisturbances
-from crashhunt.simulators.highway._hidden import Hidden
+from crashhunt.simulators.highway._scene import Hidden, HighwayEvents, TakingPart, contact_of, lanes_of
 from crashhunt.simulators.highway._scripted import Puppet, Puppets
-from crashhunt.simulators.highway._shapes import contact_of, lanes_of
-from crashhunt.simulators.highway._taking_part import TakingPart
-from crashhunt.simulators.highway._traffic_events import HighwayEvents
 from crashhunt.world import Actor, Lane, Roster, Scene
 
 if TYPE_CHECKING:
@@ -51,7 +47,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
+    from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Contact, Event, Paths
 
@@ -133,6 +129,14 @@ class HighwaySimulator:
         self._look(())
         return self._show(self.agents, shown), {}
 
+    why_no_reseeding = ""
+
+    def reseed(self, seed: int) -> None:
+        """Give the environment's generator, which its road and vehicles share, another seed."""
+        reseed_in_place(self._env.np_random, seed)
+        if self._env.road.np_random is not self._env.np_random:
+            reseed_in_place(self._env.road.np_random, seed)
+
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Let everybody act; the rewards are the environment's."""
         given = [
@@ -188,12 +192,12 @@ class HighwaySimulator:
             return FullBraking(kind.actions_indexes["SLOWER"], "by answering SLOWER in every step")
         return None
 
-    def whom(self, disturbance: Disturbance) -> str:
+    def resolve_target(self, disturbance: Disturbance) -> str:
         """Return who is at a place around an agent, along the lanes; of who crosses its way, as the crow flies."""
-        found = self._disturbances.whom(self._controlled[disturbance.agent], disturbance)
+        found = self._disturbances.resolve_target(self._controlled[disturbance.agent], disturbance)
         return "" if found is None else self._actor(found).id
 
-    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
         """Overrule a vehicle until its disturbance ends."""
         thing = next(thing for thing, actor in self._known.values() if actor.id == vehicle)
         if disturbance.what == "unseen":
@@ -202,7 +206,7 @@ class HighwaySimulator:
             return Hidden(self._env.road, self._seeing[disturbance.agent], thing)
         return self._disturbances.disturb(thing, disturbance, self._controlled[disturbance.agent])
 
-    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+    def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
         """Keep a vehicle from something until that ends."""
         present = {id(thing) for thing in self._env.road.vehicles}
         found = (thing for thing, actor in self._known.values() if actor.id == vehicle and id(thing) in present)

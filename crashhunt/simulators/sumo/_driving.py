@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 from typing import TYPE_CHECKING
 
-# As in _simulator.py: the package's own functions cost twice as much.
+import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.simulators._actions import META_ACTIONS
@@ -17,8 +17,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import AgentSetup
+    from crashhunt.simulators._protocol import ActiveDisturbance
 
-__all__ = ["Driving"]
+
+__all__ = ["Driving", "held_back"]
+
+
+# As in _simulator.py: the package's own functions cost twice as much.
 
 
 class Driving:
@@ -114,3 +119,75 @@ def _is_right_of(lane: str, other: str) -> bool:
     (x, y, *_), (to_x, to_y, *_) = sumo.lane_getShape(other)[:2]
     at_x, at_y = sumo.lane_getShape(lane)[0][:2]
     return bool((to_x - x) * (at_y - y) < (to_y - y) * (at_x - x))
+
+
+# Others on SUMO that are kept from something, to see what hangs on it: braking, changing lanes, being there.
+
+_HEEDING_NOBODY = 0  # speed mode: what is commanded is driven
+_NOT_AT_ALL = 0  # lane change mode
+
+
+def held_back(vehicle: str, what: str) -> ActiveDisturbance | None:
+    """Keep a vehicle from something, from the next step on; None where it is not there.
+
+    Args:
+        vehicle: its name.
+        what: one of `HELD`.
+    """
+    if vehicle not in sumo.vehicle_getIDList():
+        return None
+    if what == "gone":
+        libsumo.vehicle.remove(vehicle)
+        return _Gone()
+    return _KeepsSpeed(vehicle) if what == "keep_speed" else _KeepsLane(vehicle)
+
+
+class _Gone:
+    """It is gone, and does not come back."""
+
+    how_strong = 1.0
+
+    def keep(self) -> None:
+        """Stay away."""
+
+    def end(self) -> None:
+        """Stay away."""
+
+
+class _KeepsSpeed:
+    """Drives on at its speed, whoever is in its way."""
+
+    def __init__(self, vehicle: str) -> None:
+        self.how_strong = float(sumo.vehicle_getSpeed(vehicle))
+        self._vehicle = vehicle
+        self._before = sumo.vehicle_getSpeedMode(vehicle)
+        sumo.vehicle_setSpeedMode(vehicle, _HEEDING_NOBODY)
+        sumo.vehicle_setSpeed(vehicle, self.how_strong)
+
+    def keep(self) -> None:
+        """Go on; SUMO holds what has been commanded."""
+
+    def end(self) -> None:
+        """Drive by itself again."""
+        if self._vehicle in sumo.vehicle_getIDList():
+            sumo.vehicle_setSpeedMode(self._vehicle, self._before)
+            sumo.vehicle_setSpeed(self._vehicle, -1.0)
+
+
+class _KeepsLane:
+    """Does not leave its lane."""
+
+    how_strong = 1.0
+
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+        self._before = sumo.vehicle_getLaneChangeMode(vehicle)
+        sumo.vehicle_setLaneChangeMode(vehicle, _NOT_AT_ALL)
+
+    def keep(self) -> None:
+        """Go on; SUMO holds what has been commanded."""
+
+    def end(self) -> None:
+        """Change lanes by itself again."""
+        if self._vehicle in sumo.vehicle_getIDList():
+            sumo.vehicle_setLaneChangeMode(self._vehicle, self._before)

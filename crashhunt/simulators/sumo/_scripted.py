@@ -20,7 +20,7 @@ from crashhunt.world import Actor, Path, Roster, Scene, State
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.simulators.sumo._sight import Sight
+    from crashhunt.simulators.sumo._scene_reader import Sight
     from crashhunt.world import Paths, Spine
 
     Row = tuple[Actor, State, str, Spine | None]

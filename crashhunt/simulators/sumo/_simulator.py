@@ -13,23 +13,20 @@ import libsumo
 from libsumo import _libsumo as sumo
 
 from crashhunt.base.errors import InvalidEpisodeError, SimulatorError
-from crashhunt.native import core_for
+from crashhunt.native import core_for, reseed_generators, why_no_reseeding
 from crashhunt.scenario import ObservationSetup
 from crashhunt.scenario.backends.sumo import BACKEND, StagedFiles, SumoSetup
 from crashhunt.simulators._actions import META_ACTIONS, MetaAction, SpeedAndLaneChange
-from crashhunt.simulators._kinematics import Kinematics
+from crashhunt.simulators._kinematics import Kinematics, Unseen
 from crashhunt.simulators._protocol import FullBraking
-from crashhunt.simulators._unseen import Unseen
 from crashhunt.simulators.sumo._disturbances import SumoDisturbances
-from crashhunt.simulators.sumo._driving import Driving
-from crashhunt.simulators.sumo._entering import enter, replaced_by, steps_counted
-from crashhunt.simulators.sumo._holding import held_back
+from crashhunt.simulators.sumo._driving import Driving, held_back
+from crashhunt.simulators.sumo._entering import TakingPart, enter, replaced_by, steps_counted
+from crashhunt.simulators.sumo._fast_step import Present, UsualSteps
 from crashhunt.simulators.sumo._loading import VERSION, Loading, ready_xml
+from crashhunt.simulators.sumo._scene_reader import Sight
 from crashhunt.simulators.sumo._scripted import ScriptedSight, place_agents
-from crashhunt.simulators.sumo._sight import Sight
-from crashhunt.simulators.sumo._taking_part import TakingPart
 from crashhunt.simulators.sumo._traffic_events import SumoEvents
-from crashhunt.simulators.sumo._usual import Present, UsualSteps
 from crashhunt.world import PERSON, Lane, is_person
 
 if TYPE_CHECKING:
@@ -40,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.scenario import Scenario
-    from crashhunt.simulators._protocol import ActionForm, Disturbing, Info, Observations, Options, StepResult
+    from crashhunt.simulators._protocol import ActionForm, ActiveDisturbance, Info, Observations, Options, StepResult
     from crashhunt.trial import Disturbance, Value
     from crashhunt.world import Paths, Scene
 
@@ -173,6 +170,15 @@ class SumoSimulator:
             usual.begin()
         return observations, {}
 
+    @property
+    def why_no_reseeding(self) -> str:
+        """Why SUMO's generators cannot be re-seeded; empty where they can."""
+        return why_no_reseeding(VERSION, sumo.__file__)
+
+    def reseed(self, seed: int) -> None:
+        """Give the generators of drivers, types and devices other seeds; when vehicles depart stays as planned."""
+        reseed_generators(sumo.__file__, seed)
+
     def step(self, actions: Mapping[str, NDArray[np.generic]]) -> StepResult:
         """Apply the actions and simulate one step; the reward is the distance driven in it, in m."""
         if self.at_once is not None and self.at_once.core.step > self._steps:
@@ -242,17 +248,17 @@ class SumoSimulator:
             return FullBraking((0.0, 0), "all that its type can do", float(libsumo.vehicle.getDecel(agent)))
         return FullBraking((0.0, 0), f"as hard as its speed mode {setup.speed_mode} allows")
 
-    def whom(self, disturbance: Disturbance) -> str:
+    def resolve_target(self, disturbance: Disturbance) -> str:
         """Return who is at a place around an agent, along the lanes."""
-        return self._disturbances.whom(disturbance, self.scene())
+        return self._disturbances.resolve_target(disturbance, self.scene())
 
-    def disturb(self, vehicle: str, disturbance: Disturbance) -> Disturbing | None:
+    def disturb(self, vehicle: str, disturbance: Disturbance) -> ActiveDisturbance | None:
         """Command a vehicle until its disturbance ends."""
         if disturbance.what == "unseen":
             return Unseen(self._kinematics, disturbance.agent, vehicle)
         return self._disturbances.disturb(vehicle, disturbance)
 
-    def hold(self, vehicle: str, what: str) -> Disturbing | None:
+    def hold(self, vehicle: str, what: str) -> ActiveDisturbance | None:
         """Keep a vehicle from something until that ends; for a person there is nothing."""
         found = held_back(vehicle, what)
         if what == "gone":

@@ -1,24 +1,10 @@
-from ._allowed import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
 from ._backend import BACKEND as BACKEND
-from ._files import StagedFiles as StagedFiles, filled_in as filled_in
-from ._names import check_names as check_names
-from ._options import (
-    HARMLESS as HARMLESS,
-    INPUTS as INPUTS,
-    RESERVED as RESERVED,
-    canonical as canonical,
-    is_output as is_output,
-    is_shown as is_shown,
-    is_true as is_true,
-    writes as writes,
-)
-from ._says import explained as explained
-from ._sumocfg import load_sumocfg as load_sumocfg
-from ._survey import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
-from ._table import SumoSetup as SumoSetup
-from ._xml import (
+from ._ego import NOT_ON_A_ROAD as NOT_ON_A_ROAD, SurveyedRun as SurveyedRun
+from ._files import (
     READ as READ,
     WRITTEN as WRITTEN,
+    StagedFiles as StagedFiles,
+    filled_in as filled_in,
     movable as movable,
     nested_files as nested_files,
     read_xml as read_xml,
@@ -26,3 +12,17 @@ from ._xml import (
     rewritten as rewritten,
     written_by as written_by,
 )
+from ._names import check_names as check_names, explained as explained
+from ._options import (
+    HARMLESS as HARMLESS,
+    INPUTS as INPUTS,
+    RESERVED as RESERVED,
+    SumoSetup as SumoSetup,
+    canonical as canonical,
+    is_output as is_output,
+    is_shown as is_shown,
+    is_true as is_true,
+    writes as writes,
+)
+from ._side_effects import ATTRIBUTES as ATTRIBUTES, ELEMENTS as ELEMENTS, LABELS as LABELS
+from ._sumocfg import load_sumocfg as load_sumocfg

@@ -6,10 +6,8 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._backend import Backend, CompiledCore, Configuration, LoadOrder
-from crashhunt.scenario._traffic_survey import TrafficSurvey
-from crashhunt.scenario.backends.sumo._options import INPUTS, canonical, writes
-from crashhunt.scenario.backends.sumo._table import SumoSetup
+from crashhunt.scenario._backend import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
+from crashhunt.scenario.backends.sumo._options import INPUTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
 if TYPE_CHECKING:
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.errors import ScenarioError
-    from crashhunt.base.plain import Json
+    from crashhunt.base.json_types import Json
     from crashhunt.scenario._scenario import Scenario
     from crashhunt.trial import Value
     from crashhunt.world import RightOfWay
@@ -28,8 +26,7 @@ _VEHICLE = ("existing", "replaces", "type", "route", "edges", "depart_s", "depar
 _DRIVING = ("action", "target_speeds", "speed_mode")
 
 
-# Whoever asks what backends there are imports this module, and need not wait for the rest: it is imported where it is
-# needed.
+# A listing of backends imports this module, so everything else is imported where it is needed.
 
 
 def _check(scenario: Scenario, where: str) -> None:
@@ -55,7 +52,7 @@ def _files(scenario: Scenario) -> Iterator[str]:
 
 def _texts(scenario: Scenario) -> Iterator[str]:
     """Routes, additional files, and what these have SUMO read."""
-    from crashhunt.scenario.backends.sumo._xml import nested_files
+    from crashhunt.scenario.backends.sumo._files import nested_files
 
     sumo = scenario.table(SumoSetup)
     named = (*sumo.routes, *sumo.additional)
@@ -64,14 +61,14 @@ def _texts(scenario: Scenario) -> Iterator[str]:
 
 
 def _relocated(path: Path) -> bytes | None:
-    from crashhunt.scenario.backends.sumo._xml import movable
+    from crashhunt.scenario.backends.sumo._files import movable
 
     return movable(path)
 
 
 def _notes(scenario: Scenario) -> Iterator[str]:
     """Tell what SUMO would write and does not."""
-    from crashhunt.scenario.backends.sumo._xml import written_by
+    from crashhunt.scenario.backends.sumo._files import written_by
 
     sumo = scenario.table(SumoSetup)
     named = [name for option in sumo.options if writes(name := canonical(option))]
@@ -88,7 +85,7 @@ def _load(path: Path, ego: str) -> Scenario:
 
 
 def _explained(message: str, output: str, scenario: Scenario) -> ScenarioError | None:
-    from crashhunt.scenario.backends.sumo._says import explained
+    from crashhunt.scenario.backends.sumo._names import explained
 
     return explained(message, output, scenario)
 
@@ -106,13 +103,13 @@ def _side_effect(scenario: Scenario, values: Mapping[str, Value], specifications
 
 
 def _refined(scenario: Scenario, answer: Json) -> Scenario:
-    from crashhunt.scenario.backends.sumo._survey import refine
+    from crashhunt.scenario.backends.sumo._ego import refine
 
     return refine(scenario, answer)
 
 
 def _restored(scenario: Scenario, kept: Scenario) -> Scenario | None:
-    from crashhunt.scenario.backends.sumo._survey import restore
+    from crashhunt.scenario.backends.sumo._ego import restore
 
     return restore(scenario, kept)
 

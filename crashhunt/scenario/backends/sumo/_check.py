@@ -6,10 +6,9 @@ import string
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._checks import refuse
-from crashhunt.scenario.backends.sumo._options import RESERVED, canonical, is_true
-from crashhunt.scenario.backends.sumo._table import SumoSetup
-from crashhunt.scenario.backends.sumo._xml import read_xml
+from crashhunt.scenario._load import refuse
+from crashhunt.scenario.backends.sumo._files import read_xml
+from crashhunt.scenario.backends.sumo._options import RESERVED, SumoSetup, canonical, is_true
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -2,33 +2,273 @@
 
 from __future__ import annotations
 
+import gzip
 import os
+import re
 import string
-from typing import TYPE_CHECKING
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
+from xml.parsers import expat
 
-from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError
-from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, USUALLY, canonical, is_output, is_shown
-from crashhunt.scenario.backends.sumo._table import SumoSetup
-from crashhunt.scenario.backends.sumo._xml import read_xml, references, rewritten
+from crashhunt.base.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.scenario.backends.sumo._options import ALWAYS, INPUTS, USUALLY, SumoSetup, canonical, is_output, is_shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from crashhunt.scenario._scenario import Scenario
-    from crashhunt.scenario.backends.sumo._xml import Reference
     from crashhunt.trial import Value
 
-__all__ = ["StagedFiles", "filled_in"]
 
-_NOWHERE = "/dev/null"
+__all__ = [
+    "READ",
+    "WRITTEN",
+    "Reference",
+    "StagedFiles",
+    "filled_in",
+    "movable",
+    "nested_files",
+    "read_xml",
+    "references",
+    "rewritten",
+    "written_by",
+]
+
+
+# What SUMO's XML files say about other files: those that they read, and those that they write.
+
+READ = {
+    ("include", "href"),
+    ("variableSpeedSign", "file"),
+    ("rerouter", "file"),
+    ("calibrator", "file"),
+    ("edgeData", "edgesFile"),
+    ("laneData", "edgesFile"),
+}
+"""The attributes that name what SUMO reads."""
+
+WRITTEN = {"file", "output", "dest"}
+"""The attributes that name what SUMO writes, wherever they are not `READ`."""
+_NOWHERE = {"", "NUL", "nul", "/dev/null", "stdout", "STDOUT", "-", "stderr", "STDERR"}
+"""What SUMO does not take for the name of a file."""
+
+# What is not in a file's bytes, no attribute of it can be; most files have none of these. Networks are large, and a
+# word is found ten times as fast as a choice of words: so each by itself, and the pattern only where the word is.
+_PATTERNS = dict.fromkeys((b"File", b"output", b"dest", b"href"), rb"\s*=")
+_PATTERNS |= {b"file": rb"(?:\s*=|[\"'])", b"<!DOCTYPE": b""}
+_WORTH_PARSING = {word: re.compile(word + rest) for word, rest in _PATTERNS.items()}
+_MAX_BYTES = 10**9  # of a compressed file, unpacked
+_TAG = re.compile(rb"<[^\s/>]+")
+_ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """An attribute of an XML file that names another file.
+
+    Args:
+        tag: of the element.
+        attribute: of it.
+        value: the name, as it is there.
+        kind: whether SUMO reads or writes it.
+        offset: of the element in the file, in bytes.
+    """
+
+    tag: str
+    attribute: str
+    value: str
+    kind: Literal["read", "written"]
+    offset: int
+
+    def __str__(self) -> str:
+        """How it stands in the file."""
+        return f'<{self.tag} {self.attribute}="{self.value}">'
+
+
+def read_xml(path: Path) -> bytes:
+    """Return the content of a file as SUMO reads it: unpacked where it is compressed, whatever it is called.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+        if content.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as packed:
+                content = packed.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise EOFError("it has more than a gigabyte")
+    except (OSError, EOFError, zlib.error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ScenarioError(f"cannot be read: {reason}", fix="mend the file", where=str(path)) from None
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = re.sub(r"(<\?xml[^>]*?)\s+encoding\s*=\s*(\"[^\"]*\"|'[^']*')", r"\1", content.decode("utf-16"), count=1)
+        return text.encode()
+    return content
+
+
+def references(content: bytes, where: str) -> list[Reference]:
+    """Return what an XML file says about other files.
+
+    Raises:
+        ScenarioError: it is no valid XML.
+    """
+    if not any(word in content and pattern.search(content) for word, pattern in _WORTH_PARSING.items()):
+        return []
+    found: list[Reference] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        for name, value in attributes.items():
+            if (tag, name) in READ:
+                if value:
+                    found.append(Reference(tag, name, value, "read", parser.CurrentByteIndex))
+            elif name in WRITTEN and value not in _NOWHERE:
+                found.append(Reference(tag, name, value, "written", parser.CurrentByteIndex))
+        if tag == "param" and _is_written(attributes.get("key", "")) and attributes.get("value", "") not in _NOWHERE:
+            found.append(Reference(tag, "value", attributes["value"], "written", parser.CurrentByteIndex))
+
+    parser.StartElementHandler = start
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, ValueError) as error:
+        raise ScenarioError(f"not valid XML: {error}", fix="mend the file", where=where) from None
+    return found
+
+
+def _is_written(key: str) -> bool:
+    """Whether the parameter of a vehicle, a type or a traffic light is a file that SUMO writes."""
+    return key == "file" or (key.endswith(".file") and key != "device.fcd-replay.file")
+
+
+def rewritten(content: bytes, found: list[Reference], name: Callable[[Reference], str]) -> bytes:
+    """Return an XML file in which attributes name other files; all else stays as it is.
+
+    Args:
+        content: of the file.
+        found: what `references` has found in it.
+        name: what each is to name; what it does already changes nothing.
+    """
+    from xml.sax.saxutils import quoteattr  # which imports urllib and ssl
+
+    parts, end = [], 0
+    for reference in found:
+        value = name(reference)
+        place = _place(content, reference)
+        if value != reference.value and place is not None:
+            parts += [content[end : place[0]], quoteattr(value).encode("ascii", "xmlcharrefreplace")]
+            end = place[1]
+    return b"".join([*parts, content[end:]])
+
+
+def _place(content: bytes, reference: Reference) -> tuple[int, int] | None:
+    """Where the value of an attribute is, with its quotes; None for one that the document type gives by default."""
+    wanted = reference.attribute.encode()
+    match = _TAG.match(content, reference.offset)
+    while match is not None and (match := _ATTRIBUTE.match(content, match.end())) is not None:
+        if match[1] == wanted:
+            return match.span(2)
+    return None
+
+
+def movable(path: Path) -> bytes | None:
+    """Return the content of a file as it is right wherever its folder goes; None where it is so already.
+
+    Raises:
+        ScenarioError: it cannot be read.
+    """
+    content = read_xml(path)
+
+    def staged_name(reference: Reference) -> str:
+        is_absolute = reference.kind == "read" and reference.value.startswith("/")
+        return os.path.relpath(reference.value, path.parent) if is_absolute else reference.value
+
+    moved = rewritten(content, references(content, str(path)), staged_name)
+    return None if moved == content else moved
+
+
+def nested_files(folder: Path, names: tuple[str, ...], *, inside: bool = False) -> tuple[str, ...]:
+    """Return the files that some files have SUMO read, and those that these do, relative to the folder.
+
+    Args:
+        folder: of the scenario.
+        names: files in it.
+        inside: refuse what lies outside the folder, before it is looked at.
+
+    Raises:
+        ScenarioError: one does not exist.
+    """
+    found: dict[str, None] = {}
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop(0)
+        for nested in _named_by(folder, name):
+            if inside and nested.startswith(f"..{os.sep}"):
+                message, fix = f"names {nested!r}, outside the scenario's folder", "move it inside, to be archived"
+                raise ScenarioError(message, fix=fix, where=str(folder / name))
+            if nested not in found and nested not in names:
+                found[nested] = None
+                waiting.append(nested)
+    return tuple(found)
+
+
+def written_by(folder: Path, names: tuple[str, ...]) -> list[str]:
+    """Return what files would have SUMO write, in words; nothing where they would not."""
+    found = [
+        f"{name}: {reference}"
+        for name in dict.fromkeys((*names, *nested_files(folder, names)))
+        for reference in _before_it_is_filled_in(folder / name)
+        if reference.kind == "written"
+    ]
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return [f"{found[0]}{more} (nothing is written)"] if found else []
+
+
+def _named_by(folder: Path, name: str) -> list[str]:
+    path = folder / name
+    try:
+        stat = path.stat()
+    except OSError:
+        return []  # the check of the scenario reports it
+    return [os.path.relpath(target, folder) for target in _targets(path, stat.st_mtime_ns, stat.st_size)]
+
+
+def _before_it_is_filled_in(path: Path) -> list[Reference]:
+    content = read_xml(path)
+    try:
+        return references(content, str(path))
+    except ScenarioError:
+        if b"${" in content:  # an argument may be more than a value, so that only what it is filled into is XML
+            return []
+        raise
+
+
+@lru_cache(maxsize=256)
+def _targets(path: Path, _mtime_ns: int, _size: int) -> tuple[str, ...]:
+    targets = []
+    for reference in _before_it_is_filled_in(path):
+        if reference.kind == "written":
+            continue
+        # As SUMO does it: relative to the file that names it, and ${NAME} is no variable here.
+        target = os.path.normpath(path.parent / reference.value)
+        if not os.path.isfile(target):  # noqa: PTH113
+            fix = "name one file; an argument cannot choose it" if "${" in target else "mend the path"
+            raise ScenarioError(f"{reference}: there is no file {target!r}", fix=fix, where=str(path))
+        targets.append(target)
+    return tuple(targets)
+
+
+_NULL_DEVICE = "/dev/null"
 
 
 class StagedFiles:
     """The scenario's files, as one worker reads them.
 
     Every file is linked into a folder of the worker's own. One that says what SUMO is to write is copied there, and
-    writes nothing: nobody would find the files of a thousand trials, and two workers would write the same one. A route
+    writes nothing: the files of a thousand trials are of no use, and two workers would write the same one. A route
     or additional file that says ``${NAME}`` is filled in per trial.
 
     Args:
@@ -113,7 +353,7 @@ class StagedFiles:
 
         def name(reference: Reference) -> str:
             if reference.kind == "written":
-                return _NOWHERE
+                return _NULL_DEVICE
             if not reference.value.startswith("/"):
                 return reference.value
             return str(self._folder / os.path.relpath(reference.value, self._scenario.folder))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
 
 __all__ = [
     "ALWAYS",
@@ -13,12 +15,14 @@ __all__ = [
     "INPUTS",
     "RESERVED",
     "USUALLY",
+    "SumoSetup",
     "canonical",
     "is_output",
     "is_shown",
     "is_true",
     "writes",
 ]
+
 
 USUALLY = {"time-to-teleport": "-1"}  # otherwise a jam removes vehicles; a scenario may want just that
 """What SUMO gets where a scenario says nothing else."""
@@ -32,14 +36,14 @@ ALWAYS = {
     "no-step-log": "true",
     "duration-log.disable": "true",
     "xml-validation": "never",
-    # Devices write beside the working directory if nobody says where, which is the user's.
+    # Devices write to the user's working directory by default.
     "device.ssm.file": "/dev/null",
     "device.toc.file": "/dev/null",
 }
 """What every trial has, because it means something else with other values."""
 
 RESERVED = frozenset({*ALWAYS, "seed", "step-length", "net-file", "route-files", "additional-files"})
-RESERVED -= {"device.ssm.file", "device.toc.file"}  # left out like every other output
+RESERVED -= {"device.ssm.file", "device.toc.file"}  # disabled like every other output
 """The options that crashhunt sets itself."""
 
 INPUTS = frozenset({"weight-files", "device.fcd-replay.files", "astar.all-distances", "astar.landmark-distances"})
@@ -168,7 +172,7 @@ _WRITING = frozenset(
         "device.toc.file",
     ]
 )
-# How something is written or shown, and to whom; none of it changes what happens on the road.
+# Options of output and display; none of them changes the traffic.
 _SHOWN_NAMES = """
 write-license write-metadata precision human-readable-time verbose print-options help version no-warnings
 aggregate-warnings language xml-validation no-step-log remote-port num-clients configuration-file
@@ -217,10 +221,39 @@ def is_output(name: str) -> bool:
 
 
 def is_shown(name: str) -> bool:
-    """Whether an option is about what is printed, shown in a window, or told to a remote control."""
+    """Return whether an option concerns printing, a window, or a remote control."""
     return name in _SHOWN or name.startswith(_SHOWN_FAMILIES + _WINDOW_FAMILIES)
 
 
 def is_true(value: object) -> bool:
     """Whether SUMO reads the value of an option that is true or false as true."""
     return str(value).strip().lower() in ("1", "yes", "true", "on", "x", "t")
+
+
+# The table ``[sumo]``.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SumoSetup:
+    """``[sumo]``: files, relative to the scenario's folder, and further options of SUMO.
+
+    Args:
+        net: the network.
+        routes: route files.
+        additional: additional files.
+        options: further options of SUMO without their dashes, such as ``lateral-resolution``. Where there is no
+            ``time-to-teleport``, it is -1: no vehicle is removed, and a jam stays one. What they would have SUMO write
+            is not written.
+        native: whether the compiled core may be used; it changes no bit.
+        fix_link_order: whether SUMO processes the links of the network in the order of their construction.
+            Otherwise it uses the order of their memory addresses, which differs between processes.
+        literal: whether ``${NAME}`` in a route or additional file is left as it is, instead of being filled in.
+    """
+
+    net: str
+    routes: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
+    options: dict[str, bool | int | float | str] = field(default_factory=dict)
+    literal: bool | None = None
+    native: bool | None = None
+    fix_link_order: bool | None = None

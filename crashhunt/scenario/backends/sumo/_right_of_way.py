@@ -1,4 +1,4 @@
-"""Who has to give way to whom, as a network says it: the request matrix of each junction."""
+"""Right of way in a network: reads the request matrix of each junction."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario.backends.sumo._table import SumoSetup
-from crashhunt.scenario.backends.sumo._xml import read_xml
+from crashhunt.scenario.backends.sumo._files import read_xml
+from crashhunt.scenario.backends.sumo._options import SumoSetup
 from crashhunt.world import Link, RightOfWay
 
 if TYPE_CHECKING:

@@ -1,0 +1,11 @@
+from ._network import Network as Network
+from ._substep_loop import Onlooker as Onlooker, Unasked as Unasked
+from ._switch import (
+    Acceleration as Acceleration,
+    accelerate as accelerate,
+    switch_off as switch_off,
+    switch_on as switch_on,
+    why_not as why_not,
+)
+from ._vehicle_arrays import Frame as Frame
+from ._versions import kind_of as kind_of, reason_against as reason_against

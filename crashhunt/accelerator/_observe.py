@@ -1,0 +1,216 @@
+"""What an agent is shown: `KinematicObservation.observe` without data frames, and who is close by."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from typing import TYPE_CHECKING
+
+import numpy as np
+from highway_env import utils
+from highway_env.road.lane import AbstractLane, CircularLane, SineLane
+from highway_env.vehicle.kinematics import Vehicle
+
+from crashhunt.accelerator._vehicle_arrays import are_plain
+from crashhunt.accelerator._versions import are_numbers, kind_of
+
+if TYPE_CHECKING:
+    from highway_env.envs.common.observation import (
+        KinematicObservation,
+        KinematicsGoalObservation,
+        OccupancyGridObservation,
+    )
+    from highway_env.road.road import Road
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
+
+    from crashhunt.accelerator._network import Network
+    from crashhunt.accelerator._vehicle_arrays import Frame
+
+
+__all__ = ["close_objects", "fill_lanes", "observe", "observe_goal"]
+
+
+_KNOWN = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
+_OF_OBJECTS = _KNOWN - {"heading"}
+
+
+def close_objects(
+    frame: Frame,
+    vehicle: Vehicle,
+    distance: float,
+    count: int | None,
+    *,
+    see_behind: bool,
+    sort: bool,
+    vehicles_only: bool,
+) -> list[RoadObject] | None:
+    """`Road.close_objects_to`; None where that must be asked."""
+    lane = frame.network.number.get(id(vehicle.lane))
+    row = frame.row.get(id(vehicle))
+    kind = kind_of(type(vehicle))
+    if lane is None or row is None or not kind.collides or not kind.is_of(vehicle):
+        return None
+    road: Road = frame.road
+    total = len(road.vehicles) if vehicles_only else len(frame.things)
+    offset = frame.places[:total] - frame.places[row]
+    squared = offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1]
+    limit = -2 * vehicle.LENGTH
+    own = frame.coordinates(row, lane)[0]
+    found: list[tuple[float, int]] = []
+    for number in np.flatnonzero(squared <= (distance + 1e-3) ** 2).tolist():
+        if number == row or not np.linalg.norm(offset[number]) < distance:
+            continue
+        ahead = frame.coordinates(number, lane)[0] - own
+        if (number < len(road.vehicles) and see_behind) or limit < ahead:
+            found.append((abs(ahead), number))
+    if sort:
+        found.sort(key=lambda item: item[0])
+    if count:
+        found = found[:count]
+    return [frame.things[number] for _, number in found]
+
+
+def observe(kinematic: KinematicObservation, frame: Frame | None) -> NDArray[np.generic] | None:
+    """`KinematicObservation.observe`; None where that must be asked."""
+    env, vehicle, features = kinematic.env, kinematic.observer_vehicle, kinematic.features
+    if frame is None or not _are_known(features) or not _is_plain(vehicle, features):
+        return None
+    close = env.road.close_objects_to(
+        vehicle,
+        env.PERCEPTION_DISTANCE,
+        count=kinematic.vehicles_count - 1,
+        see_behind=kinematic.see_behind,
+        sort=kinematic.order == "sorted",
+        vehicles_only=not kinematic.include_obstacles,
+    )[-kinematic.vehicles_count + 1 :]
+    if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
+        return None
+    own = _values(vehicle)
+    rows = [own]
+    for thing in close:
+        values = _values(thing)
+        if not kinematic.absolute:
+            for name in ("x", "y", "vx", "vy"):
+                values[name] -= own[name]
+        rows.append(values)
+    shown = np.zeros((max(len(rows), kinematic.vehicles_count), len(features)))
+    for column, name in enumerate(features):
+        shown[: len(rows), column] = [values[name] for values in rows]
+    if kinematic.normalize:
+        _normalize(kinematic, shown, len(rows))
+    if kinematic.order == "shuffled":
+        env.np_random.shuffle(shown[1:])
+    return shown.astype(np.float32)
+
+
+def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:
+    """`KinematicsGoalObservation.observe`; None where that must be asked."""
+    vehicle, features = kinematic.observer_vehicle, kinematic.features
+    goal = getattr(vehicle, "goal", None)
+    if vehicle is None or goal is None or type(features) is not list or not _KNOWN.issuperset(features):
+        return None
+    things = [vehicle, goal]
+    if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
+        return None
+    if any(getattr(thing, "route", None) for thing in things):  # whose end is asked for, shown or not
+        return None
+    here, there = (np.array([values[name] for name in features]) for values in (_values(vehicle), _values(goal)))
+    scales = kinematic.scales
+    return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
+
+
+def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> None:
+    """`OccupancyGridObservation.fill_road_layer_by_lanes`, all points of a lane at once.
+
+    What lies so near to the border of a cell that rounding could decide is asked of highway-env.
+    """
+    observer = grid.observer_vehicle
+    spacing, low, cells = np.amin(grid.grid_step), grid.grid_size[:, 0], grid.grid.shape[-2:]
+    c, s = math.cos(observer.heading), math.sin(observer.heading)
+    for lane in network.lanes:
+        origin, _ = lane.local_coordinates(observer.position)
+        points = np.unique(np.arange(origin - reach, origin + reach, spacing).clip(0, lane.length))
+        offset = _along(lane, points) - observer.position
+        if grid.align_to_vehicle_axes:
+            offset = np.stack((offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s), axis=1)
+        place = (offset - low) / grid.grid_step
+        near = ((place > -1) & (place < np.array(cells) + 1)).all(axis=1)
+        sure = (np.abs(place - np.rint(place)) > 1e-6).all(axis=1)
+        found = np.floor(place[near & sure]).astype(int).tolist()
+        found += [grid.pos_to_index(lane.position(point, 0)) for point in points[near & ~sure]]
+        for first, second in found:
+            if 0 <= first < cells[0] and 0 <= second < cells[1]:
+                grid.grid[layer, first, second] = 1
+
+
+def _along(lane: AbstractLane, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places on the centre line, shape (points, 2); the last bits may differ from highway-env's."""
+    if isinstance(lane, CircularLane):
+        phi = lane.direction * points / lane.radius + lane.start_phase
+        found = lane.center + lane.radius * np.stack((np.cos(phi), np.sin(phi)), axis=1)
+    else:
+        found = lane.start + points[:, None] * lane.direction
+        if isinstance(lane, SineLane):
+            swing = lane.amplitude * np.sin(lane.pulsation * points + lane.phase)
+            found = found + swing[:, None] * lane.direction_lateral
+    places: NDArray[np.float64] = found
+    return places
+
+
+def _are_known(features: object) -> bool:
+    """Whether features are known, and each is asked for once: of the others, a data frame has more columns."""
+    return type(features) is list and _KNOWN.issuperset(features) and len(set(features)) == len(features)
+
+
+def _arrives(thing: RoadObject, network: Network) -> bool:
+    """Whether the end of its route is on the road: whoever describes a vehicle asks for it, shown or not."""
+    route = getattr(thing, "route", None)
+    if not route:
+        return True
+    try:
+        start, end, number = route[-1]
+        return (start, end, 0 if number is None else number) in network.index
+    except (LookupError, TypeError, ValueError):
+        return False
+
+
+def _is_plain(thing: RoadObject, features: list[str]) -> bool:
+    kind = kind_of(type(thing))
+    if not kind.describes or not kind.is_of(thing) or not are_numbers((thing.heading, thing.speed)):
+        return False
+    return isinstance(thing, Vehicle) or _OF_OBJECTS.issuperset(features)
+
+
+def _values(thing: RoadObject) -> dict[str, float]:
+    """The part of `to_dict` that is asked for."""
+    x, y = thing.position.tolist()
+    c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))
+    vx, vy = (float(thing.speed) * c, float(thing.speed) * s) if isinstance(thing, Vehicle) else (0.0, 0.0)
+    return {
+        "presence": 1.0,
+        "x": x,
+        "y": y,
+        "vx": vx,
+        "vy": vy,
+        "heading": float(thing.heading),
+        "cos_h": c,
+        "sin_h": s,
+    }
+
+
+def _normalize(kinematic: KinematicObservation, shown: NDArray[np.float64], rows: int) -> None:
+    if not kinematic.features_range:
+        side = kinematic.env.road.network.all_side_lanes(kinematic.observer_vehicle.lane_index)
+        width = AbstractLane.DEFAULT_WIDTH * len(side)
+        kinematic.features_range = {
+            "x": [-5.0 * Vehicle.MAX_SPEED, 5.0 * Vehicle.MAX_SPEED],
+            "y": [-width, width],
+            "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+            "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
+        }
+    for name, limits in kinematic.features_range.items():
+        if name in kinematic.features:
+            column = kinematic.features.index(name)
+            scaled = utils.lmap(shown[:rows, column], [limits[0], limits[1]], [-1, 1])
+            shown[:rows, column] = np.clip(scaled, -1, 1) if kinematic.clip else scaled

@@ -1,0 +1,419 @@
+"""What the accelerator knows: versions of highway-env by their source, and classes by their methods."""
+
+from __future__ import annotations
+
+import builtins
+import hashlib
+import inspect
+import logging
+import re
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import highway_env
+import numpy as np
+from highway_env import utils
+from highway_env.envs.common import abstract, observation
+from highway_env.road import lane, regulation, road
+from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
+
+from crashhunt.scenario.backends.highway import ACCELERATED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from types import ModuleType
+
+
+__all__ = [
+    "MODULES",
+    "NUMBERS_OF",
+    "Kind",
+    "Own",
+    "Watch",
+    "are_numbers",
+    "is_genuine",
+    "is_plain",
+    "kind_of",
+    "kinds_of",
+    "left_alone",
+    "originals",
+    "reason_against",
+]
+
+
+# Whether highway-env's functions are still its own: a user's module may replace them at any time.
+
+MODULES = (utils, lane, regulation, road, behavior, controller, dynamics, kinematics, objects)
+"""In which everything matters to the accelerator; of `observation`, a few classes do."""
+
+_NUMPY = (
+    "abs", "arange", "arccos", "arcsin", "arctan", "arctan2", "argmin", "array", "array_equal", "clip", "concatenate",
+    "cos", "diff", "dot", "linalg", "max", "min", "power", "sign", "sin", "sqrt", "sum", "tan", "tile", "vstack",
+    "zeros",
+)  # fmt: skip
+
+
+class Watch:
+    """Notices whatever is replaced, added or removed, but for numbers: these are read where they are used.
+
+    Looking costs about ten microseconds, so that it can be done in every sub-step.
+
+    Args:
+        places: namespaces by how messages name them.
+        but: members that do not matter, as ``Class.name``.
+    """
+
+    def __init__(self, places: Iterable[tuple[str, Mapping[str, object]]], but: Iterable[str] = ()) -> None:
+        skipped = frozenset(but)
+        self._places: list[_Place] = [_Place(name, space, skipped) for name, space in places]
+        self._told = ""
+
+    @classmethod
+    def of_roads(cls, but: Iterable[str]) -> Watch:
+        """Watch all that roads, lanes and vehicles are made of, and what of NumPy they use."""
+        places = [(module.__name__, vars(module)) for module in MODULES]
+        for module in MODULES:
+            places += _classes(module)
+        numpy = {name: getattr(np, name) for name in _NUMPY}
+        watch = cls(places, but)
+        watch._places.append(_Place("numpy", vars(np), frozenset(), tuple(numpy)))
+        watch._places.append(_Place("numpy.linalg", vars(np.linalg), frozenset(), ("norm",)))
+        return watch
+
+    @classmethod
+    def of_observations(cls, but: Iterable[str]) -> Watch:
+        """Watch what the observations that are sped up are made of."""
+        kinds = ("", "Kinematic", "KinematicsGoal", "OccupancyGrid", "Exit", "MultiAgent")
+        wanted = ("ObservationType", *[f"{kind}Observation" for kind in kinds])
+        places = [(name, space) for name, space in _classes(observation) if name in wanted]
+        return cls([(observation.__name__, vars(observation)), *places], but)
+
+    @property
+    def intact(self) -> bool:
+        """Whether all is as it was; where it is not, that is logged once."""
+        for place in self._places:
+            if len(place.space) != place.size or not place.same():
+                changed = place.changed()
+                if changed:
+                    if changed != self._told:
+                        self._told = changed
+                        message = "the accelerator steps aside: %s has been replaced"
+                        logging.getLogger("crashhunt").warning(message, changed)
+                    return False
+        return True
+
+    @property
+    def reason(self) -> str:
+        """What has been replaced; empty where all is as it was."""
+        return f"{self._told} has been replaced" if not self.intact else ""
+
+
+class _Place:
+    """One namespace."""
+
+    def __init__(
+        self, name: str, space: Mapping[str, object], but: frozenset[str], names: tuple[str, ...] | None = None
+    ) -> None:
+        self.name = name
+        self.space = space
+        self.size = len(space)
+        if names is None:
+            names = tuple(
+                key
+                for key, value in space.items()
+                if f"{name}.{key}" not in but and not _special(key) and not is_plain(value)
+            )
+            self._seen = frozenset(space)
+            self._but = frozenset(key for key in space if f"{name}.{key}" in but)
+        else:  # of a namespace that is large and others' business, only these
+            self._seen = self._but = frozenset(space)
+        self._names = names
+        self._get: Callable[[Mapping[str, object]], tuple[object, ...]] = _getter(names)
+        self._values = self._get(space)
+
+    def same(self) -> bool:
+        try:
+            # Tuples compare what is not the very same by its own `==`: nobody's function is equal to another.
+            return self._get(self.space) == self._values
+        except Exception:
+            return False
+
+    def changed(self) -> str:
+        """The first name that matters and is not what it was."""
+        missing = object()
+        for name, value in zip(self._names, self._values, strict=True):
+            if self.space.get(name, missing) is not value:
+                return f"{self.name}.{name}"
+        if self._but is not self._seen:
+            for name in self.space.keys() - self._seen - self._but:
+                # A name that is new may be in the way of one further up, or of one that Python has.
+                if not is_plain(self.space[name]) or hasattr(builtins, name) or _is_method(self.name, name):
+                    return f"{self.name}.{name}"
+        self.size = len(self.space)
+        return ""
+
+
+def is_plain(value: object) -> bool:
+    """Whether a member of a class is a mere value: no function, property or other thing with a life of its own."""
+    return not callable(value) and not hasattr(type(value), "__get__") and not inspect.ismodule(value)
+
+
+def _special(name: str) -> bool:
+    return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
+
+
+def _getter(names: tuple[str, ...]) -> Callable[[Mapping[str, object]], tuple[object, ...]]:
+    if len(names) > 1:
+        return itemgetter(*names)
+    return lambda space: tuple([space[name] for name in names])
+
+
+def _classes(module: ModuleType) -> list[tuple[str, Mapping[str, object]]]:
+    found = [value for value in vars(module).values() if isinstance(value, type)]
+    return [(kind.__qualname__, vars(kind)) for kind in found if kind.__module__ == module.__name__]
+
+
+def _is_method(owner: str, name: str) -> bool:
+    """Whether a class has a method of that name further up, which a value would hide."""
+    kinds = [kind for module in (*MODULES, observation) for key, kind in vars(module).items() if key == owner]
+    return any(not is_plain(inspect.getattr_static(base, name)) for kind in kinds if isinstance(kind, type)
+               for base in kind.__mro__[1:] if name in vars(base))  # fmt: skip
+
+
+_MODULES = (*MODULES, observation)
+
+_COLLIDES = ("handle_collisions", "_is_colliding", "polygon", "direction", "velocity", "lane_distance_to", "on_road")
+_MOVES = ("step", "clip_actions", "on_state_update")
+_DRIVES: tuple[str, ...] = ("act", "follow_road", "steering_control", "speed_control", "acceleration", "desired_gap")
+_DRIVES += ("change_lane_policy", "mobil")
+_SLIDES = ("state", "derivative_func")
+_PREDICTS = ("predict_trajectory_constant_speed",)
+_DESCRIBES = ("to_dict", "destination", "destination_direction", "lane_offset")
+_SPECIAL = (
+    "__bool__", "__len__", "__eq__", "__ne__", "__lt__", "__hash__", "__getattribute__", "__getattr__", "__setattr__",
+    "__delattr__", "__copy__", "__deepcopy__", "__reduce__", "__reduce_ex__", "__getstate__", "__setstate__",
+    "__class__", "__array__", "__float__", "__iter__", "__getitem__", "__contains__", "__add__", "__radd__",
+)  # fmt: skip
+"""A class with one of these of its own may do anything wherever highway-env touches it."""
+_VALUES = (
+    "road", "position", "heading", "speed", "lane_index", "lane", "collidable", "solid", "check_collisions", "diagonal",
+    "crashed", "hit", "impact", "prediction_type", "action", "history", "target_lane_index", "target_speed", "route",
+    "timer", "enable_lane_change", "speed_index", "target_speeds", "is_yielding", "yield_timer", "color", "log",
+)  # fmt: skip
+"""What vehicles have, each its own: values, and read as often as is convenient."""
+_BASES = {
+    behavior.IDMVehicle: "idm",
+    controller.MDPVehicle: "controlled",
+    controller.ControlledVehicle: "controlled",
+    dynamics.BicycleVehicle: "nothing",
+    kinematics.Vehicle: "nothing",
+    objects.Obstacle: "",
+    objects.Landmark: "",
+    objects.RoadObject: "",
+}
+_OUTLINE: tuple[str, ...] = ("LENGTH", "WIDTH")
+_LIMITED = (*_OUTLINE, "MAX_SPEED", "MIN_SPEED")
+_STEERED = (*_LIMITED, "TAU_PURSUIT", "KP_LATERAL", "KP_HEADING", "MAX_STEERING_ANGLE", "KP_A")
+_THINKING = (*_STEERED, "COMFORT_ACC_MAX", "COMFORT_ACC_MIN", "DISTANCE_WANTED", "TIME_WANTED", "ACC_MAX", "POLITENESS")
+_THINKING += ("LANE_CHANGE_DELAY", "LANE_CHANGE_MIN_ACC_GAIN", "LANE_CHANGE_MAX_BRAKING_IMPOSED")
+NUMBERS_OF = {"": _OUTLINE, "nothing": _LIMITED, "controlled": _STEERED, "idm": _THINKING}
+"""The numbers that classes have for all of their vehicles, as long as none has its own, by how they decide."""
+_METHODS = frozenset((*_COLLIDES, *_MOVES, *_SLIDES, *_DRIVES, *_PREDICTS, *_DESCRIBES))
+_ORIGINALS = {
+    (owner, name): inspect.getattr_static(owner, name, None) for owner in _BASES for name in (*_METHODS, *_SPECIAL)
+}
+_OWN = frozenset(module.__name__ for module in MODULES) | {"abc", "builtins"}
+
+originals: dict[str, Callable[..., Any]] = {}
+"""The methods of highway-env that are replaced, by class and name, as they were; nothing before the first time."""
+
+
+class Own:
+    """What a class of somebody's has instead of what its base in highway-env has.
+
+    Args:
+        kind: the class.
+        base: in highway-env.
+        values: names that have to be mere values.
+    """
+
+    def __init__(self, kind: type, base: type, values: Iterable[str]) -> None:
+        self._kind, self._base = kind, base
+        self._mro = kind.__mro__
+        # Everything that a user can have changed since: highway-env's own classes are watched elsewhere.
+        self._members = [(vars(part), tuple(vars(part).items())) for part in self._mro if part.__module__ not in _OWN]
+        values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
+        self.names = [name for name in _SPECIAL if self.has(name)]
+        self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._of(name))]
+        self.plain = type(kind) is type(base) and not self.names
+
+    def has(self, name: str) -> bool:
+        """Whether it has another member of that name than its base."""
+        return self._of(name) is not inspect.getattr_static(self._base, name, None)
+
+    def _of(self, name: str) -> object:
+        return inspect.getattr_static(self._kind, name, None)
+
+    @property
+    def current(self) -> bool:
+        """Whether the class is still what it was."""
+        return self._kind.__mro__ is self._mro and all(
+            len(space) == len(seen)
+            and all(a is b and v is w for (a, v), (b, w) in zip(space.items(), seen, strict=True))
+            for space, seen in self._members
+        )
+
+
+class Kind:
+    """What is known about a class of vehicles or objects: what it leaves as its base in highway-env has it.
+
+    Args:
+        kind: the class.
+
+    Attributes:
+        plain: whether what it is made of is mere values, wherever they are read.
+        collides: whether it collides as that does.
+        moves: whether it moves so.
+        slides: whether it moves by the dynamic model, which nobody does at once for many.
+        times: whether it counts the time since it last thought of changing lanes.
+        drives: how it decides: ``idm``, ``controlled``, ``nothing``; empty where that is not known.
+        predicts: whether where it will be is foreseen so.
+        describes: whether it describes itself so.
+        base: how its base in highway-env decides.
+        methods: all names that an object must not have of its own.
+        fixed: these, and those of the numbers that its objects share, if none of them has its own.
+    """
+
+    def __init__(self, kind: type) -> None:
+        base = next((base for base in kind.__mro__ if base in _BASES), None)
+        self.own = Own(kind, base or kind, _VALUES)
+        self.plain = base is not None and self.own.plain
+
+        def leaves(names: tuple[str, ...]) -> bool:
+            return self.plain and all(
+                inspect.getattr_static(kind, name, None) is _ORIGINALS[base, name] for name in names
+            )
+
+        moving = issubclass(kind, kinematics.Vehicle)
+        self.collides = leaves(_COLLIDES)
+        self.slides = base is dynamics.BicycleVehicle
+        self.moves = moving and self.collides and leaves((*_MOVES, *(_SLIDES if self.slides else ())))
+        self.times = base is behavior.IDMVehicle
+        self.drives = _BASES[base] if base is not None and self.collides and leaves(_DRIVES) else ""
+        self.predicts = self.moves and leaves((*_PREDICTS, *_DRIVES))
+        self.describes = self.collides and leaves(_DESCRIBES)
+        self.base = _BASES[base] if base is not None else ""
+        self.methods = frozenset(name for name in dir(kind) if not is_plain(inspect.getattr_static(kind, name, None)))
+        self.fixed = self.methods | frozenset(NUMBERS_OF[self.base])
+        if moving and not (self.moves and self.drives):
+            own = self.own.names + [
+                name for name in sorted(_METHODS)
+                if base is not None and inspect.getattr_static(kind, name, None) is not _ORIGINALS[base, name]
+            ]  # fmt: skip
+            name = f"{kind.__module__}.{kind.__qualname__}"
+            if left_alone.get(name) != own:
+                left_alone[name] = own
+                logging.getLogger("crashhunt").info("not accelerated: %s has its own %s", name, ", ".join(own))
+
+    def is_of(self, thing: object) -> bool:
+        """Whether an object has no method of its own instead of its class's."""
+        return self.methods.isdisjoint(vars(thing))
+
+
+left_alone: dict[str, list[str]] = {}
+"""The classes that have been met and are not sped up, or not wholly, with what they have of their own."""
+
+
+def kind_of(kind: type) -> Kind:
+    """Return what is known about a class, as it is now."""
+    found = _kinds.get(kind)
+    if found is None or not found.own.current:
+        found = _kinds[kind] = Kind(kind)
+    return found
+
+
+def kinds_of(things: Iterable[object]) -> list[Kind]:
+    """Return what is known about the class of each object."""
+    types = list(map(type, things))
+    known = {kind: kind_of(kind) for kind in set(types)}
+    return list(map(known.__getitem__, types))
+
+
+_kinds: dict[type, Kind] = {}
+
+
+def are_numbers(values: Iterable[object]) -> bool:
+    """Whether arithmetic on all of these is that of Python's and NumPy's usual numbers."""
+    return _NUMBERS.issuperset(map(type, values))
+
+
+_NUMBERS = frozenset((float, int, np.float64))
+
+
+def reason_against() -> str:
+    """Say why the accelerator must not be used in this process; empty where it may."""
+    version = highway_env.__version__
+    if version not in ACCELERATED:
+        return f"highway-env {version} is not known to it; it knows {', '.join(ACCELERATED)}"
+    digest = hashlib.blake2b(digest_size=8)
+    for module in (*_MODULES, abstract):  # of the last one, a single function is replaced
+        digest.update(Path(str(module.__file__)).read_bytes())
+    if digest.hexdigest() != ACCELERATED[version]:
+        return f"the installed highway-env {version} is not the published one"
+    for name, function in _functions():
+        place = getattr(getattr(function, "__code__", None), "co_filename", "something else")
+        if place not in _FILES:
+            return f"{name} has been replaced by {place}"
+        if function.__qualname__ != name:  # such as another method of its own
+            return f"{name} has been replaced by {function.__qualname__}"
+    if not hasattr(np, "vecdot"):
+        return f"it needs NumPy 2.0, and {np.__version__} is installed"
+    if not _arrays_equal_scalars():
+        return "NumPy's functions give other results for arrays than for single numbers on this processor"
+    return ""
+
+
+_FILES = {str(module.__file__) for module in (*_MODULES, abstract)}
+
+
+def is_genuine(name: str, function: Callable[..., object]) -> bool:
+    """Whether a function is the one that highway-env's source has by this name, such as ``Class.method``."""
+    found = inspect.unwrap(function)
+    return getattr(getattr(found, "__code__", None), "co_filename", "") in _FILES and found.__qualname__ == name
+
+
+def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
+    """All functions and methods that the sources of the modules define, by name, as they are now."""
+    for module in _MODULES:
+        source = Path(str(module.__file__)).read_text(encoding="utf-8")
+        for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE):
+            owner = getattr(module, name)
+            members = vars(owner).items() if kind == "class" else [("", owner)]
+            for member, found in members:
+                function = getattr(found, "fget", None) or getattr(found, "__func__", found)
+                if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
+                    yield f"{name}.{member}".rstrip("."), inspect.unwrap(function)
+
+
+def _arrays_equal_scalars() -> bool:
+    """Whether the functions that are used on arrays give the very numbers that highway-env gets one at a time."""
+    rng = np.random.default_rng(0)
+    values, others = rng.normal(size=203) * 10.0 ** rng.integers(-6, 3, 203).astype(float), rng.uniform(3.5, 4.5, 203)
+    inside = np.clip(values, -1.0, 1.0)
+    for function in (np.cos, np.sin, np.tan, np.arctan, np.arcsin):
+        if function(inside).tolist() != [function(value) for value in inside.tolist()]:
+            return False
+        if function is not np.arcsin and function(values).tolist() != [function(value) for value in values.tolist()]:
+            return False
+    if ((values + np.pi) % (2 * np.pi)).tolist() != [float((value + np.pi) % (2 * np.pi)) for value in values.tolist()]:
+        return False
+    bases = np.abs(values)
+    powers = [np.power(base, exponent) for base, exponent in zip(bases.tolist(), others.tolist(), strict=True)]
+    if np.power(bases, others).tolist() != powers:
+        return False
+    if np.power(values, 2).tolist() != [np.power(value, 2) for value in values.tolist()]:
+        return False
+    pairs, against = rng.normal(size=(203, 2)), rng.normal(size=(203, 2))
+    products = [float(np.dot(one, two)) for one, two in zip(pairs, against, strict=True)]
+    return bool(np.vecdot(pairs, against).tolist() == products)

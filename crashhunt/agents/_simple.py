@@ -1,0 +1,121 @@
+"""The simplest agent: one speed, never another lane."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from crashhunt.agents._protocol import meta_actions
+from crashhunt.trial import Argument, Range
+
+if TYPE_CHECKING:
+    from gymnasium import Space
+
+
+__all__ = ["KeepLaneWithSpeed", "RandomAgent", "Recorded"]
+
+
+class KeepLaneWithSpeed:
+    """Keeps its lane at a constant speed, whatever is in front of it.
+
+    Args:
+        speed: in m/s.
+        action_space: of the vehicle; with discrete meta-actions it answers IDLE, FASTER or SLOWER.
+
+    Raises:
+        ValueError: it has other actions.
+    """
+
+    def __init__(
+        self,
+        speed: Annotated[
+            float, Argument("speed", distribution=Range(5.0, 30.0), unit="m/s", help="held for ever")
+        ] = 15.0,
+        action_space: Space[object] | None = None,
+    ) -> None:
+        self.speed = speed
+        self._meta = meta_actions(action_space)
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Any) -> object:
+        """Return (speed, 0), or the meta-action that brings the speed nearer."""
+        if self._meta is None:
+            return self.speed, 0
+        error = self.speed - float(observation[0, 3])
+        return self._meta["FASTER" if error > 2.5 else "SLOWER" if error < -2.5 else "IDLE"]
+
+
+# An agent that acts at random.
+
+
+class RandomAgent:
+    """Draws an action from the action space and holds it for a while.
+
+    Args:
+        hold_steps: for how many steps it holds each action.
+        action_space: of the vehicle.
+    """
+
+    def __init__(
+        self,
+        action_space: Space[object],
+        hold_steps: Annotated[int, Argument("hold_steps", unit="steps", help="before it draws again")] = 10,
+    ) -> None:
+        if hold_steps < 1:
+            raise ValueError(f"hold_steps must be at least 1, not {hold_steps}")
+        self._space = action_space
+        self._hold = hold_steps
+        self._left = 0
+        self._action: object = None
+
+    def reset(self, seed: int) -> None:
+        """Seed the space."""
+        self._space.seed(seed)
+        self._left = 0
+
+    def act(self, observation: object) -> object:
+        """Return the action that is held."""
+        if self._left == 0:
+            self._left = self._hold
+            self._action = self._space.sample()
+        self._left -= 1
+        return self._action
+
+
+# An agent that plays the actions of a log.
+
+
+class Recorded:
+    """Plays the recorded actions of one agent, one a step.
+
+    Args:
+        log: the path of a ``log.mcap``.
+        agent: whose actions.
+    """
+
+    def __init__(
+        self,
+        log: Annotated[str, Argument("log", help="path of a log.mcap")],
+        agent: Annotated[str, Argument("agent", help="whose actions")] = "ego",
+    ) -> None:
+        from crashhunt.recording import read_log
+
+        self._actions = read_log(Path(log)).actions(agent)
+        self._next = 0
+
+    def reset(self, seed: int) -> None:
+        """Begin at the first action."""
+        self._next = 0
+
+    def act(self, observation: object) -> object:
+        """Return the next action.
+
+        Raises:
+            IndexError: the log is exhausted; it never drives on silently.
+        """
+        if self._next >= len(self._actions):
+            raise IndexError(f"the log has {len(self._actions)} actions, and the episode asks for one more")
+        self._next += 1
+        return self._actions[self._next - 1]

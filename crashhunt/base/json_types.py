@@ -1,0 +1,45 @@
+"""The types of plain data of unknown shape: everything that a JSON file may hold.
+
+Data of a known shape have a `TypedDict` in the module that writes them, so the type checker finds misspelt keys.
+At run time all of them are dicts: nothing is converted or checked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TypeAlias, TypedDict, final
+
+__all__ = ["ErrorData", "ErrorWords", "Json", "Plain", "finite", "finite_values"]
+
+
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+"""What `json.loads` returns."""
+
+Plain: TypeAlias = Mapping[str, object]
+"""An object that is only looked through or written: any `TypedDict` is one."""
+
+
+class ErrorWords(TypedDict):
+    """What an error says."""
+
+    message: str
+    fix: str
+    where: str
+
+
+@final
+class ErrorData(TypedDict):
+    """The shape that every command prints under ``--json``."""
+
+    error: ErrorWords
+
+
+def finite(value: float) -> float | None:
+    """Return a number for JSON, which has no infinity and no NaN: null instead."""
+    return value if math.isfinite(value) else None
+
+
+def finite_values(data: Plain) -> dict[str, object]:
+    """Return plain data with null instead of what is not a finite number."""
+    return {name: finite(value) if isinstance(value, float) else value for name, value in data.items()}

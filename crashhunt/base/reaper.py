@@ -1,0 +1,186 @@
+"""The keeper of a process: ends the process and all its descendants when it is done or its owner has ended.
+
+``python -P …/reaper.py LIFELINE MODULE ARGUMENT…`` calls ``main()`` of a module in a child. The lifeline is one end of
+a pipe, and the owner holds the other end. The kernel closes that end whenever the owner dies, even before the keeper
+has started. The keeper is run by its path and imports almost nothing: the crashhunt that the child imports comes from
+a snapshot, which may be older than this file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import runpy
+import select
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
+from typing import IO, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+__all__ = ["Kept"]
+
+_PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+_LOOK_EVERY_S = 0.02  # where the kernel does not notify when a child ends
+_RESUME_EVERY_S = 1.0  # one check takes 20 µs
+_END_S = 5.0  # for the keeper to end all processes
+
+
+class Kept:
+    """A Python module that runs in a separate process with a keeper.
+
+    Args:
+        module: its ``main()`` is called.
+        arguments: command-line arguments of the module.
+        environment: environment variables of the process.
+        inherited: file descriptors that the process receives.
+        apart: whether the process has a session of its own, without signals of this terminal and group.
+        stdin: as for `subprocess.Popen`.
+        stdout: the same.
+        stderr: the same.
+
+    Raises:
+        OSError: the system has no more processes or files.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        arguments: Sequence[str] = (),
+        *,
+        environment: Mapping[str, str],
+        inherited: Sequence[int] = (),
+        apart: bool = True,
+        stdin: int | IO[bytes] | None = None,
+        stdout: int | IO[bytes] | None = None,
+        stderr: int | IO[bytes] | None = None,
+    ) -> None:
+        theirs, self._lifeline = os.pipe()
+        # While Python starts, SIGINT would end the reaper with 1, as if its child had failed. The mask is inherited.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", __file__, str(theirs), module, *arguments],
+                stdin=stdin,
+                stdout=stdout,
+                stderr=stderr,
+                env=environment,
+                pass_fds=(theirs, *inherited),
+                start_new_session=apart,
+            )
+        except BaseException:
+            os.close(self._lifeline)
+            raise
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            os.close(theirs)
+
+    def end(self) -> None:
+        """Kill the process and everything below it; return when no process is left."""
+        if self._lifeline >= 0:
+            os.close(self._lifeline)
+            self._lifeline = -1
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def _main() -> None:
+    lifeline, module, *arguments = sys.argv[1:]
+    processes = _import_sibling("processes")
+    processes.adopt_orphans()
+    keeper = os.getpid()
+    child = os.fork()
+    if child == 0:
+        os.close(int(lifeline))
+        processes.die_with(keeper)
+        sys.argv = [module, *arguments]
+        # A signal of the terminal ends the imports, and prints no traceback of them.
+        interrupted = signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _PASSED_ON)
+        found = _imported(module)
+        signal.signal(signal.SIGINT, interrupted)
+        if "main" in vars(found):
+            found.main()
+        else:  # the debugger of older versions
+            del sys.modules[module]
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        return
+    for number in _PASSED_ON:  # the child, or the owner, handles signals that are sent to the whole group
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _PASSED_ON)
+    status = _wait(child, int(lifeline), processes.resume)
+    processes.end_descendants()
+    _leave(status)
+
+
+def _imported(name: str) -> ModuleType:
+    """Import a module of a snapshot."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != "pebble":
+            raise
+    # Snapshots of before the first release import pebble, which their pools need and no replay calls.
+    sys.modules["pebble"] = stand_in = ModuleType("pebble")
+    stand_in.ProcessPool = stand_in.ProcessExpired = type("NotInstalled", (Exception,), {})  # type: ignore[attr-defined]
+    return importlib.import_module(name)
+
+
+def _import_sibling(name: str) -> ModuleType:
+    """Import a module of this folder by its file, even where another package of that name is importable."""
+    spec = importlib.util.spec_from_file_location(f"_crashhunt_{name}", Path(__file__).with_name(f"{name}.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | None:
+    """Wait until the child has ended or the owner has closed the lifeline; return the child's status, else None.
+
+    A child that is stopped alone, for example by an agent, is resumed. A batch system stops the keeper as well, so
+    the whole job stays suspended.
+    """
+    ended = None
+    with suppress(AttributeError, OSError):  # an old kernel, or not Linux
+        ended = os.pidfd_open(child)
+    while True:
+        ready, _, _ = select.select([lifeline, *([ended] if ended is not None else [])], [], [],
+                                    _RESUME_EVERY_S if ended is not None else _LOOK_EVERY_S)  # fmt: skip
+        if lifeline in ready:
+            return None
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            return status
+        if not ready:
+            resume(child)
+
+
+def _leave(status: int | None) -> None:
+    """Exit as the child has exited, so that the owner sees the same status as without a keeper."""
+    if status is None:
+        os._exit(1)
+    code = os.waitstatus_to_exitcode(status)
+    if code < 0:
+        import resource
+
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the child's, where there is one, is enough
+        if -code not in (signal.SIGKILL, signal.SIGSTOP):
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code & 0xFF)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,80 @@
+"""Resource limits of this process (``ulimit``): which one an error came from, and how to raise it."""
+
+from __future__ import annotations
+
+import errno
+import resource
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+__all__ = ["FREE", "free_memory", "limit_behind"]
+
+
+_MEBIBYTE = 1 << 20
+_NO_MEMORY = ("can't start new thread", "failed to map segment", "cannot allocate memory", "unable to allocate")
+
+
+def limit_behind(error: BaseException) -> str:
+    """Return the limit that an error came from and how to raise it, in words; empty where no limit is set.
+
+    A limit on memory (``RLIMIT_AS``) shows as one of many errors: of Python, of a thread or of a library that does not
+    load. A limit on the size of files (``RLIMIT_FSIZE``) is an `OSError`, since Python ignores its signal.
+    """
+    if _is_no_memory(error) and (limit := _soft_limit(resource.RLIMIT_AS)) is not None:
+        return f"the limit on memory is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -v"
+    if (
+        isinstance(error, OSError)
+        and error.errno == errno.EFBIG
+        and (limit := _soft_limit(resource.RLIMIT_FSIZE)) is not None
+    ):
+        return f"the limit on the size of a file is {limit / _MEBIBYTE:.4g} MiB: raise it with ulimit -f"
+    return ""
+
+
+def _is_no_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    try:
+        said = str(error).lower()
+    except BaseException:  # of a class that cannot even say its message
+        return False
+    return isinstance(error, ImportError | RuntimeError | OSError) and any(words in said for words in _NO_MEMORY)
+
+
+def _soft_limit(which: int) -> int | None:
+    soft, _ = resource.getrlimit(which)
+    return None if soft == resource.RLIM_INFINITY else soft
+
+
+# How much of the memory is free.
+
+FREE: Final = 0.25
+"""The share of the memory that must be free before another suspended fork is kept."""
+_LINES = 30  # what is looked for stands further up
+
+
+def free_memory(root: Path = Path("/")) -> float:
+    """Return the share of the memory that is free or can be reclaimed at once; 1 where the system does not report it.
+
+    Args:
+        root: where the kernel's own files are.
+    """
+    with suppress(OSError, ValueError, KeyError, ZeroDivisionError):
+        found = _numbers(root / "proc" / "meminfo")
+        free = found["MemAvailable"] / found["MemTotal"]
+        with suppress(OSError, ValueError):  # of a container
+            group = root / "sys" / "fs" / "cgroup"
+            most = int((group / "memory.max").read_text(encoding="ascii"))
+            used = int((group / "memory.current").read_text(encoding="ascii"))
+            with suppress(OSError, ValueError, KeyError):  # files that were read or written once are in there, too
+                used -= min(used, _numbers(group / "memory.stat")["inactive_file"])
+            free = min(free, 1 - used / most)
+        return free
+    return 1.0
+
+
+def _numbers(path: Path) -> dict[str, int]:
+    """What each of the first lines has after its name."""
+    lines = path.read_text(encoding="ascii").splitlines()[:_LINES]
+    return {name.rstrip(":"): int(number) for name, number, *_ in map(str.split, lines)}

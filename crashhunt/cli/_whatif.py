@@ -1,0 +1,130 @@
+"""``crashhunt whatif``."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import UsageError
+from crashhunt.cli._common import (
+    DONE,
+    INTERRUPTED,
+    add_crash,
+    add_json,
+    add_trust,
+    integer,
+    number,
+    opened_crash,
+    pairs,
+    run_trusted,
+    say,
+    shown_progress,
+)
+
+if TYPE_CHECKING:
+    import argparse
+
+    from crashhunt.cli._common import Commands
+    from crashhunt.whatif import Counts
+
+__all__ = ["add_whatif"]
+
+
+def add_whatif(commands: Commands) -> None:
+    """Add the command."""
+    whatif = commands.add_parser(
+        "whatif",
+        help="run a saved crash again with a change, many times, and count how often it crashes",
+        description="Run the trial of a crash again with other arguments, with another agent from a step on, or with "
+        "other random numbers from a step on, and count the outcomes. Each run starts at step 0. Where the change "
+        "begins at a step, a run counts only if it is bit-identical to the recording up to this step.",
+    )
+    add_crash(whatif)
+    whatif.add_argument(
+        "--set", metavar="NAME=VALUE", action="append", default=[], dest="sets",
+        help="another value for an argument, as of replay; with --from-step or --before, for the agent from then on",
+    )  # fmt: skip
+    moment = whatif.add_mutually_exclusive_group()
+    moment.add_argument(
+        "--from-step", metavar="K", type=integer, help="the first K steps stay as recorded, and the change follows"
+    )
+    moment.add_argument(
+        "--before", metavar="SECONDS", type=number, help="the same, so long before the crash, in simulation time"
+    )
+    whatif.add_argument(
+        "--agent", metavar="MODULE:NAME", default="",
+        help="an agent that takes over after step K: up to K the recorded actions are played, then it is reset and is "
+        "shown its first observation; ID=MODULE:NAME for one of several vehicles; without --from-step, after step 0",
+    )  # fmt: skip
+    whatif.add_argument(
+        "--arg", metavar="NAME=VALUE", action="append", default=[], help="an argument of that agent; may be repeated"
+    )
+    whatif.add_argument(
+        "--futures", action="store_true",
+        help="give the simulator's random generators another seed after step K, a different one in each run",
+    )  # fmt: skip
+    whatif.add_argument(
+        "--overrule", metavar="HOW", choices=("brake", "left", "right", "keep_lane", "keep_speed"), default="",
+        help="from step K on, have the vehicle brake, change lanes and brake, or keep its lane or its speed",
+    )  # fmt: skip
+    whatif.add_argument("--leave-out", metavar="ID,…", default="", help="actors that do not take part, from the start")
+    whatif.add_argument(
+        "--code", choices=("snapshot", "current"), default=None,
+        help="drive with the code of the snapshot or with today's; default: current with --agent, else snapshot. With "
+        "--code current and a step, today's code takes over after it",
+    )  # fmt: skip
+    whatif.add_argument(
+        "--times", metavar="N", type=integer, default=0, help="how many runs; default: 50 with --futures, else 1"
+    )
+    whatif.add_argument("--parallel", metavar="N", type=integer, default=0, help="at a time; default: one per core")
+    whatif.add_argument(
+        "--for", metavar="TIME", default="", dest="time", help="stop after this time and count the runs that ended"
+    )
+    add_trust(whatif)
+    add_json(whatif)
+    whatif.set_defaults(command=_whatif)
+
+
+def _whatif(options: argparse.Namespace, _words: list[str]) -> int:
+    from crashhunt.base.signals import stop_requests
+    from crashhunt.plans import seconds_of
+
+    for name, value in (("times", options.times), ("parallel", options.parallel)):
+        if value < 0:
+            raise UsageError(f"--{name} is {value}", fix="give at least 1")
+    try:
+        time_s = seconds_of(options.time)
+    except ValueError:
+        raise UsageError(f"--for is {options.time!r}", fix="give a time above 0, such as 90s, 1m or 1h30m") from None
+    sets, arguments = pairs(options.sets, "--set"), pairs(options.arg, "--arg")
+    from crashhunt.whatif import WhatIfOptions, interventions_of, what_if
+
+    with opened_crash(options.directory, options.crash) as (bundle, archive), stop_requests() as stops:
+        asked = interventions_of(
+            bundle, changes=sets, from_step=options.from_step, before_s=options.before, agent=options.agent,
+            arguments=arguments, futures=options.futures, overrule=options.overrule,
+            leave_out=tuple(filter(None, options.leave_out.split(","))), code=options.code,
+        )  # fmt: skip
+
+        def run(trusted: bool | None) -> Counts:
+            with shown_progress(f"running {bundle.id}", as_json=options.json) as watch:
+                return what_if(
+                    bundle,
+                    asked,
+                    WhatIfOptions(
+                        code=options.code or ("current" if options.agent else "snapshot"),
+                        times=options.times,
+                        parallel=options.parallel or len(os.sched_getaffinity(0)),
+                        time_s=time_s,
+                        trusted=trusted,
+                        watch=watch,
+                        stopped=lambda: bool(stops),
+                    ),
+                )
+
+        counts = run_trusted(run, bundle, archive, options)
+    say("\n".join(counts.lines()), as_json=options.json)
+    if options.json:
+        print(json.dumps(counts.to_json()))
+    return INTERRUPTED if stops else DONE

@@ -1,0 +1,373 @@
+"""Whose fault a collision was: what rules with names and sources say, or that nobody can tell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from crashhunt.base import layout
+from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.crashes._lanes import SAME_WAY, Case, LaneMap
+from crashhunt.snapshots import Snapshot
+from crashhunt.trial import Outcome
+from crashhunt.world import is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.world import RightOfWay
+
+
+__all__ = ["RULES", "Blame", "Fault", "Finding", "Verdict", "fault_in", "fault_of", "safe_gap_m"]
+
+
+# The rules by which a collision is somebody's fault. A rule is right, or it is silent.
+#
+# A rule looks at a `Case` and returns a finding, or None where it has nothing to say. Names of sources: *Vienna* is the
+# Convention on Road Traffic of 1968; *StVO* the German traffic code; *RSS* is S. Shalev-Shwartz, S. Shammah and
+# A. Shashua, On a formal model of safe and scalable self-driving cars, 2017, with parameters like ad-rss-lib's.
+
+Blame = Literal["ego", "other", "both"]
+
+_RESPONSE_S = 1.0  # RSS: until somebody reacts
+_SPEEDS_UP = 3.5  # m/s², RSS: at most, until then
+_BRAKES = 4.0  # m/s², RSS: at least, from then on
+_BRAKES_HARD = 8.0  # m/s², RSS: at most, who is ahead
+_MERGES = math.radians(30)  # who meets at a smaller angle follows, or changes lanes
+_IMPOSSIBLE = 10.0  # m/s²; who stops faster has not braked
+_FOLLOWS_S = 3.5  # who has been ahead for so long has not just come there
+_CHANGE_S = 3.0  # a lane change that began longer ago is over
+_AT_ONCE_S = 1.5  # nobody who drives behind can do anything about what comes so late
+_TOGETHER_S = 0.5  # of each other: neither was there first
+_STANDS = 0.1  # m/s
+_STANDS_S = 1.0
+_STEP_M = 1.0  # beside a car; who is nearer walks in its way
+_OFF_M = 2.5  # beside the middle of a car; who is nearer may be on the road
+_WALKS = 3.0  # m/s; whoever drives so slowly can stop for anybody
+_CLEARS_S = 3.0
+_RED_S = 8.0  # after a red light, a junction is left by then
+_EARLY_S = 1.0  # what crashes so soon was put there
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a rule says.
+
+    Args:
+        rule: its name.
+        blames: whom.
+        words: the evidence, a clause.
+        source: where the rule is from.
+    """
+
+    rule: str
+    blames: Blame
+    words: str
+    source: str
+
+
+def safe_gap_m(speed: float, ahead: float) -> float:
+    """Return the gap to who is ahead that RSS calls safe, in m; speeds in m/s (RSS, lemma 2)."""
+    then = speed + _RESPONSE_S * _SPEEDS_UP
+    driven = speed * _RESPONSE_S + _SPEEDS_UP * _RESPONSE_S**2 / 2
+    return float(max(0.0, driven + then * then / (2 * _BRAKES) - ahead * ahead / (2 * _BRAKES_HARD)))
+
+
+def _who(case: Case, actor: str) -> Blame:
+    return "ego" if actor == case.agent else "other"
+
+
+def _red_light(case: Case) -> Finding | None:
+    """Who ran a red light and meets somebody from another side, at the same junction; both, where both ran one."""
+    if case.same_way:
+        return None
+    ran: dict[str, str] = {}
+    for time_s, event in case.events:
+        if event.kind != "red_light" or event.agent not in (case.agent, case.other) or case.time_s - time_s > _RED_S:
+            continue
+        if not case.is_past(event, time_s):
+            ran[event.agent] = f"{event.what}, {case.time_s - time_s:.1f} s before"
+    if not ran:
+        return None
+    blames = "both" if len(ran) == 2 else _who(case, *ran)
+    return Finding("red light", blames, ", and ".join(ran.values()), "Vienna, article 23; StVO § 37")
+
+
+def _wrong_way(case: Case) -> Finding | None:
+    """Who drove against the direction of its lane."""
+    for time_s, event in reversed(case.events):
+        if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
+            return Finding("wrong way", _who(case, event.agent), event.what, "Vienna, article 10; StVO § 2")
+    return None
+
+
+def _lane_change(case: Case) -> Finding | None:
+    """Who changed lanes into a gap that was taken, or too short for who came behind."""
+    if not case.lanes or not case.same_way:
+        return None
+    changed = {actor: case.changed_s(actor) for actor in (case.agent, case.other)}
+    changers = [actor for actor, before in changed.items() if before is not None and before <= _CHANGE_S]
+    source = "Vienna, articles 11 and 14; StVO § 7 (5)"
+    if len(changers) == 2:
+        times = [before for before in changed.values() if before is not None]
+        at_once = abs(times[0] - times[1]) <= _TOGETHER_S
+        if case.follower or not at_once or not all(case.meets_sideways(actor) for actor in changers):
+            return None  # the one may have been there when the other came
+        return Finding("lane change", "both", "both moved sideways into each other", source)
+    if len(changers) != 1:
+        return None
+    changer = changers[0]
+    other, before = case.partner(changer), changed[changer]
+    assert before is not None
+    if case.drifted(other) or case.turned(before) > SAME_WAY:
+        return None  # in a bend or a roundabout, lanes lead apart and together
+    if not case.follower:
+        if not case.meets_sideways(changer):
+            return None
+        words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
+        return Finding("lane change", _who(case, changer), words, source)
+    if case.follower == changer:
+        if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
+            return None
+        if case.turn >= _MERGES or not case.was_beside(changer, int(np.argmin(np.abs(case.times - before)))):
+            return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
+        words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
+        return Finding("lane change", _who(case, changer), words, source)
+    return _cut_in(case, changer, before, source)
+
+
+def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | None:
+    """Who came in front of somebody, by how much, and what that one could do."""
+    other = case.partner(changer)
+    back = int(np.argmin(np.abs(case.times - before)))
+    if not case.was_beside(changer, back):
+        return None  # it was ahead, and left
+    gap = case.gap_m(changer, back)
+    safe = safe_gap_m(float(case.way(other).speeds[back]), float(case.way(changer).speeds[back]))
+    words = f"{changer} changed lanes {before:.1f} s before, {max(0.0, gap):.1f} m ahead of {other}"
+    if gap >= safe:
+        return None
+    if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _BRAKES:
+        return None  # who drove behind had the time, and did not use it
+    return Finding("lane change", _who(case, changer), f"{words}; {safe:.1f} m would have been safe (RSS)", source)
+
+
+def _rear_end(case: Case) -> Finding | None:
+    """Who drove into the back of somebody who had been ahead for long."""
+    follower = case.follower
+    if not follower or is_person(case.partner(follower)):
+        return None
+    leader = case.partner(follower)
+    ahead_s = case.in_its_way_s(leader)
+    if ahead_s < _FOLLOWS_S or case.hardest_braking(leader) > _IMPOSSIBLE:
+        return None
+    lead, follow = case.way(leader), case.way(follower)
+    if lead.speeds[-1] < -_STANDS:
+        return None  # it reversed
+    back = int(np.argmin(np.abs(case.times - min(ahead_s, _FOLLOWS_S))))
+    gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
+    words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
+    words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
+    return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
+
+
+def _turns_off(case: Case) -> Finding | None:
+    """Who drove straight on into the back of somebody who had been ahead for long, and was turning off."""
+    if _rear_end(case) is not None:
+        return None  # it says the same
+    for leader in (case.agent, case.other):
+        follower = case.partner(leader)
+        if case.follower == leader or is_person(leader) or is_person(follower) or case.times[0] < _FOLLOWS_S:
+            continue
+        left_s = case.turns_off_s(leader)
+        if left_s is None or left_s > _AT_ONCE_S:
+            continue
+        lead = case.way(leader)
+        if case.hardest_braking(leader) > _IMPOSSIBLE or float(lead.speeds.min()) < -_STANDS:
+            continue
+        words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
+        words += " and was turning off"
+        return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1)")
+    return None
+
+
+def _steps_out(case: Case) -> Finding | None:
+    """A person who came onto the road so late that nobody could have stopped; not at junctions and their crossings."""
+    person, driver = (case.agent, case.other) if is_person(case.agent) else (case.other, case.agent)
+    if not is_person(person) or is_person(driver) or not case.is_between_junctions(person, driver):
+        return None
+    asides = [abs(case.aside_m(person, back)) for back in range(len(case.before))]
+    way, reach = case.way(driver), case.way(driver).width / 2 + _STEP_M
+    inside = next((back for back in range(len(asides) - 1, -1, -1) if asides[back] > reach), -1) + 1
+    if not 0 < inside < len(asides) or max(asides[:inside]) < _OFF_M or case.times[inside] > _AT_ONCE_S:
+        return None  # it was there all the time, walked along the edge of the road, or is beside still
+    speed, gap = float(way.speeds[inside]), case.gap_m(person, inside)
+    stops = speed * _RESPONSE_S + speed * speed / (2 * _BRAKES_HARD)
+    if gap >= stops or speed < _WALKS or float(np.max(case.times[:inside], initial=0.0)) < _STANDS_S:
+        return None
+    words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
+    words += f", which needs {stops:.1f} m to stop"
+    return Finding("steps out", _who(case, person), words, "Vienna, article 20 (6); StVO § 25 (3)")
+
+
+def _standing(case: Case) -> Finding | None:
+    """Who drove into somebody who had stood for longer than stopping takes."""
+    for actor in (case.agent, case.other):
+        mover = case.partner(actor)
+        own, its = case.way(actor), case.way(mover)
+        speed = float(its.speeds[0])
+        needs = max(_STANDS_S, _RESPONSE_S + speed / _BRAKES)
+        stood = case.times[0] if bool((own.speeds < _STANDS).all()) else 0.0
+        if stood >= needs and bool((its.speeds > _STANDS).all()) and not is_person(mover):
+            words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
+            return Finding("standing", _who(case, mover), words, "Vienna, article 13 (1); StVO § 3 (1)")
+    return None
+
+
+def _right_of_way(case: Case) -> Finding | None:
+    """Who had to give way, as the map says it, where no traffic light decides."""
+    rights = case.right_of_way
+    if rights is None or case.turn < _MERGES or not case.before:
+        return None
+    places = {actor: case.links(actor) for actor in (case.agent, case.other)}
+    if not all(places.values()):
+        return None
+    links = [rights.links[place] for found in places.values() for place in found]
+    if len({link.junction for link in links}) != 1 or any(link.signalised for link in links):
+        return None
+    pairs = [(one, two) for one in places[case.agent] for two in places[case.other]]
+    gives = {(pair in rights.gives_way, pair[::-1] in rights.gives_way) for pair in pairs}
+    if gives not in ({(True, False)}, {(False, True)}):
+        return None  # both, neither, or it depends on where they were going
+    yields, goes = (case.agent, case.other) if gives == {(True, False)} else (case.other, case.agent)
+    if float(case.way(goes).speeds.min()) < _STANDS or case.drifted(yields) or case.drifted(goes):
+        return None  # who had stood in the junction may have been let through
+    if float(case.way(yields).speeds[case.times <= _CLEARS_S].max(initial=0.0)) < _STANDS:
+        return None  # who has stood there for so long could be seen
+    if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
+        return None  # who starts off while somebody is in the junction has to let it out
+    words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
+    return Finding("right of way", _who(case, yields), words, "the map of the scenario; Vienna, article 18; StVO § 8")
+
+
+RULES: tuple[Callable[[Case], Finding | None], ...] = (
+    _red_light, _wrong_way, _lane_change, _rear_end, _turns_off, _steps_out, _standing, _right_of_way,
+)  # fmt: skip
+"""All rules. Where two of them blame different parties, nobody can tell, but that a red light and the wrong way come
+before the right of way."""
+
+
+Verdict = Literal["ego", "the other", "both", "nobody can tell"]
+_VERDICTS: dict[str, Verdict] = {"ego": "ego", "other": "the other", "both": "both"}
+_FIRST = ("red light", "wrong way")
+_EVENTS_S = 10.0  # before the crash
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Whose fault a crash was.
+
+    Args:
+        verdict: ``ego`` is the controlled vehicle that it happened to.
+        findings: of the rules that said something; they may contradict each other where nobody can tell.
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def is_egos(self) -> bool:
+        """Whether it was the agent's fault, or both's."""
+        return self.verdict in ("ego", "both")
+
+    def to_json(self) -> JsonObject:
+        """Return plain data."""
+        return {
+            "verdict": self.verdict,
+            "findings": [
+                {"rule": one.rule, "blames": _VERDICTS[one.blames], "words": one.words, "source": one.source}
+                for one in self.findings
+            ],
+        }
+
+
+def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
+    """Return whose fault a crash was; no code of the bundle is run.
+
+    Args:
+        bundle: the crash.
+        recording: of it, where it has been read already.
+
+    Raises:
+        BundleError: its log is missing or damaged.
+    """
+    result = bundle.result
+    hit = result.collision
+    if result.outcome is Outcome.AGENT_ERROR:
+        words = "the code of the agent failed"
+        return Fault("ego", (Finding("agent error", "ego", words, "whoever drives answers for it"),))
+    if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
+        words = "it left the road, and nobody touched it"
+        return Fault("ego", (Finding("off the road", "ego", words, "Vienna, article 13 (1); StVO § 3 (1)"),))
+    if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
+        return Fault("nobody can tell")
+    from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
+
+    found = recording or bundle.recording()
+    scenes = found.scenes()
+    if not scenes or not all(name in scenes[-1].roster.index for name in (hit.agent, hit.other)):
+        return Fault("nobody can tell")
+    end_s = scenes[-1].time_s
+    events = tuple(
+        (step.scene.time_s, event)
+        for step in found.all_steps
+        if step.scene is not None and step.scene.time_s >= end_s - _EVENTS_S
+        for event in step.scene.events
+    )
+    lanes = LaneMap(read_lanes(bundle.path / layout.LOG), (hit.x, hit.y))
+    time_s = hit.time_s if end_s - found.prologue.step_length_s <= hit.time_s <= end_s else end_s
+    return fault_in(
+        Case(
+            hit.agent,
+            hit.other,
+            scenes,
+            time_s,
+            scenes[0].time_s,
+            lanes,
+            events,
+            _right_of_way_of(bundle),
+            lane=hit.lane,
+        )
+    )
+
+
+def fault_in(case: Case) -> Fault:
+    """Return what the rules say of a collision."""
+    if case.time_s - case.began_s < 1.0 or len(case.before) < 2:
+        return Fault("nobody can tell")  # it was put there
+    findings = tuple(finding for rule in RULES if (finding := rule(case)) is not None)
+    return Fault(_verdict(findings), findings)
+
+
+def _verdict(findings: Iterable[Finding]) -> Verdict:
+    found = list(findings)
+    first = [one for one in found if one.rule in _FIRST]
+    if first:
+        found = [one for one in found if one.rule != "right of way"]
+    blamed = {one.blames for one in found}
+    return _VERDICTS[blamed.pop()] if len(blamed) == 1 else "nobody can tell"
+
+
+def _right_of_way_of(bundle: Bundle) -> RightOfWay | None:
+    try:
+        scenario = Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot).scenario()
+        ask = scenario.backend.right_of_way
+        return ask(scenario) if ask is not None else None
+    except (BundleError, CrashhuntError, OSError):
+        return None

@@ -1,0 +1,206 @@
+"""The signature of a crash: what makes two crashes the same one."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
+from crashhunt.crashes import Encounter
+from crashhunt.crashes._lanes import LaneMap
+from crashhunt.world import is_person
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.recording import Recording
+    from crashhunt.trial import Collision, Failure, TrialResult
+
+
+__all__ = ["Frame", "Signature", "own_frames", "signature_of", "signature_of_fault"]
+
+
+# Where in somebody's code a software fault was: the calls of a traceback, or of a stack that was written down.
+
+_CALLERS = (
+    ("crashhunt", "episode", "_fast_path.py"),
+    ("crashhunt", "episode", "_episode.py"),
+    ("crashhunt", "episode", "_ahead.py"),  # crashes that were saved by earlier versions name their files
+    ("crashhunt", "episode.py"),
+)
+_FRAME = re.compile(r'^\s*File "(?P<file>[^"]+)", line (?P<line>\d+),? in (?P<function>\S+)', re.MULTILINE)
+_LIBRARIES = re.compile(r"(site|dist)-packages|python3\.\d+")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A call.
+
+    Args:
+        file: in which it is.
+        line: of it, from 1.
+        function: in which it is.
+    """
+
+    file: PurePath
+    line: int
+    function: str
+
+
+def own_frames(failure: Failure) -> list[Frame]:
+    """Return the calls that are the agent's own, the innermost first; those of libraries where it has none there."""
+    frames = _frames(failure.traceback) or _frames(failure.last_output)
+    ours = [
+        number
+        for number, frame in enumerate(frames)
+        if any(frame.file.parts[-len(one) :] == one for one in _CALLERS)
+    ]  # fmt: skip
+    inner = frames[: min(ours)] if ours else frames  # what the episode has called
+    return [frame for frame in inner if not _is_of_a_library(frame.file)] or inner
+
+
+def _frames(text: str) -> list[Frame]:
+    """Each call, the innermost first."""
+    found = [Frame(PurePath(match["file"]), int(match["line"]), match["function"]) for match in _FRAME.finditer(text)]
+    # A stuck or dead process has written its stack that way already, an exception the other way.
+    return found if "most recent call first" in text else found[::-1]
+
+
+def _is_of_a_library(file: PurePath) -> bool:
+    return any(_LIBRARIES.fullmatch(part) for part in file.parts)
+
+
+_BEFORE_S = 3.0  # a lane change that began longer ago is over
+_CHANGES = {
+    "agent": "while the agent changes lanes",
+    "other": "while the other changes lanes",
+    "both": "while both change lanes",
+}
+_FRAMES = 3  # of a stack, the innermost ones
+_NUMBERS = re.compile(r"0x[0-9a-fA-F]+|-?\d+(\.\d+)?")
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Signature(Serializable):
+    """What makes two crashes the same one. No speeds, ids and times: they differ from trial to trial.
+
+    Args:
+        outcome: how the trial ended.
+        role: the agent's: ``collider``, ``victim``, ``alone``; empty where it is no collision.
+        manner: ``rear end``, ``side swipe``, ``crossing from the left`` (that is where the other one came from),
+            ``crossing from the right``, ``head-on``, ``pedestrian``, ``off road``; what kind of event; the exception,
+            signal or exit code of a software fault.
+        lane_change: who was changing lanes: ``agent``, ``other``, ``both`` or empty.
+        place: ``crossing`` where lanes of different directions lie over each other, ``road`` elsewhere; empty where
+            the map is not known, or it is no matter of place.
+        where: of a software fault, the innermost functions of the agent's, or what is said where there are none.
+        disturbed: whether disturbances took place before it; in undisturbed traffic it is another crash.
+    """
+
+    outcome: str
+    role: str = ""
+    manner: str = ""
+    lane_change: str = ""
+    place: str = ""
+    where: str = ""
+    disturbed: bool = False
+
+    def __str__(self) -> str:
+        words = self.manner or self.outcome
+        words += {"collider": ", the agent into the other", "victim": ", the other into the agent"}.get(self.role, "")
+        words += f", {_CHANGES[self.lane_change]}" if self.lane_change else ""
+        words += ", where lanes cross" if self.place == "crossing" else ""
+        words += f" in {self.where}" if self.where else ""
+        return f"{words}, disturbed" if self.disturbed else words
+
+
+def signature_of(bundle: Bundle, recording: Recording | None = None) -> Signature:
+    """Return the signature of a crash; no code of the bundle is run.
+
+    Args:
+        bundle: the crash.
+        recording: of it, where it has been read already.
+
+    Raises:
+        BundleError: its log is missing or damaged.
+    """
+    result = bundle.result
+    hit = result.collision
+    if hit is None:
+        found = signature_of_fault(result)
+    else:
+        from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults
+
+        found = _of_a_collision(result, hit, recording or bundle.recording(), read_lanes(bundle.path / layout.LOG))
+    return replace(found, disturbed=result.disturbed)
+
+
+def _of_a_collision(
+    result: TrialResult,
+    hit: Collision,
+    recording: Recording,
+    borders: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]],
+) -> Signature:
+    scenes = recording.scenes()
+    first = scenes[-1].time_s - _BEFORE_S
+    scenes = [scene for scene in scenes if scene.time_s >= first]
+    lanes = LaneMap(borders, (hit.x, hit.y))
+    place = ("crossing" if lanes.cross((hit.x, hit.y)) else "road") if lanes else ""
+    outcome = str(result.outcome)
+    if not hit.other:
+        return Signature(outcome, hit.role, "off road", place=place)
+    changes = [lanes.leaves_sideways(scenes, actor) for actor in (hit.agent, hit.other)]
+    manner = _manner(recording, hit)
+    if manner in ("side swipe", "rear end") and not any(changes):  # they touched before half a lane had been crossed
+        late = [scene for scene in scenes if scene.time_s >= scenes[-1].time_s - _BEFORE_S / 2]
+        changes = [
+            lanes.reaches_over(scenes, actor) or lanes.reaches_over(late, actor) for actor in (hit.agent, hit.other)
+        ]
+    lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
+    return Signature(outcome, hit.role, manner, lane_change, place)
+
+
+def _manner(recording: Recording, hit: Collision) -> str:
+    if is_person(hit.other):
+        return "pedestrian"
+    encounter = Encounter(recording, hit.agent, hit.other)
+    last = encounter.moments[-1].step if encounter.moments else -1
+    position = encounter.position(last)
+    manner = encounter.manner(last)
+    if position is None or manner is None:
+        return ""
+    if position.faces == "other":
+        return "head-on"
+    if position.faces == "same":
+        return "rear end" if position.place in ("ahead", "behind") else "side swipe"
+    return manner
+
+
+def signature_of_fault(result: TrialResult) -> Signature:
+    """Return the signature of a crash that is no collision, from what its trial came to; disturbances do not count."""
+    outcome, failure, event = str(result.outcome), result.failure, result.event
+    if event is not None:
+        return Signature(outcome, manner=event.kind)
+    if failure is None:
+        return Signature(outcome)
+    return Signature(outcome, manner=_kind(failure), where=_where(failure))
+
+
+def _kind(failure: Failure) -> str:
+    """The exception's type; of a process that died, of what."""
+    return f"{failure.kind} {failure.exit_code}" if failure.exit_code is not None else failure.kind
+
+
+def _where(failure: Failure) -> str:
+    """The innermost functions that are the agent's own, or what was said, without its numbers."""
+    chosen = own_frames(failure)
+    if chosen:
+        return " < ".join(f"{frame.file.name}:{frame.function}" for frame in chosen[:_FRAMES])
+    return _NUMBERS.sub("#", failure.message)

@@ -1,0 +1,144 @@
+"""Crashes that are the same one, over one hunt or many, and their order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import BundleError
+from crashhunt.crashes import judgement_of
+from crashhunt.crashes._fault import fault_of
+from crashhunt.crashes._signature import Signature, signature_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
+    from crashhunt.crashes._fault import Verdict
+
+
+__all__ = ["Group", "Groups", "group_crashes", "groups_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Crashes with one signature.
+
+    Args:
+        signature: of all of them.
+        bundles: in the order in which they were given; at least one.
+        faults: whose fault each was; empty where that was not asked.
+        dropped: how many more there were, whose bundles were given up.
+    """
+
+    signature: Signature
+    bundles: tuple[Bundle, ...]
+    faults: tuple[Verdict, ...] = ()
+    dropped: int = 0
+
+    @property
+    def count(self) -> int:
+        """How many crashes there were."""
+        return len(self.bundles) + self.dropped
+
+    @property
+    def fault(self) -> str:
+        """Whose fault they were: one of `Verdict`, or ``mixed``; empty where that was not asked."""
+        said = set(self.faults)
+        return "mixed" if len(said) > 1 else next(iter(said), "")
+
+    @property
+    def avoidable(self) -> bool | None:
+        """Whether runs have avoided all of them, or none; None where that differs, or is not known of all."""
+        said = {_avoidable(bundle) for bundle in self.bundles}
+        return said.pop() if len(said) == 1 else None
+
+    @property
+    def first(self) -> Bundle:
+        """The one that was found first, by its trial's number; over several hunts, in the first of them."""
+        return self.bundles[0]
+
+    @property
+    def shortest(self) -> Bundle:
+        """The one with the fewest steps, and of several the first."""
+        return min(self.bundles, key=lambda bundle: bundle.result.steps)
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``crashes --json`` prints; crashes are given by their paths."""
+        return {
+            "words": str(self.signature),
+            "signature": self.signature.to_json(),
+            "count": self.count,
+            "outcome": self.signature.outcome,
+            "manner": self.signature.manner,
+            "fault": self.fault,
+            "avoidable": self.avoidable,
+            "first": str(self.first.path),
+            "shortest": str(self.shortest.path),
+            "members": [str(bundle.path) for bundle in self.bundles],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """What came of grouping crashes.
+
+    Args:
+        groups: the largest first.
+        left_out: why a crash belongs to none: its log is missing or damaged.
+    """
+
+    groups: tuple[Group, ...]
+    left_out: tuple[str, ...] = ()
+
+
+def group_crashes(bundles: Iterable[Bundle], dropped: Mapping[str, int] | None = None) -> Groups:
+    """Group crashes by their signatures.
+
+    Args:
+        bundles: of one hunt or several; the log of each is read.
+        dropped: of each kind, in words, how many more there were.
+    """
+    signed, left_out = [], []
+    faults: dict[Path, Verdict] = {}
+    for bundle in bundles:
+        try:
+            recording = bundle.recording() if bundle.result.collision is not None else None
+            signed.append((signature_of(bundle, recording), bundle))
+            faults[bundle.path] = fault_of(bundle, recording).verdict
+        except BundleError as error:
+            left_out.append(str(error))
+    groups = (
+        replace(group, faults=tuple(faults[bundle.path] for bundle in group.bundles))
+        for group in groups_of(signed, dropped)
+    )
+    return Groups(tuple(groups), tuple(left_out))
+
+
+def _avoidable(bundle: Bundle) -> bool | None:
+    """What was run of one: by `judge`, or by the hunt that found it."""
+    judgement, escape = judgement_of(bundle), bundle.result.escape
+    if judgement is not None and judgement.avoidable is not None:
+        return judgement.avoidable
+    return True if escape is not None and escape.step is not None else None
+
+
+def groups_of(
+    signed: Iterable[tuple[Signature, Bundle]], dropped: Mapping[str, int] | None = None
+) -> tuple[Group, ...]:
+    """Return the groups of crashes whose signatures are known, the largest first.
+
+    Args:
+        signed: the crashes.
+        dropped: of each kind, in words, how many more there were.
+    """
+    found: dict[Signature, list[Bundle]] = {}
+    for signature, bundle in signed:
+        found.setdefault(signature, []).append(bundle)
+    more = dropped or {}
+    groups = [
+        Group(signature, tuple(members), dropped=more.get(str(signature), 0)) for signature, members in found.items()
+    ]
+    return tuple(sorted(groups, key=lambda group: (-group.count, group.signature)))

@@ -1,0 +1,304 @@
+"""Lets the disturbances of a trial take place: it stands between the agents and the simulator.
+
+A vehicle errs from the step in which its disturbance begins; who is meant is found out just before. What an agent sees
+late or wrongly in a step is what it is shown in that step, and is recorded so; what it does late is recorded when it
+decides.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.simulators import HasMeanings, HoldsBack, NamesObservations, SupportsDisturbances
+from crashhunt.trial import HELD, OF_AGENT, Disturbance, in_effect, steps_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from crashhunt.simulators import ActionForm, ActiveDisturbance, Observations, Simulator, StepResult
+    from crashhunt.trial import TrialResult, TrialSpec
+
+    Array = NDArray[Any]
+
+
+__all__ = ["DisturbanceInjector"]
+
+
+_NOISE = 0x6E6F6973  # apart from what else is drawn of a trial's seed
+_EXACT = ("presence", "kind", "heading", "cos_h", "sin_h")  # columns that noise leaves alone: they are no distances
+
+
+class _Filter(Protocol):
+    """What becomes of what an agent is shown, or answers, in each step of its disturbance."""
+
+    def __call__(self, array: Array) -> Array: ...
+
+
+@dataclass(slots=True)
+class _Going:
+    """A disturbance that is going on.
+
+    Args:
+        last: the last step in which it does.
+        vehicle: who errs; the agent, where it is its own eyes or hands.
+        what: the kind.
+        errs: the vehicle's; None of the agent's own.
+        filters: what the agent is shown or does; None of a vehicle.
+    """
+
+    last: int
+    vehicle: str
+    what: str
+    errs: ActiveDisturbance | None = None
+    filters: _Filter | None = None
+
+
+class DisturbanceInjector:
+    """Takes a simulator's steps, with the disturbances of a trial.
+
+    Args:
+        spec: of the trial.
+        simulator: which has been reset.
+        tells: called with each disturbance as it takes place; whoever adds to this list is told.
+
+    Raises:
+        InvalidEpisodeError: the simulator cannot do one of the kinds.
+    """
+
+    def __init__(self, spec: TrialSpec, simulator: Simulator, tells: Sequence[Callable[[Disturbance], None]]) -> None:
+        self._seed = spec.seed
+        self._simulator = simulator
+        self._tells = tells
+        self._dt = simulator.step_length_s
+        self._traffic = simulator if supports(simulator, SupportsDisturbances) else None
+        self._holding = simulator if supports(simulator, HoldsBack) else None
+        known = tuple(self._traffic.disturbing_kinds) if self._traffic is not None else ()
+        able = (*known, *OF_AGENT, *(HELD if self._holding is not None else ()))
+        odd = next((one.what for one in spec.disturbances if one.what not in able), None)
+        if odd is not None:
+            raise InvalidEpisodeError(
+                f"the simulator cannot do the disturbance {odd!r}", fix=f"it can do {', '.join((*known, *OF_AGENT))}"
+            )
+        # Of each sort, those that are still to come, the next one last.
+        waiting = sorted(spec.disturbances, key=lambda one: one.step, reverse=True)
+        self._traffic_waits = [one for one in waiting if one.what not in OF_AGENT]
+        self._agent_waits = [one for one in waiting if one.what in OF_AGENT]
+        self._going: list[_Going] = []
+        self._told: list[Disturbance] = []
+        self._step = 0
+        self._next = 0  # the next step in which anything begins, goes on or ends
+        self._before: Mapping[str, Array] = {}
+
+    def add(self, disturbance: Disturbance) -> None:
+        """Plan one more; not before the step after the next."""
+        waits = self._agent_waits if disturbance.what in OF_AGENT else self._traffic_waits
+        waits.append(disturbance)
+        waits.sort(key=lambda one: (one.agent, one.what))  # as a specification has those of one step
+        waits.sort(key=lambda one: one.step, reverse=True)
+
+    def replan(self, disturbances: Sequence[Disturbance]) -> None:
+        """Plan others in place of those that were planned for after the next step."""
+        for waits in (self._traffic_waits, self._agent_waits):
+            waits[:] = [one for one in waits if one.step <= self._step + 1]
+        for one in disturbances:
+            self.add(one)
+
+    def took_place(self, planned: Disturbance) -> bool:
+        """Whether somebody was there for a disturbance that has begun."""
+        return any(
+            one.vehicle and (one.step, one.agent, one.what) == (planned.step, planned.agent, planned.what)
+            for one in self._told
+        )
+
+    def first(self, observations: Observations) -> Observations:
+        """Return what agents are shown in the first step."""
+        return self._shown(observations)
+
+    def step(self, actions: Mapping[str, Array]) -> StepResult:
+        """Take the simulator's next step, with whatever goes on in it."""
+        self._step = step = self._step + 1
+        if not self._going and not self._is_due(step):
+            self._before = actions
+            return self._simulator.step(actions)
+        self._end_before(step)
+        for going in self._going:
+            if going.errs is not None:
+                going.errs.keep()
+        while self._traffic_waits and self._traffic_waits[-1].step <= step:
+            self._begin(self._traffic_waits.pop())
+        given, self._before = self._late(actions), actions
+        observations, *rest = self._simulator.step(given)
+        return self._shown(observations), *rest  # type: ignore[return-value]
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """Return the result with what took place."""
+        return in_effect(result, self._told)
+
+    def _is_due(self, step: int) -> bool:
+        """Whether a vehicle begins to err in this step, or an agent in the next, before which it is shown something."""
+        traffic, agents = self._traffic_waits, self._agent_waits
+        return bool((traffic and traffic[-1].step <= step) or (agents and agents[-1].step <= step + 1))
+
+    def _end_before(self, step: int) -> None:
+        over = [going for going in self._going if going.last < step]
+        if over:
+            self._going = [going for going in self._going if going.last >= step]
+            for going in over:
+                if going.errs is not None:
+                    going.errs.end()
+
+    def _steps(self, seconds: float) -> int:
+        return steps_of(seconds, self._dt)
+
+    def _begin(self, planned: Disturbance) -> None:
+        """Have a vehicle err from this step on, where there is one that can."""
+        last = self._step + self._steps(planned.how_long) - 1
+        vehicle = self._whom(planned)
+        errs = None
+        if vehicle and all(going.vehicle != vehicle for going in self._going):  # one at a time
+            errs = self._erring(vehicle, planned)
+        if errs is None:
+            self._tell(replace(planned, vehicle=""))
+            return
+        self._going.append(_Going(last, vehicle, planned.what, errs))
+        self._tell(planned.took_place(vehicle, errs.how_strong, self._dt))
+
+    def _whom(self, planned: Disturbance) -> str:
+        if planned.what in HELD:
+            return planned.vehicle
+        assert self._traffic is not None
+        return self._traffic.resolve_target(planned) if planned.agent in self._simulator.agents else ""
+
+    def _erring(self, vehicle: str, planned: Disturbance) -> ActiveDisturbance | None:
+        if planned.what in HELD:
+            assert self._holding is not None
+            return self._holding.hold(vehicle, planned.what)
+        assert self._traffic is not None
+        return self._traffic.disturb(vehicle, planned)
+
+    def _tell(self, disturbance: Disturbance) -> None:
+        self._told.append(disturbance)
+        for tell in self._tells:
+            tell(disturbance)
+
+    def _late(self, actions: Mapping[str, Array]) -> Mapping[str, Array]:
+        found = dict(actions)
+        for going in self._going:
+            if going.what == "late_action" and going.vehicle in found and going.filters is not None:
+                found[going.vehicle] = going.filters(found[going.vehicle])
+        return found
+
+    def _shown(self, observations: Observations) -> Observations:
+        """Return what agents are shown in the next step."""
+        step, found = self._step + 1, dict(observations)
+        while self._agent_waits and self._agent_waits[-1].step <= step:
+            self._begin_of_agent(self._agent_waits.pop(), found)
+        for going in self._going:
+            if going.filters is None or going.what == "late_action" or going.last < step:
+                continue
+            if going.vehicle in found:
+                found[going.vehicle] = going.filters(found[going.vehicle])
+        return found
+
+    def _begin_of_agent(self, planned: Disturbance, observations: Observations) -> None:
+        """Have an agent see or act late from the next step on, where it does not already."""
+        agent, kind = planned.agent, planned.what
+        going_on = (going for going in self._going if going.last > self._step)  # others are let go in the next step
+        already = any(going.vehicle == agent and going.what == kind for going in going_on)
+        made = self._filter(planned) if agent in observations and agent in self._simulator.agents else None
+        if made is None or already:
+            self._tell(planned)
+            return
+        last = planned.step + self._steps(planned.how_long) - 1
+        self._going.append(_Going(last, agent, planned.what, filters=made))
+        self._tell(planned.took_place(agent, planned.how_strong, self._dt))
+
+    def _filter(self, planned: Disturbance) -> _Filter | None:
+        agent, simulator = planned.agent, self._simulator
+        delay = self._steps(planned.how_strong) if planned.how_strong > 0 else 0
+        if planned.what == "late_action":
+            return _Late(delay, _Held(simulator.actions[agent], self._before.get(agent)))
+        if planned.what == "late_observation":
+            return _Late(delay)
+        names = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
+        space: Any = simulator.observation_spaces[agent]
+        if np.dtype(space.dtype).kind != "f":
+            return None  # such as a picture
+        rng = np.random.default_rng(
+            np.random.SeedSequence(self._seed, spawn_key=(_NOISE, planned.step, *agent.encode()))
+        )
+        return _Noisy(planned.how_strong, names, space.low, space.high, rng)
+
+
+class _Late:
+    """Hands on what it was given so many steps ago; until it has something, the first, or what somebody holds.
+
+    Args:
+        delay: in steps.
+        held: returns what stands for the time in which nothing has come yet, from the first that is given.
+    """
+
+    def __init__(self, delay: int, held: Callable[[Array], Array] = lambda first: first) -> None:
+        self._delay = delay
+        self._held = held
+        self._first: Array | None = None
+        self._queue: deque[Array] = deque()
+
+    def __call__(self, array: Array) -> Array:
+        if self._first is None:
+            self._first = self._held(array)
+        self._queue.append(array)
+        return self._queue.popleft() if len(self._queue) > self._delay else self._first
+
+
+class _Held:
+    """What a vehicle goes on doing while no decision reaches it: the same speed, and no further change of lanes.
+
+    Args:
+        form: of its actions.
+        before: the action of the step before; None at the beginning.
+    """
+
+    def __init__(self, form: ActionForm, before: Array | None) -> None:
+        self._form = form
+        self._before = before
+
+    def __call__(self, first: Array) -> Array:
+        form, space = self._form, self._form.space
+        action = first if self._before is None else self._before
+        if tuple(form.names) == ("target_speed", "lane_change"):
+            return form.encode((float(action[0]), 0))
+        if supports(space, HasMeanings) and "IDLE" in space.meanings:
+            return form.encode(tuple(space.meanings).index("IDLE"))
+        return action
+
+
+class _Noisy:
+    """Makes every number wrong by up to a share of itself, within the bounds of the space.
+
+    Args:
+        share: the most by which it is wrong.
+        names: what the columns are, where somebody knows; directions and what says who it is stay as they are.
+        low: the least of each number.
+        high: the greatest.
+        rng: of its own.
+    """
+
+    def __init__(self, share: float, names: Sequence[str], low: Array, high: Array, rng: np.random.Generator) -> None:
+        self._share = share
+        self._columns = np.array([name not in _EXACT for name in names], bool) if names else np.True_
+        self._bounds = low, high
+        self._rng = rng
+
+    def __call__(self, array: Array) -> Array:
+        wrong = 1.0 + self._share * self._rng.uniform(-1.0, 1.0, array.shape)
+        noisy = np.clip((array * wrong).astype(array.dtype), *self._bounds)
+        return np.where(self._columns, noisy, array).astype(array.dtype)

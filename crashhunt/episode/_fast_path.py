@@ -1,0 +1,126 @@
+"""Whether most steps of an episode can be taken in one call, by the compiled core."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from crashhunt.base.capabilities import supports
+from crashhunt.episode._observers import Nearness, Recorder, overrides_hook
+from crashhunt.native import ANSWERED, ASK, DONE, REFUSED
+from crashhunt.oracles import (
+    HARDEST,
+    OffRoad,
+    OffRoute,
+    Overlap,
+    RedLight,
+    ReportedCollision,
+    Teleport,
+    TrafficEvents,
+    WrongWay,
+)
+from crashhunt.simulators import FlattensObservations, StepsAtOnce
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from crashhunt.agents import Agent
+    from crashhunt.episode._observers import Observer
+    from crashhunt.oracles import Oracle
+    from crashhunt.simulators import AtOnce, Simulator
+
+
+__all__ = ["FastPath", "make_fast_path"]
+
+
+_FIND_NOTHING = (ReportedCollision, OffRoad, TrafficEvents, RedLight, WrongWay, OffRoute, Teleport)
+"""Oracles that find nothing where the simulator tells of nothing; whoever inherits from one is none of them."""
+
+
+class FastPath:
+    """Goes on where the core has left something of a step, as long as nothing has happened that Python looks into.
+
+    Args:
+        at_once: the simulator's.
+        recorder: of the episode.
+        agent: the only one of the episode.
+        encode: encodes its actions.
+
+    Attributes:
+        cannot_record: whether recording is what has failed, where something has.
+    """
+
+    def __init__(
+        self, at_once: AtOnce, recorder: Recorder, agent: str, encode: Callable[[object], NDArray[np.generic]]
+    ) -> None:
+        self.at_once = at_once
+        self._recorder, self._agent, self._encode = recorder, agent, encode
+        self.cannot_record = False
+        at_once.core.listen(at_once.enter, self._record_roster)
+
+    def resume_after(self, come: int, agents: dict[str, Agent]) -> tuple[int, dict[str, NDArray[np.generic]] | None]:
+        """Return what a step has come to in the end, and what the agent answered; None where it was not asked.
+
+        Where it ends with `ANSWERED`, nobody has been told of the answer yet.
+
+        Args:
+            come: what it has come to so far.
+            agents: by name.
+        """
+        core = self.at_once.core
+        if come == REFUSED and self._resume():
+            come = core.take(agents)
+        if come in (DONE, ASK, REFUSED):
+            return come, None
+        action = self._encode(core.answer)
+        if come == ANSWERED and core.note(action):
+            come = core.go_on(self.at_once.apply(self._agent, action))
+        return come, {self._agent: action}
+
+    def _resume(self) -> bool:
+        """Have the core go on from where the simulator is; False where that has to wait."""
+        if self.at_once.resume() is None:
+            return False
+        self._record_roster()
+        return True
+
+    def _record_roster(self) -> None:
+        """Have the core record steps of those who are in sight."""
+        self.cannot_record = True
+        self._recorder.lend(self.at_once.core, self.at_once.roster)
+        self.cannot_record = False
+
+
+def make_fast_path(
+    simulator: Simulator,
+    observers: Sequence[Observer],
+    oracles: Sequence[Oracle],
+    max_steps: int,
+    encoders: Sequence[Callable[[object], NDArray[np.generic]]],
+) -> FastPath | None:
+    """Return what takes steps at once; None where somebody has to be told of each part of each step.
+
+    Args:
+        simulator: which has been reset.
+        observers: of the episode.
+        oracles: of the episode.
+        max_steps: of the episode.
+        encoders: of the actions of each agent.
+    """
+    first = observers[0] if observers else None
+    if not isinstance(first, Recorder) or type(first) is not Recorder or not supports(simulator, StepsAtOnce):
+        return None
+    if simulator.at_once is None or not simulator.at_once.is_unpatched(simulator):
+        return None
+    if supports(simulator, FlattensObservations):
+        return None
+    rest = [one for one in observers[1:] if type(one) is not Nearness]
+    if any(overrides_hook(one, "observation") or overrides_hook(one, "action") for one in rest):
+        return None
+    always = any(overrides_hook(one, "scene") for one in rest)
+    always = always or any(type(one) is not Overlap and type(one) not in _FIND_NOTHING for one in oracles)
+    overlaps = any(type(one) is Overlap for one in oracles)
+    simulator.at_once.core.judge(overlaps, HARDEST, always, max_steps, Nearness.EVERY)
+    return FastPath(simulator.at_once, first, simulator.agents[0], encoders[0])

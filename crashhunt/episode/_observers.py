@@ -1,0 +1,365 @@
+"""Observers of an episode: their protocol, who is connected with what, and the two that every trial has.
+
+One measures how near to a crash the episode comes, one records it in the black box.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.base.errors import InvalidEpisodeError
+from crashhunt.recording import (
+    AgentChannel,
+    BlackBox,
+    Phase,
+    Prologue,
+    Tag,
+    digest_of,
+    encode_actors,
+    encode_disturbance,
+    encode_events,
+    encode_heights,
+    encode_notes,
+    encode_spines,
+)
+from crashhunt.simulators import LeavesOut, NamesDanger, NamesObservations, PlaysPaths, TellsEvents
+from crashhunt.trial import Outcome
+from crashhunt.world import ApproachMeter, DangerMeter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from gymnasium import Space
+    from numpy.typing import NDArray
+
+    from crashhunt.episode._episode import Episode
+    from crashhunt.native import UsualSteps
+    from crashhunt.simulators import ActionForm, Options, Simulator
+    from crashhunt.trial import Disturbance, TrialResult, TrialSpec
+    from crashhunt.world import Actor, ClosestApproach, Frame, Roster, Scene
+
+
+__all__ = [
+    "Nearness",
+    "Observer",
+    "Recorder",
+    "agent_seed",
+    "callbacks_for",
+    "observation_restorer",
+    "options_of",
+    "overrides_hook",
+    "ready_recorder",
+]
+
+
+# What looks on while an episode runs: it is told of everything, and changes nothing.
+
+
+class Observer:
+    """Is told what happens in an episode; override what you want to be told. What is not overridden costs nothing.
+
+    Observers are told in their order, and of the end in the opposite one. Whatever one raises ends the episode, as
+    everything does that is neither the agent's nor the simulator's.
+    """
+
+    def begin(self, episode: Episode) -> None:
+        """The simulator has been reset, and `Episode.names` says who takes part; no agent has been made yet."""
+
+    def making(self, number: int) -> None:
+        """An agent is about to be made and reset.
+
+        Args:
+            number: of the agent, in `Episode.names`; -1 once every agent has been.
+        """
+
+    def observation(self, number: int, observation: NDArray[np.generic]) -> None:
+        """An agent is about to be shown something.
+
+        Args:
+            number: of the agent, in `Episode.names`.
+            observation: as it is recorded: flattened, where the agent is shown something structured.
+        """
+
+    def action(self, number: int, action: NDArray[np.generic]) -> None:
+        """An agent has answered.
+
+        Args:
+            number: of the agent, in `Episode.names`.
+            action: encoded.
+        """
+
+    def disturbance(self, disturbance: Disturbance) -> None:
+        """A disturbance takes place; told before the step in which it begins, or that follows.
+
+        Args:
+            disturbance: as it takes place, with who is meant; a vehicle that is not there is empty.
+        """
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """A step is complete.
+
+        Args:
+            step: its number; 0 for the scene before the first step.
+            scene: as it is now.
+            rewards: of every agent, in the order of `Episode.names`; 0 of those that did not act.
+        """
+
+    def copied(self) -> None:
+        """This process has become a copy of the one in which the episode runs, which is not to notice it."""
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """The episode is over; return its result, with what this observer has found out about it.
+
+        It is told again, with another result, where an observer has failed at the end.
+        """
+        return result
+
+
+# What connects an episode with those who take part, and with those who look on.
+
+
+def options_of(spec: TrialSpec, simulator: Simulator) -> Options:
+    """Return what a simulator is asked for with its reset.
+
+    Raises:
+        InvalidEpisodeError: it cannot do it.
+    """
+    options: Options = {"arguments": spec.scenario_arguments}
+    if spec.only is not None:
+        if not supports(simulator, LeavesOut):
+            raise InvalidEpisodeError("the simulator cannot leave anybody out")
+        options["only"] = spec.only
+    if spec.script is not None:
+        if not supports(simulator, PlaysPaths):
+            raise InvalidEpisodeError("the simulator cannot move anybody along recorded paths")
+        options["script"] = spec.script
+    return options
+
+
+def agent_seed(seed: int, number: int) -> int:
+    """Return a seed of each agent's own, which differs from the simulator's."""
+    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
+
+
+def observation_restorer(space: Space[object]) -> Callable[[NDArray[np.generic]], object]:
+    """Return what makes a Dict or Tuple observation again of the flattened array, which is recorded."""
+    from gymnasium.spaces import unflatten
+
+    return partial(unflatten, space)
+
+
+def callbacks_for(observers: Sequence[Observer], name: str) -> Any:
+    """Return what is called to tell observers of something; those that do not want to be told are left out."""
+    return [getattr(one, name) for one in observers if overrides_hook(one, name)]
+
+
+def overrides_hook(observer: Observer, name: str) -> bool:
+    """Whether an observer wants to be told of something."""
+    return getattr(type(observer), name) is not getattr(Observer, name)
+
+
+# The observer that measures how near to a crash an episode comes.
+
+_AT_ONCE = 2048  # scenes
+
+
+class Nearness(Observer):
+    """Measures the closest approach and the danger, and adds them to the result.
+
+    Args:
+        take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
+            columns already.
+    """
+
+    EVERY: ClassVar = 256
+    """Steps; scenes are taken in many at a time, which costs a tenth of one at a time."""
+
+    def __init__(self, take_frames: Callable[[], Sequence[Frame]]) -> None:
+        self._take_frames = take_frames
+        self._meter = ApproachMeter(())
+        self._dangers = DangerMeter((), 1.0)
+        self._simulator: object = None
+        self._waiting: list[Frame] = []  # for the closest approach, of which so many at a time cost least
+
+    @property
+    def closest(self) -> ClosestApproach:
+        """The closest approach so far, up to the last complete step."""
+        self._take_in()
+        self._measure()
+        return self._meter.closest
+
+    def begin(self, episode: Episode) -> None:
+        """Note who is controlled."""
+        self._meter = ApproachMeter(episode.names)
+        self._simulator = episode.simulator
+        self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Take in what there is, now and then."""
+        if step and step % self.EVERY == 0:
+            self._take_in()
+            if sum(len(frame.columns) for frame in self._waiting) >= _AT_ONCE:
+                self._measure()
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """Add the closest approach and the danger."""
+        closest = self.closest
+        if result.collision is not None and "overlap" in result.collision.seen_by:
+            closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
+        if result.outcome is Outcome.INVALID:
+            return replace(result, closest=closest)
+        touched = result.outcome.is_traffic_crash or closest.gap_m <= 0.0
+        danger = 1.0 if touched else self._dangers.danger
+        # Asked at the end: before the first step it names none, which counts as one that never does.
+        if danger is None and supports(self._simulator, NamesDanger):
+            named = self._simulator.named_danger
+            danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
+        return replace(result, closest=closest, danger=danger)
+
+    def _take_in(self) -> None:
+        frames = self._take_frames()
+        self._waiting += frames
+        self._dangers.add(frames)
+
+    def _measure(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        self._meter.measure(waiting)
+
+
+# The observer that records an episode in the black box.
+
+
+class Recorder(Observer):
+    """Turns what happens into records; adds the digest to the result, and how often which event happened.
+
+    It comes first of all observers: a step is complete when it is recorded.
+
+    Args:
+        box: what to write into; `BlackBox.begin` has been called.
+        simulator: whose episode it is.
+    """
+
+    def __init__(self, box: BlackBox, simulator: Simulator) -> None:
+        self._box = box
+        self._numbers: dict[Actor, int] = {}
+        self._same: dict[int, int] = {}
+        self._kept: list[Actor] = []
+        self._roster: Roster | None = None
+        # Where nobody looks for events, none having happened says nothing.
+        self._events: Counter[str] | None = Counter() if supports(simulator, TellsEvents) else None
+        # Called in every step: without a call in between.
+        self.observation = box.observation  # type: ignore[assignment, method-assign]
+        self.action = box.action  # type: ignore[assignment, method-assign]
+
+    def lend(self, steps: UsualSteps, roster: Roster) -> None:
+        """Have the core record steps of these actors, who are recorded here."""
+        if roster is not self._roster:
+            self._note_roster(roster)
+        self._box.lend(steps, roster)
+
+    def begin(self, episode: Episode) -> None:
+        """Record who takes part."""
+        simulator = episode.simulator
+        columns = tuple(simulator.observation_names) if supports(simulator, NamesObservations) else ()
+        channels = []
+        for agent in episode.names:
+            space, form = simulator.observation_spaces[agent], simulator.actions[agent]
+            sample = _sample_of(form)
+            shown = np.dtype(space.dtype).str, tuple(space.shape or ())
+            channels.append(AgentChannel(agent, *shown, sample.dtype.str, sample.shape, tuple(form.names), columns))
+        self._box.set_up(episode.setup_steps or 0)
+        self._box.prologue(Prologue(tuple(channels), simulator.step_length_s).encode(), len(channels))
+
+    def making(self, number: int) -> None:
+        """Note which agent is being made, as its constructor may end the process."""
+        self._box.mark(Phase.SETUP if number < 0 else Phase.ACT, max(number, 0))
+
+    def observation(self, number: int, observation: NDArray[np.generic]) -> None:
+        """Record what an agent is about to be shown."""
+        self._box.observation(number, observation)
+
+    def action(self, number: int, action: NDArray[np.generic]) -> None:
+        """Record what an agent answered."""
+        self._box.action(number, action)
+
+    def disturbance(self, disturbance: Disturbance) -> None:
+        """Record what takes place, and who is meant."""
+        self._box.append(Tag.DISTURBANCE, 0, encode_disturbance(disturbance))
+
+    def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
+        """Record a scene, and before it whatever is new about it."""
+        if scene.roster is not self._roster:
+            self._note_roster(scene.roster)
+        if scene.lanes:
+            self._box.append(Tag.LANES, 0, "\n".join(scene.lanes).encode())
+        if scene.contacts or scene.off_road:
+            self._box.append(Tag.EVENTS, 0, encode_events(scene))
+        if scene.heights:
+            self._box.append(Tag.HEIGHTS, 0, encode_heights(scene))
+        if scene.spines:
+            self._box.append(Tag.SPINES, 0, encode_spines(scene))
+        if scene.events:
+            self._box.note(encode_notes(scene.events))
+            if self._events is not None:
+                self._events.update([event.kind for event in scene.events])
+        self._box.step(step, scene, rewards)
+
+    def _note_roster(self, roster: Roster) -> None:
+        actors = roster.actors
+        # Most are the same objects as before: to look for an equal one takes longer than all else about a roster.
+        numbers = list(map(self._same.get, map(id, actors)))
+        if None in numbers:
+            fresh, known = [], self._numbers
+            for row, number in enumerate(numbers):
+                if number is None:
+                    actor, free = actors[row], len(known)
+                    numbers[row] = self._same[id(actor)] = known.setdefault(actor, free)
+                    self._kept.append(actor)  # so that nobody else gets its identity
+                    if len(known) > free:
+                        fresh.append(actor)
+            if fresh:
+                self._box.append(Tag.ACTORS, 0, encode_actors(fresh))
+        self._box.append(Tag.ROSTER, 0, struct.pack(f"<{len(numbers)}I", *numbers))
+        self._roster = roster
+
+    def copied(self) -> None:
+        """Record elsewhere from now on, after a copy of what there is."""
+        self._box.copy()
+
+    def end(self, result: TrialResult) -> TrialResult:
+        """Say so, and add the digest of what has been recorded."""
+        self._box.mark(Phase.DONE)
+        digest = digest_of(*self._box.evidence()) if result.outcome is not Outcome.INVALID else ""
+        return replace(result, digest=digest, events=None if self._events is None else dict(self._events))
+
+
+_ready: dict[int, tuple[ActionForm, NDArray[np.generic]]] = {}  # by identity, which holds as long as the form is here
+
+
+def ready_recorder(simulator: Simulator) -> None:
+    """Encode an action of each agent ahead of the first episode, whose recorder then need not.
+
+    Seeding a space takes longer than many steps. A fork inherits the generators of the spaces as this leaves them, so
+    an agent that samples from its action space gets the same. Only for simulators whose `reset` leaves them alone.
+    """
+    for form in simulator.actions.values():
+        _ready[id(form)] = form, _encode_any(form)
+
+
+def _sample_of(form: ActionForm) -> NDArray[np.generic]:
+    ready = _ready.pop(id(form), None)  # for one episode: afterwards an agent may have sampled from the space
+    return _encode_any(form) if ready is None else ready[1]
+
+
+def _encode_any(form: ActionForm) -> NDArray[np.generic]:
+    # Only the shape and type of the encoded action matter.
+    form.space.seed(0)
+    return form.encode(form.space.sample())

@@ -1,0 +1,435 @@
+"""What a process that died or hung left behind, as the result of its trial."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import signal
+import struct
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
+
+from crashhunt.base import layout
+from crashhunt.base.signals import is_sent_from_outside
+from crashhunt.episode import scratch_of
+from crashhunt.recording import BlackBoxHeader, Phase, Recording, Tag, digest_of, read_black_box, read_header
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
+from crashhunt.world import ClosestApproach, DangerMeter, Lane, closest_approach
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.trial import TrialSpec
+
+
+__all__ = [
+    "KEY_BYTES",
+    "Attempt",
+    "Report",
+    "agent_in_stack",
+    "check_report",
+    "damaged",
+    "died",
+    "encode_report",
+    "hung",
+    "killed_from_outside",
+    "read_map",
+    "read_tail",
+    "result_of_death",
+    "signal_name",
+    "where_it_is",
+]
+
+
+_TAIL = 4000  # bytes
+_FRAME = re.compile(r'  File "(.*)", line \d+ in ')  # of a stack that faulthandler wrote
+_ATTEMPTS = 3  # of a trial whose process is killed from outside
+
+
+@dataclass(slots=True)
+class Attempt:
+    """A trial that is to be run, and what has become of it so far.
+
+    A process that ends by certain signals may have been ended from outside: by an administrator, a batch system, the
+    kernel because memory ran out. Then the trial is run again, alone. Where it ends in the same way at the same place
+    it was the trial itself. Where it ends at another place each time, the trial is not the cause.
+
+    Args:
+        spec: the trial.
+        ends: of its processes: which signal, at which step.
+    """
+
+    spec: TrialSpec
+    ends: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def alone(self) -> bool:
+        """Whether no other trial may run meanwhile."""
+        return bool(self.ends)
+
+    @property
+    def is_killed_from_outside(self) -> bool:
+        """Whether every allowed attempt was killed, each at another step: no attempt shows how the trial ends."""
+        return len(self.ends) >= _ATTEMPTS and len(set(self.ends)) == len(self.ends)
+
+    def again(self, scratch: Path, exit_code: int) -> str:
+        """Why it is to be run once more, in words; empty where what has happened is its outcome."""
+        if not is_sent_from_outside(exit_code):
+            return ""
+        header = where_it_is(scratch, self.spec.number)
+        end = exit_code, header.step if header is not None else -1
+        seen = end in self.ends
+        self.ends.append(end)
+        if seen or len(self.ends) >= _ATTEMPTS:
+            return ""
+        return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
+
+
+def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
+    """Return where a running trial is, or None where it has not begun."""
+    header = read_header(scratch_of(scratch, number) / layout.BLACK_BOX)
+    return header if header is not None and header.trial == number else None
+
+
+def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, str] | None = None) -> TrialResult:
+    """Return the result of a trial whose process died.
+
+    Before the first step that is a start-up failure, which makes the trial invalid; afterwards it is a crash.
+
+    Args:
+        spec: the trial.
+        scratch: the folder in which it recorded.
+        exit_code: of its process, negative for a signal.
+        agents: identifier of each agent to its module, where no other code comes from that module.
+    """
+    header = where_it_is(scratch, spec.number)
+    message = (
+        f"the process died of {signal_name(exit_code)}" if exit_code < 0 else f"the process exited with {exit_code}"
+    )
+    kind = "signal" if exit_code < 0 else "exit code"
+    return _result(spec, scratch, header, Outcome.PROCESS_DIED, kind, message, exit_code, agents=agents)
+
+
+def result_of_death(attempt: Attempt, scratch: Path, exit_code: int) -> TrialResult:
+    """Return the result of a trial whose process died and that is not run again.
+
+    The trial is invalid where its processes were killed from outside at different steps, and else as of `died`.
+
+    Args:
+        attempt: the trial; `Attempt.again` has been called with this death.
+        scratch: the folder in which the trial records.
+        exit_code: exit code of the process; negative for a signal.
+    """
+    result = died(attempt.spec, scratch, exit_code)
+    if not attempt.is_killed_from_outside:
+        return result
+    ends = ", ".join(f"{signal_name(code)} after step {max(0, step)}" for code, step in attempt.ends)
+    why = f"killed from outside {len(attempt.ends)} times, each time at another step ({ends})"
+    lost = killed_from_outside(attempt.spec, why, exit_code)
+    return replace(lost, wall_s=result.wall_s, worker=result.worker, kept=result.kept)
+
+
+def killed_from_outside(spec: TrialSpec, why: str, exit_code: int) -> TrialResult:
+    """Return the result of a trial that ended at no step of its own, which a resumed hunt runs again.
+
+    Args:
+        spec: the trial.
+        why: how often it was killed, and where.
+        exit_code: of its last process; negative for a signal.
+    """
+    return TrialResult(spec, Outcome.INVALID, failure=Failure(KILLED, why, exit_code=exit_code))
+
+
+def damaged(spec: TrialSpec, scratch: Path, message: str, *, agent: str = "", recorded: bool = True) -> TrialResult:
+    """Return the result of a trial whose process damaged itself or its recording.
+
+    Args:
+        spec: the trial.
+        scratch: the folder in which it recorded.
+        message: what is damaged, as a sentence.
+        agent: identifier of the agent that did it, where the recording cannot be read; empty where that is not known.
+        recorded: whether the recording can be read.
+    """
+    if recorded:
+        header = where_it_is(scratch, spec.number)
+        return _result(spec, scratch, header, Outcome.AGENT_ERROR, "damaged process", message, None, agent)
+    output = read_tail(scratch_of(scratch, spec.number) / layout.RUN_LOG)
+    failure = Failure("damaged recording", message, agent=agent, last_output=output)
+    return TrialResult(spec, Outcome.AGENT_ERROR, failure=failure, kept=True)
+
+
+def hung(spec: TrialSpec, scratch: Path, timeout_s: float) -> TrialResult:
+    """Return the result of a trial that was still running at its wall-clock limit, and has been killed."""
+    header = where_it_is(scratch, spec.number)
+    message = f"still running after {timeout_s:g} s"
+    return _result(spec, scratch, header, Outcome.HANG, "timeout", message, None)
+
+
+def _result(
+    spec: TrialSpec,
+    scratch: Path,
+    header: BlackBoxHeader | None,
+    outcome: Outcome,
+    kind: str,
+    message: str,
+    exit_code: int | None,
+    agent: str = "",
+    agents: Mapping[str, str] | None = None,
+) -> TrialResult:
+    folder = scratch_of(scratch, spec.number)
+    output = read_tail(folder / layout.RUN_LOG)
+    stack = read_tail(folder / layout.STACK)
+    steps, sim_time_s, digest, closest = 0, 0.0, "", ClosestApproach()
+    danger: float | None = None
+    phase = header.phase if header is not None else Phase.SETUP
+    try:
+        recording = Recording(read_black_box(folder / layout.BLACK_BOX)) if header is not None else None
+        scenes = recording.scenes() if recording is not None else []
+    except Exception:  # of whatever kind: a process that ran foreign code may have written anything there
+        recording, scenes = None, []
+    if phase == Phase.SETUP or (recording is not None and not scenes):
+        if header is not None and recording is not None and phase == Phase.ACT:
+            agent = recording.agents[header.agent] if header.agent < len(recording.agents) else ""
+            message = f"{message} in {agent}'s constructor or reset()" if agent else message
+        agent = agent or agent_in_stack(stack, agents or {})
+        outcome, message = Outcome.INVALID, f"{message} while the episode was being set up"
+    elif recording is None:
+        message = f"{message}, and its recording cannot be read"
+    else:
+        steps, sim_time_s, digest = recording.steps, scenes[-1].time_s, recording.digest
+        closest = closest_approach(scenes, recording.agents)
+        meter = DangerMeter(recording.agents, recording.prologue.step_length_s)
+        meter.add([scene.frame for scene in scenes])
+        danger = meter.danger
+        if outcome is Outcome.AGENT_ERROR:
+            agent = recording.agents[0] if len(recording.agents) == 1 else ""
+        elif header is not None and phase == Phase.ACT:
+            agent = recording.agents[header.agent]
+            message = f"{message} in {agent}'s act() of step {steps + 1}"
+        elif phase == Phase.DONE:  # where no code but that of agents runs, in close() or a finalizer
+            agent = recording.agents[0] if len(recording.agents) == 1 else ""
+            message = f"{message} after the last step"
+        else:
+            agent = agent_in_stack(stack, agents or {})
+            whose = f"{agent}'s code" if agent else "the simulator"
+            message = f"{message} in {whose} at step {steps + 1}"
+    failure = Failure(kind, message, stack, agent, exit_code, output)
+    wall_s = time.monotonic() - header.started if header is not None else 0.0
+    result = TrialResult(
+        spec,
+        outcome,
+        steps=steps,
+        sim_time_s=sim_time_s,
+        digest=digest,
+        closest=closest,
+        danger=danger,
+        failure=failure,
+        wall_s=wall_s,
+        worker=header.pid if header is not None else 0,
+        kept=folder.is_dir(),
+        setup_steps=(header.setup_steps or None) if header is not None else None,
+    )
+    return in_effect(result, recording.disturbances if recording is not None else ())
+
+
+def agent_in_stack(stack: str, agents: Mapping[str, str]) -> str:
+    """Return the agent whose code ran when the process died; empty where the stack does not show it.
+
+    A signal handler of an agent may be called while the simulator runs. Its frames then lie above those of crashhunt.
+
+    Args:
+        stack: as `faulthandler` writes it for a fatal signal.
+        agents: identifier to module.
+    """
+    _, _, frames = stack.rpartition("\nCurrent thread ")
+    for line in frames.split("\n\n", 1)[0].splitlines():
+        found = _FRAME.match(line)
+        if found is None:
+            continue
+        if found[1].startswith(str(layout.PACKAGE)):
+            return ""
+        endings = {name: module.replace(".", os.sep) for name, module in agents.items()}
+        named = [
+            name
+            for name, ending in endings.items()
+            if found[1].endswith((f"{os.sep}{ending}.py", f"{os.sep}{ending}{os.sep}__init__.py"))
+        ]
+        if named:
+            return named[0] if len(named) == 1 else ""
+    return ""
+
+
+def read_map(scratch: Path, trial: Path) -> list[Lane]:
+    """Return the map of a trial that is kept, or that of its hunt; nothing where none has been written down."""
+    for folder in (trial, scratch):
+        with suppress(OSError, ValueError, TypeError):
+            data = json.loads((folder / layout.MAP).read_text(encoding="utf-8"))
+            return [Lane(name, width, tuple(map(tuple, shape))) for name, width, shape in data]
+    return []
+
+
+def read_tail(path: Path) -> str:
+    """Return the last few thousand characters of a file; nothing where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _TAIL))
+            return file.read().decode("utf-8", "replace")
+    except OSError:
+        return ""
+
+
+def signal_name(exit_code: int) -> str:
+    """Return what people call the signal that a process died of."""
+    try:
+        return signal.Signals(-exit_code).name
+    except ValueError:
+        return f"signal {-exit_code}"
+
+
+# What the process of a trial leaves behind when it ends, and whether it may be believed.
+#
+# That process runs foreign code. So what it leaves is evidence, and no instruction: records in the black box, behind
+# them one report, and an exit code. The supervisor believes the report where all of them agree. The report carries a
+# keyed hash over itself and over the trace digest. The key is new for every trial, and only the process of the trial is
+# given it: this keeps out code that writes into the file, but not code that searches the memory of its own process for
+# the key.
+
+KEY_BYTES = 16
+_HASH_BYTES = 16
+_HEAD = struct.Struct("<BxHI")  # of a record: tag, aux, length of its payload
+_STEP_HEAD = struct.Struct("<qd")  # of the payload of a step: its number, and the simulation time in s
+_FIRST_ASIDE, _NOTES = 128, int(Tag.NOTES)
+_PROLOGUE, _STEP = int(Tag.PROLOGUE), int(Tag.STEP)
+_FAULTS = (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.INVALID)
+_SUPERVISED = (Outcome.PROCESS_DIED, Outcome.HANG)
+"""Outcomes that the supervisor alone can see."""
+
+
+class Report(TypedDict):
+    """What the process of a trial reports at its end.
+
+    ``result`` is without the specification, which the supervisor knows. ``notices`` are lines for people.
+    """
+
+    result: Mapping[str, object]
+    notices: list[str]
+    map: NotRequired[str]
+    entered: NotRequired[list[str]]
+    braking: NotRequired[Mapping[str, object] | None]
+
+
+def encode_report(report: Report, key: bytes, digest: str, *, dumps: Callable[[object], str] = json.dumps) -> bytes:
+    """Return the bytes of a report.
+
+    Args:
+        report: what is reported.
+        key: of the trial.
+        digest: the trace digest; empty for an invalid trial.
+        dumps: writes JSON.
+    """
+    text = dumps(report).encode()
+    return _keyed_hash(text, key, digest) + text
+
+
+def check_report(
+    report: bytes, *, key: bytes, spec: TrialSpec, header: BlackBoxHeader, records: bytes, pid: int
+) -> tuple[TrialResult, Report] | str:
+    """Check what the process of a trial left behind.
+
+    Args:
+        report: as it lies behind the records.
+        key: of the trial.
+        spec: the trial that was asked for.
+        header: of the black box.
+        records: all committed records.
+        pid: the process that was to run the trial.
+
+    Returns:
+        The result and the whole report; in words what does not agree, where something does not.
+    """
+    found = _walk(records)
+    if isinstance(found, str):
+        return found
+    steps, time_s, evidence = found
+    if (header.trial, header.pid) != (spec.number, pid):
+        return f"it says that process {header.pid} ran trial {header.trial}"
+    digest = digest_of(*evidence) if records else ""
+    text = report[_HASH_BYTES:]
+    if report[:_HASH_BYTES] not in (_keyed_hash(text, key, digest), _keyed_hash(text, key, "")):
+        return "its report was not written by crashhunt"
+    try:
+        said: Report = json.loads(text)
+        data = cast("JsonObject", {**said["result"], "spec": spec.to_json()})
+        result = TrialResult.from_json(data)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"its report cannot be read ({type(error).__name__})"
+    problem = _contradiction(result, spec, steps, time_s, digest)
+    return problem or (replace(result, spec=spec), said)
+
+
+def _contradiction(result: TrialResult, spec: TrialSpec, steps: int, time_s: float, digest: str) -> str:
+    """What in a result contradicts its recording; empty where nothing does."""
+    outcome = result.outcome
+    if outcome in _SUPERVISED:
+        return f"a process cannot report {outcome} of itself"
+    if outcome in _FAULTS and result.failure is None:
+        return f"it reports {outcome} and no reason"
+    if outcome is Outcome.INVALID:
+        return ""
+    # An episode that broke off while its observers were called has no digest in its result.
+    if result.digest != digest and (result.digest or outcome not in _FAULTS):
+        return f"it reports the digest {result.digest or 'none'}, and its recording has {digest}"
+    if not max(result.steps, 0) <= steps <= result.steps + 1:
+        return f"it reports {result.steps} steps, and its recording has {steps}"
+    if result.steps > spec.max_steps or (outcome is Outcome.SURVIVED and result.steps != spec.max_steps):
+        return f"it reports {outcome} after {result.steps} of {spec.max_steps} steps"
+    same_time = result.sim_time_s == time_s or math.isnan(time_s)
+    if steps == result.steps and not same_time and outcome not in _FAULTS:
+        return f"it reports a simulation time of {result.sim_time_s} s, and its recording has {time_s} s"
+    return ""
+
+
+def _walk(records: bytes) -> tuple[int, float, list[memoryview]] | str:
+    """Return the last step, its simulation time and the parts that are evidence; in words what is wrong."""
+    whole, offset, end = memoryview(records), 0, len(records)
+    step, time_s, begins = -1, 0.0, 0
+    evidence: list[memoryview] = []
+    while offset < end:
+        if offset + 8 > end:
+            return "its recording is cut off"
+        tag, _, length = _HEAD.unpack_from(records, offset)
+        start = offset + 8
+        following = start + length + (-length & 7)
+        if following > end:
+            return "its recording is cut off"
+        if (tag == _PROLOGUE) != (offset == 0):
+            return "its recording does not begin with the prologue, or does twice"
+        if tag == _STEP:
+            if length < _STEP_HEAD.size:
+                return "its recording has a step that is cut off"
+            number, time_s = _STEP_HEAD.unpack_from(records, start)
+            if number != step + 1:
+                return f"its recording has step {number} after step {step}"
+            step = number
+        elif tag >= _FIRST_ASIDE or tag == _NOTES:
+            evidence.append(whole[begins:offset])
+            begins = following
+        elif tag == 0:
+            return "its recording has an empty record"
+        offset = following
+    evidence.append(whole[begins:end])
+    return max(step, 0), time_s, evidence
+
+
+def _keyed_hash(text: bytes, key: bytes, digest: str) -> bytes:
+    found = hashlib.blake2b(text, key=key, digest_size=_HASH_BYTES)
+    found.update(digest.encode())
+    return found.digest()

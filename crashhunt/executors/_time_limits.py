@@ -1,0 +1,152 @@
+"""Which trials hang, over their time limit; and how long they may write down where, before they are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.forks import ended
+from crashhunt.base.processes import kill, resume
+from crashhunt.base.signals import describe_death, is_sent_from_outside
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from crashhunt.recording import BlackBoxHeader
+
+
+__all__ = ["START_UP_S", "ImportKilledError", "ImportWatch", "await_imports", "has_hung", "import_died"]
+
+
+START_UP_S = 60.0  # for Python and the agent to be imported and the simulator to be made, before a trial's time runs
+_LAST_WORDS_S = 0.2  # after its time limit, for a hung process to write down where it is stuck
+_NO_WORDS_S = 3.0  # the same, on a machine that has no time for it at once
+
+
+def has_hung(
+    header: BlackBoxHeader | None, *, begun: bool, given_at: float, limit_s: float, has_words: Callable[[], bool]
+) -> bool:
+    """Whether a trial is to be ended because it takes too long.
+
+    Args:
+        header: of its black box; None where there is none.
+        begun: whether the process of the trial itself wrote the header; until then `START_UP_S` is added to the limit.
+        given_at: when its process was given it, as of `time.monotonic`.
+        limit_s: wall time that it may take from its beginning on, in s.
+        has_words: returns whether the process has written down where it is stuck.
+    """
+    now, began, allowed_s = time.monotonic(), given_at, limit_s
+    if header is None or not begun:
+        allowed_s += START_UP_S
+    elif given_at <= header.started <= now:  # later than it began by what copies of it took; an agent may forge it
+        began = header.started
+    over_s = now - began - allowed_s
+    return over_s > _LAST_WORDS_S and (over_s > _NO_WORDS_S or has_words())
+
+
+# The time limit for importing what trials need, and the errors that name the module at which an import hung or died.
+#
+# A process imports the agents, and reports each module before it begins. Another process, without foreign code, keeps
+# an `ImportWatch`, as only that one is left to report when a module hangs or ends its process.
+
+_LONGEST = 200  # characters of a message; foreign code may write its own
+_MESSAGE = 1 << 12  # bytes
+_LOOK_EVERY_S = 0.02  # whether the process has died
+_LOOK = "see what the module does when it is imported"
+
+
+class ImportKilledError(Exception):
+    """A process that imported what trials need was ended by a signal that may come from outside.
+
+    Args:
+        exit_code: of the process, negative for a signal.
+        importing: what it could not do, in words.
+    """
+
+    def __init__(self, exit_code: int, importing: str) -> None:
+        super().__init__(exit_code, importing)
+        self.exit_code, self.importing = exit_code, importing
+
+
+class ImportWatch:
+    """What a process is importing, and whether that takes too long.
+
+    Args:
+        timeout_s: wall-clock limit of a trial, in s; imports may take `START_UP_S` longer.
+
+    Attributes:
+        importing: what has failed if the process never reports again, as in "the module 'planner' of agent ego cannot
+            be imported"; empty where everything has been imported.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.importing = "what trials need cannot be imported"
+        self._limit_s = START_UP_S + timeout_s
+        self._ends_at = time.monotonic() + self._limit_s
+
+    def begin(self, importing: object) -> None:
+        """Note what the process imports from now on."""
+        self.importing = str(importing)[:_LONGEST]
+
+    @property
+    def has_hung(self) -> bool:
+        """Whether the imports take too long."""
+        return bool(self.importing) and time.monotonic() > self._ends_at
+
+    def hung(self) -> CrashhuntError:
+        """Return the error of an import that takes too long."""
+        return CrashhuntError(
+            f"{self.importing}: it takes more than {self._limit_s:g} s",
+            fix=f"{_LOOK}, or give it more time with --timeout",
+        )
+
+
+def import_died(importing: str, exit_code: int, *, times: int = 1) -> CrashhuntError:
+    """Return the error of an import that ended its process.
+
+    Args:
+        importing: as of `ImportWatch`.
+        exit_code: of the process, negative for a signal.
+        times: how often it was tried.
+    """
+    again = f", {times} times" if times > 1 else ""
+    return CrashhuntError(
+        f"{importing}: its process {describe_death(exit_code)} meanwhile{again}",
+        fix=f"{_LOOK}, or raise the limits on memory (ulimit -v) and processes (ulimit -u)",
+    )
+
+
+def await_imports(reports: socket.socket, pid: int, timeout_s: float) -> None:
+    """Wait until a child has imported what trials need.
+
+    Args:
+        reports: from the child: a message before each import, an empty one at the end.
+        pid: of the child.
+        timeout_s: as of `ImportWatch`.
+
+    Raises:
+        ImportKilledError: it was ended by a signal that may come from outside.
+        CrashhuntError: it takes too long, or has ended by itself.
+    """
+    watch = ImportWatch(timeout_s)
+    while watch.importing:
+        if select.select([reports], [], [], _LOOK_EVERY_S)[0] and (data := reports.recv(_MESSAGE)):
+            with suppress(ValueError):  # foreign code may write there as well
+                watch.begin(json.loads(data))
+        elif os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
+            code = ended(pid)
+            if is_sent_from_outside(code):
+                raise ImportKilledError(code, watch.importing)
+            raise import_died(watch.importing, code)
+        elif watch.has_hung:
+            kill(pid)
+            ended(pid)
+            raise watch.hung()
+        else:
+            resume(pid)  # which a module may have stopped

@@ -1,0 +1,101 @@
+"""The actor that stands on each node. It travels as it is: a node need not have crashhunt for it to say so.
+
+So it imports nothing of crashhunt before it has looked which one there is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import platform
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Site", "code_digest"]
+
+
+_LINK_ORDER = "_crashhunt_link_order"  # the library that fixes the order of SUMO's links; no part of a distribution
+
+
+class Site:
+    """Runs trials on a node. Everything else is in ``_work.py``, of the crashhunt that is installed there."""
+
+    def __init__(self) -> None:
+        self._work: Any = None
+
+    def differs(self, versions: dict[str, str], code: str) -> str:
+        """Say what is installed here in another version than where the hunt runs; empty where nothing is.
+
+        Args:
+            versions: name to version of what results depend on.
+            code: the digest of crashhunt itself, whose version stays the same while somebody works on it.
+        """
+        found = []
+        for name, wanted in versions.items():
+            try:
+                if name in ("python", "machine"):
+                    here = platform.python_version() if name == "python" else platform.machine()
+                elif name == _LINK_ORDER:
+                    here = "installed" if importlib.util.find_spec(name) else "not installed"
+                else:
+                    here = importlib.metadata.version(name)
+            except importlib.metadata.PackageNotFoundError:
+                here = "not installed"
+            if here != wanted:
+                found.append(f"{name} is {here} there and {wanted} here")
+        if not found:
+            try:
+                if code_digest() != code:
+                    found.append("crashhunt has the same version and other code there")
+            except Exception as error:
+                found.append(f"crashhunt cannot be found there ({error})")
+        return ", ".join(found)
+
+    def begin(self, job: Any) -> str:
+        """Get ready for the trials of a hunt; return ``ready``, ``lacks`` where the parcel is wanted, or an error."""
+        from crashhunt.executors.ray._node_worker import Work
+
+        if self._work is None:
+            self._work = Work(job)
+        return str(self._work.begin())
+
+    def deliver(self, packed: bytes) -> str:
+        """Take the parcel; return as `begin` does."""
+        return str(self._work.deliver(packed))
+
+    def submit(self, trials: list[tuple[int, dict[str, Any]]]) -> None:
+        """Queue trials, each with its ticket."""
+        self._work.submit(trials)
+
+    def cancel(self, above: int, before: int) -> None:
+        """Give up trials, also those that come later on another way than this does."""
+        self._work.cancel(above, before)
+
+    def take(self, wait_s: float, trials: list[tuple[int, dict[str, Any]]]) -> Any:
+        """Queue trials as `submit` does; return what has happened since the last call."""
+        return self._work.take(wait_s, trials)
+
+    def close(self) -> None:
+        """End everything."""
+        if self._work is not None:
+            self._work.close()
+
+
+def code_digest() -> str:
+    """Return the digest of the crashhunt that is installed.
+
+    Raises:
+        ImportError: none is.
+    """
+    spec = importlib.util.find_spec("crashhunt")
+    if spec is None or not spec.submodule_search_locations:
+        raise ImportError("no such package")
+    root = Path(spec.submodule_search_locations[0])
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root).as_posix()
+        if not name.startswith("scenarios/"):  # which lie elsewhere in a checkout
+            digest.update(f"{name}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,223 @@
+"""What a node does for a hunt: keeps the pool, and hands over what comes of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+import time
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crashhunt.base import layout
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors._pool import PoolExecutor
+from crashhunt.executors.ray._code_archive import Store, settings_in
+from crashhunt.executors.ray._messages import Ended, News
+from crashhunt.recording import read_header
+from crashhunt.trial import TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from crashhunt.base.json_types import ErrorData
+    from crashhunt.executors.ray._code_archive import Place
+    from crashhunt.executors.ray._messages import Header, NodeJob, Submitted
+    from crashhunt.recording import BlackBoxHeader
+    from crashhunt.trial import TrialResult
+
+
+__all__ = ["Work", "unpacked"]
+
+
+_WHERE_EVERY_S = 0.5  # as often as people can read
+_GATHER_S = 0.05  # in which what ends goes back together, while there is enough to do
+_HEAD = 64  # bytes of a black box that say what is in the rest, most of which is room for more
+_TEXTS = (layout.RUN_LOG, layout.ERROR_LOG, layout.STACK)
+
+
+class Work:
+    """The trials of one hunt on this node.
+
+    Args:
+        job: the settings, the parcel's digest and folders, how many trials at a time.
+    """
+
+    def __init__(self, job: NodeJob) -> None:
+        self._job = job
+        self._store = Store()
+        self._place: Place | None = None
+        self._pool: PoolExecutor | None = None
+        self._lock = threading.Lock()
+        self._tickets: dict[int, int] = {}
+        self._given_up: list[tuple[int, int]] = []  # greatest number that is not, and first ticket that is not
+        self._renamed: list[tuple[str, str]] = []
+        self._looked = 0.0
+        self._map_sent = False
+        self._broken: CrashhuntError | None = None
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of the code of a hunt, which is there for this hunt only
+
+    def begin(self) -> str:
+        """Get ready; return what `Site.begin` returns."""
+        packed = self._store.find(self._job["digest"])
+        if packed is None:
+            return "lacks"
+        if self._ready(packed):
+            return "ready"
+        self._store.drop(self._job["digest"])
+        return "lacks"
+
+    def deliver(self, packed: bytes) -> str:
+        """Get ready with a parcel that was sent."""
+        if not self._ready(packed):
+            return "the parcel was damaged on its way"
+        self._store.keep(self._job["digest"], packed)
+        return "ready"
+
+    def _ready(self, packed: bytes) -> bool:
+        self._place = self._place or self._store.place()
+        if not self._place.unpack(packed, self._job["digest"]):
+            return False
+        settings = WorkerSettings.from_json(self._job["settings"])
+        here = settings_in(settings, self._job["folders"], self._place.code, self._place.scratch)
+        # What people and the ledger are told names the files of the machine where the hunt was begun.
+        pairs = {str(self._place.code / place): folder for folder, place in self._job["folders"].items()}
+        pairs[str(self._place.scratch)] = str(settings.scratch)
+        self._renamed = sorted(pairs.items(), key=lambda pair: -len(pair[0]))
+        if self._job["home"]:  # an agent may open its files by names that count from there
+            os.chdir(self._place.code / self._job["home"])
+        recycle_after = self._job["recycle_after"]
+        self._pool = PoolExecutor(here, parallel=self._job["slots"], recycle_after=recycle_after)
+        return True
+
+    def submit(self, trials: Sequence[Submitted]) -> None:
+        """Queue trials, but for those that were given up before they came."""
+        assert self._pool is not None
+        try:
+            for ticket, spec in trials:
+                with self._lock:
+                    if not any(spec["number"] > above and ticket < before for above, before in self._given_up):
+                        self._tickets[spec["number"]] = ticket
+                        self._pool.submit(TrialSpec.from_json(spec))
+        except Exception as error:  # nobody looks at what comes of this call; the next `take` tells
+            self._broken = CrashhuntError(f"a trial cannot be begun: {type(error).__name__}: {error}")
+
+    def cancel(self, above: int, before: int) -> None:
+        """Give up trials whose number is greater than ``above``, and whose ticket is less than ``before``.
+
+        Tickets tell those that were submitted later from those that are late: `take` brings trials beside `submit`.
+        """
+        assert self._pool is not None
+        with self._lock:
+            self._given_up.append((above, before))
+            self._tickets = {number: ticket for number, ticket in self._tickets.items() if number <= above}
+            self._pool.cancel(above=above)
+
+    def take(self, wait_s: float, trials: Sequence[Submitted]) -> News:
+        """Queue trials; return what has happened, waiting so long for a trial to end."""
+        assert self._pool is not None
+        self.submit(trials)
+        ended: list[Ended] = []
+        error: ErrorData | None = None
+        try:
+            if self._broken is not None:
+                raise self._broken
+            for result in self._completed(wait_s):
+                with self._lock:
+                    ticket = self._tickets.pop(result.spec.number, None)
+                if ticket is not None:
+                    ended.append(self._handed_over(ticket, result))
+        except CrashhuntError as problem:
+            error = {"error": self._named_as_there(problem.to_json()["error"])}
+        where: dict[int, Header] | None = None
+        if time.monotonic() - self._looked > _WHERE_EVERY_S:
+            self._looked = time.monotonic()
+            where = {number: _values(header) for number, header in self._pool.where().items()}
+        notes = [self._named_as_there(note) for note in self._pool.notes()]
+        return News(ended, where, notes, error, self._map() if any(done.files for done in ended) else b"")
+
+    def _completed(self, wait_s: float) -> Iterator[TrialResult]:
+        """Yield what has ended, and what ends soon after it: each call from another machine costs both some time.
+
+        Nobody waits for that: what is kept goes back at once, as does everything where workers may soon be idle.
+        """
+        assert self._pool is not None
+        deadline, urgent = 0.0, False
+        while True:
+            for result in self._pool.completed(wait_s):
+                deadline, urgent = deadline or time.monotonic() + _GATHER_S, urgent or result.kept
+                yield result
+            wait_s = deadline - time.monotonic()
+            if urgent or wait_s <= 0 or 2 * len(self._tickets) < 3 * self._job["slots"]:
+                return
+
+    def close(self) -> None:
+        """End everything, and leave nothing behind."""
+        if self._pool is not None:
+            self._pool.close()
+        if self._place is not None:
+            self._place.remove()
+
+    def _handed_over(self, ticket: int, result: TrialResult) -> Ended:
+        data = result.to_json()
+        if data.get("failure"):
+            data["failure"] = self._named_as_there(data["failure"])
+        line = json.dumps({"ticket": ticket, "result": data}).encode() + b"\n"
+        files = {}
+        if result.kept:
+            assert self._place is not None
+            folder = scratch_of(self._place.scratch, result.spec.number)
+            for path in folder.iterdir():
+                if path.is_file() and not path.is_symlink():
+                    files[path.name] = zlib.compress(self._content(path), 1)
+            shutil.rmtree(folder, ignore_errors=True)  # whatever else an agent has put there
+        return Ended(ticket, result.spec.number, line, files)
+
+    def _content(self, path: Path) -> bytes:
+        with path.open("rb") as file:
+            box = read_header(path) if path.name == layout.BLACK_BOX else None
+            content = file.read(max(_HEAD, box.committed) if box is not None else -1)
+        if path.name in _TEXTS:
+            for here, there in self._renamed:
+                content = content.replace(os.fsencode(here), os.fsencode(there))
+        return content
+
+    def _named_as_there(self, said: Any) -> Any:
+        """The same with the names of files as they are on the machine where the hunt was begun."""
+        if isinstance(said, dict):
+            return {key: self._named_as_there(value) for key, value in said.items()}
+        if isinstance(said, list):
+            return [self._named_as_there(value) for value in said]
+        if isinstance(said, str):
+            for here, there in self._renamed:
+                said = said.replace(here, there)
+        return said
+
+    def _map(self) -> bytes:
+        """The map that trials of this node have in common, once."""
+        if self._map_sent or self._place is None:
+            return b""
+        with suppress(OSError):
+            content = (self._place.scratch / layout.MAP).read_bytes()
+            self._map_sent = True
+            return zlib.compress(content, 1)
+        return b""
+
+
+def _values(header: BlackBoxHeader) -> Header:
+    return header.pid, header.trial, header.started, header.committed, header.step, int(header.phase), header.agent
+
+
+def unpacked(files: dict[str, bytes], folder: Path) -> None:
+    """Write the files of a trial that is kept into a new folder.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (folder / Path(name).name).write_bytes(zlib.decompress(content))

@@ -1,0 +1,419 @@
+"""The reference of the Python interface, made from signatures and docstrings.
+
+The sources are read and not imported: a page is there at once, and no package has to be installed that only some need.
+Only functions whose arguments are made from a list when they are imported are asked themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import functools
+import importlib
+import inspect
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+__all__ = ["as_markdown", "definition", "describe_api", "describe_commands", "describe_keys", "describe_modules"]
+
+
+_OFFERED = {
+    "crashhunt": "",
+    "crashhunt.hunts": "HuntReport HuntResults SuiteResults",
+    "crashhunt.crashes": "Bundle",
+    "crashhunt.recording": "Recording Divergence",
+    "crashhunt.replays": "ReplayReport",
+    "crashhunt.estimation": "Comparison HuntFigures",
+    "crashhunt.snapshots": "SnapshotOptions",
+    "crashhunt.trial": "Outcome TrialSpec TrialResult Collision Escape Failure",
+    "crashhunt.space": "",
+    "crashhunt.agents": "",
+    "crashhunt.world": "Scene Roster Actor Contact Lane Event ClosestApproach outlines_overlap rectangle_gap "
+    "time_to_contact closest_approach",
+    "crashhunt.scenario": "load_scenario Scenario AgentSetup ObservationSetup Backend Configuration Accelerator",
+    "crashhunt.simulators": "Simulator ActionForm FullBraking SpeedAndLaneChange MetaAction SpaceAction Kinematics",
+    "crashhunt.oracles": "Oracle Finding SeesMap BringsOutcomes ReportedCollision Overlap OffRoad TooClose",
+    "crashhunt.samplers": "",
+    "crashhunt.executors": "Executor PoolExecutor FreshProcessExecutor",
+    "crashhunt.render": "Action ActionDistribution Bar Contour Curve Curve3D Heatmap Picture Text scope",
+    "crashhunt.errors": "",
+    "crashhunt.testing": "",
+}
+"""The modules that users import, and what of each is for them; empty for everything."""
+
+_SECTION = re.compile(r"^(Args|Attributes|Example|Returns|Yields|Raises):$")
+_WORDS = {name: name for name in ("Attributes", "Returns", "Yields", "Raises")} | {"Args": "Arguments"}
+_Definition = ast.ClassDef | ast.FunctionDef
+
+
+def describe_api() -> str:
+    """Return what users import, with signatures and docstrings, as Markdown."""
+    return "\n".join(line for module, names in _OFFERED.items() for line in _module(module, names.split()))
+
+
+def _module(name: str, names: list[str]) -> Iterator[str]:
+    yield f"## {name}\n"
+    yield from _docstring(ast.get_docstring(_parsed(name)))
+    for public in names or sorted(_door(name), key=str.lower):
+        found = definition(name, public)
+        if found is not None:
+            yield from _described(f"{name}.{public}", found)
+        elif names:
+            raise LookupError(f"{name} has no class or function {public}; mend the list in {__file__}")
+
+
+def _described(name: str, found: _Definition) -> Iterator[str]:
+    yield f"### {name}\n"
+    if any("called_with" in ast.unparse(decorator) for decorator in found.decorator_list):
+        made, text = _asked(name)
+    else:
+        made = _signature(found) if isinstance(found, ast.FunctionDef) else _made_with(found)
+        text = ast.get_docstring(found)
+    if made:
+        yield f"```python\n{found.name}{made}\n```\n"
+    yield from _docstring(text)
+    if isinstance(found, ast.ClassDef):
+        if not made:
+            yield from _attributes(found)
+        yield from _methods(found)
+
+
+def _asked(name: str) -> tuple[str, str | None]:
+    """Signature and docstring as the function itself has them."""
+    module, _, attribute = name.rpartition(".")
+    function = getattr(importlib.import_module(module), attribute)
+    known = inspect.signature(function)
+    parts = []
+    for parameter in known.parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
+            parts.append("*")
+        default = "" if parameter.default is parameter.empty else f" = {_value(parameter.default)}"
+        parts.append(f"{parameter.name}: {_type(parameter.annotation)}{default}")
+    return f"{_call(parts)} -> {_type(known.return_annotation)}", inspect.getdoc(function)
+
+
+def _type(annotation: object) -> str:
+    said = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return re.sub(r"\b(collections\.abc|pathlib|typing)\.", "", said)
+
+
+def _value(value: object) -> str:
+    """A default as one would write it: members of an enumeration by their values."""
+    return re.sub(r"<\w+\.\w+: ('\w+')>", r"\1", repr(value))
+
+
+def _attributes(found: ast.ClassDef) -> Iterator[str]:
+    """Those of a protocol, each with the string below it."""
+    for item, after in zip(found.body, [*found.body[1:], ast.Pass()], strict=True):
+        if isinstance(item, ast.AnnAssign):
+            yield f"**`{ast.unparse(item.target)}: {ast.unparse(item.annotation)}`**\n"
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            yield from _docstring(str(ast.literal_eval(after.value)) if is_text else "")  # type: ignore[attr-defined]
+
+
+def _methods(found: ast.ClassDef) -> Iterator[str]:
+    for method in found.body:
+        if isinstance(method, ast.FunctionDef) and not method.name.startswith("_"):
+            decorators = {ast.unparse(decorator) for decorator in method.decorator_list}
+            if {"property", "cached_property"} & decorators:
+                shown = f": {ast.unparse(method.returns)}" if method.returns else ""
+            else:
+                shown = _signature(method, bound="staticmethod" not in decorators)
+            yield f"**`{method.name}{shown}`**\n"
+            yield from _docstring(ast.get_docstring(method))
+
+
+def _made_with(found: ast.ClassDef) -> str:
+    """How an instance is made; empty for protocols, errors and enumerations."""
+    for method in found.body:
+        if isinstance(method, ast.FunctionDef) and method.name == "__init__":
+            return _signature(method, bound=True).removesuffix(" -> None")
+    if not any("dataclass" in ast.unparse(decorator) for decorator in found.decorator_list):
+        return ""
+    fields = [item for item in found.body if isinstance(item, ast.AnnAssign) and not _is_private(item)]
+    return _call([f"{ast.unparse(item.target)}: {ast.unparse(item.annotation)}{_default(item)}" for item in fields])
+
+
+def _is_private(field: ast.AnnAssign) -> bool:
+    return ast.unparse(field.target).startswith("_")
+
+
+def _default(field: ast.AnnAssign) -> str:
+    if field.value is None:
+        return ""
+    said = ast.unparse(field.value)
+    made = re.fullmatch(r"field\(default_factory=(\w+)\)", said)
+    return f" = {made[1]}()" if made else f" = {said}"
+
+
+def _signature(function: ast.FunctionDef, *, bound: bool = False) -> str:
+    given = function.args
+    if bound:
+        given = ast.arguments(**{name: getattr(given, name) for name in given._fields} | {"args": given.args[1:]})
+    parts = _parts(given)
+    answer = f" -> {ast.unparse(function.returns)}" if function.returns else ""
+    return _call(parts) + answer
+
+
+def _parts(given: ast.arguments) -> list[str]:
+    """The parameters, as they are written."""
+    plain = [*given.posonlyargs, *given.args]
+    defaults = [None] * (len(plain) - len(given.defaults)) + list(given.defaults)
+    parts = [_parameter(name, default) for name, default in zip(plain, defaults, strict=True)]
+    if given.vararg:
+        parts.append(f"*{_parameter(given.vararg, None)}")
+    elif given.kwonlyargs:
+        parts.append("*")
+    parts += [_parameter(*pair) for pair in zip(given.kwonlyargs, given.kw_defaults, strict=True)]
+    return [*parts, f"**{_parameter(given.kwarg, None)}"] if given.kwarg else parts
+
+
+def _parameter(name: ast.arg, default: ast.expr | None) -> str:
+    said = f"{name.arg}: {ast.unparse(name.annotation)}" if name.annotation else name.arg
+    equals = " = " if name.annotation else "="
+    return said if default is None else f"{said}{equals}{ast.unparse(default)}"
+
+
+def _call(parts: list[str]) -> str:
+    line = f"({', '.join(parts)})"
+    return line if len(line) <= 88 else "(\n" + "".join(f"    {part},\n" for part in parts) + ")"
+
+
+def as_markdown(docstring: str | None) -> str:
+    """Return a docstring in Google's style as Markdown."""
+    return "\n".join(_docstring(docstring))
+
+
+def _docstring(text: str | None) -> Iterator[str]:
+    """A docstring in Google's style as Markdown: prose stays, its sections become lists, examples are code."""
+    section = ""
+    for line in inspect.cleandoc(text or "").splitlines():
+        begun = _SECTION.match(line)
+        if begun or (section and line and not line.startswith("    ")):
+            if section == "Example":
+                yield "```\n"
+            section = begun[1] if begun else ""
+        if begun:
+            yield "```python" if section == "Example" else f"*{_WORDS[section]}*:\n"
+        elif section == "Example":
+            yield line[4:]
+        elif section:
+            yield _item(line)
+        else:
+            yield line if line.startswith("    ") else _prose(line)
+    yield "```\n" if section == "Example" else ""
+
+
+def _item(line: str) -> str:
+    """Return a line of a section: the entry of a name, or a continuation line."""
+    named = re.match(r" {4}(\*{0,2}\w+): (.*)", line)
+    return f"- `{named[1]}`: {_prose(named[2])}" if named else f"  {_prose(line.strip())}".rstrip()
+
+
+def _prose(line: str) -> str:
+    """Prose with the marks of Markdown; what two colons announce is indented, which is enough."""
+    return re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"^::$|:(?=:$)", "", line))
+
+
+def _door(module: str) -> dict[str, tuple[str, str]]:
+    """What a module offers, and where each is defined: the module and the name there."""
+    stub = _file(module).with_suffix(".pyi")
+    tree = ast.parse(stub.read_text(encoding="utf-8")) if stub.is_file() else _parsed(module)
+    found: dict[str, tuple[str, str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            origin = f"{module}.{node.module}" if node.level else str(node.module)
+            for alias in node.names:
+                if alias.name == "*":
+                    found |= _door(origin)
+                elif origin.startswith("crashhunt"):
+                    found[alias.asname or alias.name] = origin, alias.name
+    found |= {node.name: (module, node.name) for node in tree.body if isinstance(node, _Definition)}
+    listed = _listed(tree)
+    return {name: place for name, place in found.items() if name[0] != "_" and (listed is None or name in listed)}
+
+
+def _listed(tree: ast.Module) -> list[str] | None:
+    """The names in ``__all__``; None where it is made when the module is imported."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return ast.literal_eval(node.value) if isinstance(node.value, ast.List) else None
+    return None
+
+
+def definition(module: str, name: str) -> _Definition | None:
+    """The class or function behind a name, wherever it is defined; None for anything else."""
+    origin, known = _door(module).get(name, (module, name))
+    if (origin, known) != (module, name):
+        return definition(origin, known)
+    return next((node for node in _parsed(module).body if isinstance(node, _Definition) and node.name == name), None)
+
+
+@functools.cache
+def _parsed(module: str) -> ast.Module:
+    return ast.parse(_file(module).read_text(encoding="utf-8"))
+
+
+def _file(module: str) -> Path:
+    place = Path(__file__).parents[1].joinpath(*module.split(".")[1:])
+    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+
+
+# The reference of ``scenario.toml`` and ``suite.toml``, made from the dataclasses that read them.
+
+_SCENARIO = (
+    ("At the top", "crashhunt.scenario", "Scenario"),
+    ("[observation]", "crashhunt.scenario", "ObservationSetup"),
+    ("[arguments.NAME], [agents.ID.arguments.NAME]", "crashhunt.scenario", "ArgumentSetup"),
+    ("[agents.ID]", "crashhunt.scenario", "AgentSetup"),
+    ("[sumo]", "crashhunt.scenario.backends.sumo._options", "SumoSetup"),
+    ("[highway]", "crashhunt.scenario.backends.highway", "HighwaySetup"),
+    ("[gym]", "crashhunt.scenario.backends.gym", "GymSetup"),
+    ("crash, in [gym]", "crashhunt.scenario.backends.gym", "CrashRule"),
+)
+# Fields of Scenario that no file has, and the one that represents the tables below.
+_NO_KEY = re.compile(r"^- `(?:tables|\w+`: .*not part of (?:the file|it)\b).*\n(?:  .*\n)*", re.MULTILINE)
+
+
+def describe_keys() -> str:
+    """Return every table of both files with its keys, as Markdown."""
+    return "\n".join((*_scenario(), *_suite()))
+
+
+def _scenario() -> Iterator[str]:
+    yield "## scenario.toml\n"
+    for title, module, name in _SCENARIO:
+        yield f"### {title}\n"
+        yield _NO_KEY.sub("", _keys(module, name))
+
+
+def _suite() -> Iterator[str]:
+    from crashhunt.plans import hunt_options
+
+    yield "## suite.toml\n"
+    yield "`[defaults]` and each `[[hunts]]` have the same keys; what a hunt says itself wins.\n"
+    own = _keys("crashhunt.suites", "SuiteEntry").rstrip()
+    yield own
+    options = [option.line.partition(": ") for option in hunt_options()]
+    named = [option for option in options if f"- `{option[0]}`" not in own]
+    yield from (f"- `{name}`: {as_markdown(meaning).strip()}" for name, _, meaning in named)
+
+
+def _keys(module: str, name: str) -> str:
+    """The keys of a table, without what the docstring says before them."""
+    found = definition(module, name)
+    text = as_markdown(ast.get_docstring(found) if found else "")
+    _, heading, keys = text.partition("*Arguments*:\n\n")
+    if not heading:
+        raise LookupError(f"{module}.{name} does not say what its keys are")
+    return keys.partition("\n*")[0].rstrip() + "\n"
+
+
+# The reference of the command line, made from its parser: so it cannot be out of date.
+
+
+def describe_commands(parser: argparse.ArgumentParser) -> str:
+    """Return every command with its arguments and options, as Markdown.
+
+    Args:
+        parser: of the command line.
+    """
+    return "\n".join(line for command, _ in _commands(parser) for line in _command(command))
+
+
+def _commands(parser: argparse.ArgumentParser) -> Iterator[tuple[argparse.ArgumentParser, str]]:
+    """The commands that do something, and the commands of these."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, inner in action.choices.items():
+                if any(isinstance(below, argparse._SubParsersAction) for below in inner._actions):
+                    yield from _commands(inner)
+                else:
+                    yield inner, name
+
+
+def _command(command: argparse.ArgumentParser) -> Iterator[str]:
+    places = " ".join(_place(action) for action in command._actions if not action.option_strings)
+    yield f"## {command.prog}\n"
+    yield f"`{command.prog}{' ' if places else ''}{places}`\n"
+    yield f"{_plain(command.description)}\n"
+    for group in command._action_groups:
+        actions = [action for action in group._group_actions if action.dest != "help"]
+        if not actions:
+            continue
+        if group.title not in ("positional arguments", "options"):
+            yield f"*{_plain(group.title)}*" + (f": {_plain(group.description)}" if group.description else "") + "\n"
+        yield from (f"- `{_written(action)}`: {_plain(_expanded(command, action))}" for action in actions)
+        yield ""
+    if command.epilog:
+        yield f"```text\n{command.epilog.strip()}\n```\n"
+
+
+def _place(action: argparse.Action) -> str:
+    name = str(action.metavar or action.dest)
+    return {"?": f"[{name}]", "+": f"{name} [{name} ...]", "*": f"[{name} ...]"}.get(str(action.nargs), name)
+
+
+def _written(action: argparse.Action) -> str:
+    if not action.option_strings:
+        return str(action.metavar or action.dest)
+    value = ""
+    if action.nargs != 0:
+        choices = "{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.dest.upper()
+        value = f" {action.metavar or choices}"
+    return ", ".join(f"{option}{value}" for option in action.option_strings)
+
+
+def _expanded(command: argparse.ArgumentParser, action: argparse.Action) -> str:
+    return (action.help or "") % {**vars(action), "prog": command.prog}
+
+
+def _plain(text: str | None) -> str:
+    """Text in which nothing is Markdown by accident, such as the name of a placeholder between angle brackets."""
+    said = " ".join((text or "").split())
+    return "".join(f"\\{letter}" if letter in "*<[`" else letter for letter in said)
+
+
+# The list of all modules with what each is about, made from what it says first of itself.
+
+_ROOT = Path(__file__).parents[1]
+_SAID = {
+    ".py": re.compile(r'\A"""(.+?)(?:\n\n|""")', re.DOTALL),
+    ".cpp": re.compile(r"\A// (.+?)\n"),
+    ".hpp": re.compile(r"\A// (.+?)\n"),
+    ".html": re.compile(r"\A<!DOCTYPE html>\n<!-- (.+?) -->"),
+}
+"""What a file says first of itself; read as text, since importing everything would take seconds."""
+
+
+def describe_modules() -> str:
+    """Return every package with its modules, as Markdown."""
+    return "\n".join(_lines())
+
+
+def _lines() -> Iterator[str]:
+    yield "## crashhunt\n"
+    yield from _members(_ROOT)
+    for door in sorted(_ROOT.rglob("*/__init__.py")):
+        folder = door.parent
+        yield f"\n## {folder.relative_to(_ROOT.parent).as_posix()}\n"
+        yield f"{_said(door)}\n"
+        yield from _members(folder)
+
+
+def _members(folder: Path) -> Iterator[str]:
+    for file in sorted(folder.iterdir()):
+        if file.suffix in _SAID and file.name != "__init__.py":
+            yield f"- `{file.name}`: {_said(file)}"
+
+
+def _said(file: Path) -> str:
+    found = _SAID[file.suffix].match(file.read_text(encoding="utf-8"))
+    if found is None:
+        raise LookupError(f"{file} does not begin with what it is about")
+    return " ".join(found[1].replace("``", "`").split())

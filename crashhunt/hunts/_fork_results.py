@@ -1,0 +1,371 @@
+"""What the branches of trials have found in a hunt, and the likeliest of it run from the start."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.hunts._state import BRANCHES, PROBES
+from crashhunt.hunts._verification import Found
+from crashhunt.trial import Branches, Stress, in_turn
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.crashes import Bundle
+    from crashhunt.hunts._next_trials import Trials
+    from crashhunt.hunts._progress import Progress
+    from crashhunt.hunts._verification import VerificationRuns
+    from crashhunt.trial import Branch, Disturbance, TrialResult
+
+
+__all__ = [
+    "BranchReport",
+    "CopiedCrashes",
+    "ProbeReport",
+    "likeliest",
+    "mildest",
+    "verify_branches",
+    "verify_fork_results",
+    "verify_probes",
+]
+
+
+_LIKELIEST = 10  # trials; each takes two processes of its own
+
+
+@dataclass(frozen=True, slots=True)
+class BranchReport:
+    """What came of the branches of a hunt.
+
+    Args:
+        trials: of how many trials there might have been some.
+        moments: from how many copies went on.
+        branches: how many there were.
+        steps: how many steps they took.
+        left_out: how many were left out, because branches had taken enough steps.
+        crashed: how many crashed.
+        crashed_trials: in how many trials.
+        not_fully_asked: of how many of the trials a branch has no answer.
+        why_unanswered: the reason for the first of them; empty where there is none.
+        run_again: how many of these were run from the start: of each trial the likeliest.
+        not_finished: how many of these could not be run to their end, as when they are killed from outside.
+        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+    """
+
+    trials: int
+    moments: int
+    branches: int
+    steps: int
+    left_out: int
+    crashed: int
+    crashed_trials: int
+    not_fully_asked: int
+    why_unanswered: str
+    run_again: int
+    not_finished: int
+    crashes: tuple[Bundle, ...]
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "trials": self.trials,
+            "moments": self.moments,
+            "branches": self.branches,
+            "steps": self.steps,
+            "left_out": self.left_out,
+            "crashed": self.crashed,
+            "crashed_trials": self.crashed_trials,
+            "not_fully_asked": self.not_fully_asked,
+            "run_again": self.run_again,
+            "not_finished": self.not_finished,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+def verify_branches(copies: VerificationRuns) -> BranchReport | None:
+    """Sum up what branches came to, and run the likeliest that crashed from the start, in fresh processes.
+
+    Args:
+        copies: runs from the start what they have found.
+
+    Returns:
+        None where there were to be none.
+    """
+    ledger = copies.again.ledger
+    if not copies.again.settings.branch:
+        return None
+    sums, why_unanswered = [0] * 7, ""
+    found: list[tuple[int, Branch]] = []  # of each trial the likeliest; there may be a million trials
+    for plain in ledger.plain_results():
+        if not (data := plain.get("branches")):
+            continue
+        one = Branches.from_json(data)
+        counts = (1, one.moments, one.asked, one.steps, one.left_out, len(one.crashes), one.unanswered > 0)
+        why_unanswered = why_unanswered or one.why_unanswered
+        sums = [sum(pair) for pair in zip(sums, counts, strict=True)]
+        if one.crashes:
+            found.append((plain["spec"]["number"], max(one.crashes, key=_likely)))
+    kept = copies.kept.get(layout.BRANCHES, {})
+    specs = [
+        _specification(result, branch)
+        for number, branch in sorted(found, key=lambda pair: (pair[0] not in kept, -_likely(pair[1])))[:_LIKELIEST]
+        if (result := ledger.result(number)) is not None
+    ]
+    crashes, not_finished = copies.crashes(specs, layout.BRANCHES)
+    trials, moments, branches, steps, left_out, crashed, not_fully_asked = sums
+    return BranchReport(
+        trials,
+        moments,
+        branches,
+        steps,
+        left_out,
+        crashed,
+        len(found),
+        not_fully_asked,
+        why_unanswered,
+        0 if copies.is_stopped else len(specs),
+        not_finished,
+        crashes,
+    )
+
+
+def likeliest(result: TrialResult) -> Found | None:
+    """Return the likeliest branch of a trial that crashed, as it is from the start; None where none did."""
+    if result.branches is None or not result.branches.crashes:
+        return None
+    return _specification(result, max(result.branches.crashes, key=_likely))
+
+
+def _specification(result: TrialResult, branch: Branch) -> Found:
+    spec = replace(result.spec, disturbances=branch.disturbances, origin="branch")
+    return Found(spec, branch.outcome, branch.step)
+
+
+def _likely(branch: Branch) -> float:
+    return -math.inf if branch.log_likelihood is None else branch.log_likelihood
+
+
+# What probes have found in a hunt, and the mildest of it run from the start: only that is a crash.
+
+_MILDEST = 3  # trials; each takes two processes of its own
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeReport:
+    """What came of the probes of a hunt.
+
+    Args:
+        margins: the stress margin of each trial of which all was asked that was to be asked.
+        not_fully_asked: of how many further trials a question has no answer.
+        why_unasked: the reason for the first of them; empty where there is none.
+        probes: how many copies were asked.
+        steps: how many steps they took.
+        left_out: how many questions were left out, because copies had taken enough steps.
+        run_again: how many of the mildest were run from the start.
+        not_finished: how many of these could not be run to their end, as when they are killed from outside.
+        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+        by: what each of these was probed with, as it took place; others may have been drawn besides.
+    """
+
+    margins: tuple[float, ...]
+    not_fully_asked: int
+    why_unasked: str
+    probes: int
+    steps: int
+    left_out: int
+    run_again: int
+    not_finished: int
+    crashes: tuple[Bundle, ...]
+    by: tuple[Disturbance, ...]
+
+    def to_json(self) -> JsonObject:
+        """Return the shape that ``run --json`` prints."""
+        return {
+            "trials": len(self.margins),
+            "not_fully_asked": self.not_fully_asked,
+            "least": min(self.margins, default=None),
+            "median": statistics.median(self.margins) if self.margins else None,
+            "probes": self.probes,
+            "steps": self.steps,
+            "left_out": self.left_out,
+            "run_again": self.run_again,
+            "not_finished": self.not_finished,
+            "confirmed": len(self.crashes),
+            "crashes": [bundle.summary() for bundle in self.crashes],
+        }
+
+
+def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
+    """Sum up what copies were asked, and run the mildest that made a trial crash from the start, in fresh processes.
+
+    Args:
+        copies: runs from the start what they have found.
+
+    Returns:
+        None where nobody has asked.
+    """
+    ledger = copies.again.ledger
+    if not copies.again.settings.probe:
+        return None
+    margins: list[float] = []
+    not_fully_asked, why_unasked = 0, ""
+    sums = [0] * 3
+    found: list[tuple[float, int]] = []
+    for plain in ledger.plain_results():
+        if not (data := plain.get("stress")):
+            continue
+        stress = Stress.from_json(data)
+        if stress.margin is not None:
+            margins.append(stress.margin)
+        else:
+            not_fully_asked, why_unasked = not_fully_asked + 1, why_unasked or stress.why_unasked
+        sums = [sum(pair) for pair in zip(sums, (stress.probes, stress.steps, stress.left_out), strict=True)]
+        if stress.disturbance is not None:
+            found.append((stress.least, plain["spec"]["number"]))
+    kept = copies.kept.get(layout.PROBES, {})
+    results = [
+        result
+        for _, number in sorted(found, key=lambda pair: (pair[1] not in kept, pair[0]))[:_MILDEST]
+        if (result := ledger.result(number)) is not None
+    ]
+    specs = [one for result in results if (one := mildest(result)) is not None]
+    crashes, not_finished = copies.crashes(specs, layout.PROBES)
+    asked = {result.spec.number: result.stress for result in results}
+    by = tuple(_as_it_took_place(asked[bundle.result.spec.number], bundle.result) for bundle in crashes)
+    probes, steps, left_out = sums
+    return ProbeReport(
+        tuple(margins),
+        not_fully_asked,
+        why_unasked,
+        probes,
+        steps,
+        left_out,
+        0 if copies.is_stopped else len(specs),
+        not_finished,
+        crashes,
+        by,
+    )
+
+
+def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance:
+    """What a trial was probed with, as it took place when it was run from the start."""
+    assert stress is not None
+    planned = stress.disturbance
+    assert planned is not None
+    key = planned.step, planned.agent, planned.what
+    return next((one for one in result.disturbances if (one.step, one.agent, one.what) == key), planned)
+
+
+def mildest(result: TrialResult) -> Found | None:
+    """Return a trial from the start, with the mildest that made a copy of it crash; None where nothing did."""
+    stress = result.stress
+    if stress is None or stress.disturbance is None:
+        return None
+    planned = in_turn([*result.spec.disturbances, stress.disturbance])
+    return Found(replace(result.spec, disturbances=planned, origin="probe"), stress.outcome, stress.step)
+
+
+# A crash that a copy of a trial has found, and that comes again from the start, ends a hunt as any other does.
+
+
+class CopiedCrashes:
+    """Runs from the start what copies of trials have crashed with, where a crash of that kind would end the hunt.
+
+    That is one by disturbances of the kinds that the hunt has. A probe asks for all others as well, and with the worst
+    that is plausible nearly every trial ends in a crash: that measures a trial, and is no crash that the hunt is after.
+    Where kinds of crashes are counted, or those that are the agent's own fault, trials alone end the hunt.
+
+    Args:
+        copies: runs from the start what they have found.
+        progress: of the hunt, which gets what has crashed there as well.
+        trials: of the hunt that are still to run.
+    """
+
+    def __init__(self, copies: VerificationRuns, progress: Progress, trials: Trials) -> None:
+        self._copies, self._trials = copies, trials
+        self._progress = progress
+        run, disturber = copies.again.settings.run, copies.disturber
+        self._ends = not run.keep_going and not run.only_at_fault and disturber is not None and bool(disturber.models)
+        self._deterministic = run.deterministic
+        self._waiting: list[TrialResult] = []
+
+    def resume(self) -> None:
+        """Look at trials that ended in earlier runs of the hunt, which may have been killed before it had."""
+        ledger = self._copies.again.ledger
+        if not self._ends or self._progress.is_done:
+            return
+        numbers = [
+            plain["spec"]["number"]
+            for plain in ledger.plain_results()
+            if ((branches := plain.get("branches")) and branches["crashes"])
+            or ((stress := plain.get("stress")) and stress["disturbance"])
+        ]
+        self._waiting = [result for number in numbers if (result := ledger.result(number)) is not None]
+        self.look()
+
+    def add(self, result: TrialResult) -> None:
+        """Take in a trial that has ended without a crash."""
+        if self._ends and self._found(result):
+            self._waiting.append(result)
+
+    def look(self, tell: Callable[[], None] = lambda: None) -> bool:
+        """Run from the start what has been found of the trials that were taken in; return whether one ends the hunt.
+
+        Args:
+            tell: called before that, where there is any.
+        """
+        waiting = sorted(self._waiting, key=lambda result: result.spec.number)
+        self._waiting = [result for result in waiting if self._comes_later(result.spec.number)]
+        ends = False
+        for result in waiting[: len(waiting) - len(self._waiting)]:
+            number, least = result.spec.number, self._progress.last_wanted
+            if least is not None and (number > least or not self._deterministic):
+                continue
+            tell()
+            for folder, found in self._found(result):
+                bundle = self._copies.crash(found, folder)
+                if bundle is not None:
+                    self._progress.copied[number] = bundle
+                    ends = True
+                    break
+        return ends
+
+    def _comes_later(self, number: int) -> bool:
+        """Whether trials of lower numbers have not begun: it had ended when the hunt was killed, and they had not."""
+        upcoming = self._trials.upcoming
+        return self._deterministic and upcoming is not None and upcoming < number
+
+    def _found(self, result: TrialResult) -> list[tuple[str, Found]]:
+        """What copies of a trial have crashed with, of the kinds that its hunt has; of its branches the likeliest."""
+        every = ((layout.BRANCHES, likeliest(result)), (layout.PROBES, mildest(result)))
+        return [(folder, one) for folder, one in every if one is not None and self._is_of_the_hunt(one)]
+
+    def _is_of_the_hunt(self, found: Found) -> bool:
+        disturber = self._copies.disturber
+        kinds = {model.what for model in disturber.models.values()} if disturber is not None else set()
+        return all(one.what in kinds or (disturber and one in disturber.fixed) for one in found.spec.disturbances)
+
+
+# The end of a hunt: what copies of its trials have found is run from the start.
+
+
+def verify_fork_results(copies: VerificationRuns) -> tuple[ProbeReport | None, BranchReport | None]:
+    """Run what copies have found from the start, and write down how much of it is confirmed.
+
+    Args:
+        copies: runs that.
+    """
+    probes, branches = verify_probes(copies), verify_branches(copies)
+    found = {PROBES: probes, BRANCHES: branches}
+    confirmed = {
+        name: (one.run_again - one.not_finished, len(one.crashes)) for name, one in found.items() if one is not None
+    }
+    if confirmed:
+        copies.again.ledger.note(confirmed=confirmed)
+    return probes, branches

@@ -1,0 +1,576 @@
+"""Confirmation while a hunt goes on: each crash that it saves is run again, on one of the hunt's own slots."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base import layout
+from crashhunt.base.codec import Serializable
+from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
+from crashhunt.base.temporary import remove_at_once, remove_scratch
+from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
+from crashhunt.episode import WorkerSettings, scratch_of
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor, SharedExecutors, read_map, snapshot_executor
+from crashhunt.hunts._next_trials import settings_again
+from crashhunt.recording import Recording, first_divergence, read_black_box
+from crashhunt.replays import confirm
+from crashhunt.snapshots import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+    from pathlib import Path
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.disturbances import DisturbanceSampler
+    from crashhunt.executors import Executor
+    from crashhunt.hunts._progress import Progress
+    from crashhunt.hunts._state import HuntDirectory
+    from crashhunt.ledger import Facts, Ledger
+    from crashhunt.plans import HuntSettings
+    from crashhunt.trial import TrialResult, TrialSpec
+
+
+__all__ = [
+    "Again",
+    "Audit",
+    "AuditReport",
+    "AuditsLeft",
+    "Confirmation",
+    "Difference",
+    "Found",
+    "TrialReruns",
+    "VerificationRuns",
+]
+
+
+class Confirmation:
+    """Confirms crashes one at a time, beside the thread of the hunt. Meanwhile, the hunt has one slot less.
+
+    Crashes that it has not come to when the hunt is over are confirmed then.
+
+    Args:
+        again: runs them.
+        executor: of the hunt.
+    """
+
+    def __init__(self, again: TrialReruns, executor: Executor) -> None:
+        self._again = again
+        self._executor = executor
+        self._asked: queue.SimpleQueue[Bundle | None] = queue.SimpleQueue()
+        self._confirmed: queue.SimpleQueue[Bundle] = queue.SimpleQueue()
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._known: set[str] = set()
+
+    def look(self, progress: Progress) -> None:
+        """Ask for crashes that are new, and take in those that have been confirmed."""
+        if progress.kinds is None:
+            return  # the first crash ends the hunt, and is confirmed then
+        for bundle in progress.crashes:
+            if bundle.confirmed is None and bundle.id not in self._known:
+                self._known.add(bundle.id)
+                self._asked.put(bundle)
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._confirm, name="crashhunt-confirmation", daemon=True)
+                    self._thread.start()
+        with suppress(queue.Empty):
+            while True:
+                found = self._confirmed.get_nowait()
+                progress.replace([found if found.id == crash.id else crash for crash in progress.crashes])
+
+    def close(self, progress: Progress) -> None:
+        """Give up what runs, so that no stop waits for it."""
+        self._over.set()
+        if self._thread is not None:
+            self._asked.put(None)
+            self._thread.join()
+        self.look(progress)
+
+    def _confirm(self) -> None:
+        while (bundle := self._asked.get()) is not None and not self._over.is_set():
+            self._hold_back(1)
+            try:
+                found = self._again.confirm_one(bundle, self._over.is_set)
+                if found is not bundle:
+                    self._confirmed.put(found)
+            except Exception:  # the confirmation at the end of the hunt reports it
+                return
+            finally:
+                self._hold_back(0)
+
+    def _hold_back(self, slots: int) -> None:
+        if isinstance(self._executor, PoolExecutor):
+            self._executor.held_back = slots
+
+
+# Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings.
+
+_LOOK_EVERY_S = 0.1  # how late Ctrl-C may be
+
+
+@dataclass(frozen=True, slots=True)
+class TrialReruns:
+    """Runs trials of a hunt again.
+
+    Args:
+        place: of the hunt.
+        ledger: of the hunt, which knows the code of each trial.
+        settings: of the hunt.
+        parallel: how many run at a time.
+        notes: gets a line for whatever went wrong.
+        failed: gets what was to confirm something, and ended otherwise.
+        stops: has something in it as soon as somebody wants to stop.
+        executors: which run crashes again.
+        taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
+    """
+
+    place: HuntDirectory
+    ledger: Ledger
+    settings: HuntSettings
+    parallel: int
+    notes: list[str]
+    failed: list[TrialResult]
+    stops: Sized
+    executors: SharedExecutors
+    taken: str = ""
+
+    def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
+        """Yield each trial as it ends, until somebody wants to stop.
+
+        Args:
+            specs: of different trials of the hunt; what else they say may have been changed.
+            folder: of the hunt, into which bundles of them are written.
+
+        Raises:
+            CrashhuntError: they cannot be run.
+        """
+        by_snapshot: dict[str, list[TrialSpec]] = {}
+        for spec in specs:
+            by_snapshot.setdefault(self.ledger.snapshot_of(spec.number), []).append(spec)
+        scratch = self.place.scratch / folder
+        for digest, group in by_snapshot.items():
+            snapshot = Snapshot(self.place.path / layout.SNAPSHOTS / digest)
+            if digest != self.taken and not is_snapshot_trusted(snapshot):
+                self.notes.append(
+                    f"{len(group)} trials for {folder} did not run again: nothing proves that you took the snapshot "
+                    f"{digest} on this machine; if you trust its code, run crashhunt trust {self.place.path}, and then "
+                    "the same command again"
+                )
+                continue
+            scratch.mkdir(exist_ok=True)
+            try:
+                again = settings_again(self.settings, snapshot, scratch)
+                with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
+                    waiting = len(group)
+                    for spec in group:
+                        executor.submit(spec)
+                    while waiting and not len(self.stops):
+                        for result in executor.completed(_LOOK_EVERY_S):
+                            waiting -= 1
+                            yield Again(result, self, digest, scratch, folder)
+            finally:
+                remove_scratch(scratch)
+
+    def confirm(self, crashes: Sequence[Bundle]) -> list[Bundle]:
+        """Run every crash that is not fully confirmed yet once more, and return them all, in their order."""
+        with ThreadPoolExecutor(self.parallel) as threads:  # which only wait for their process
+            return list(threads.map(self.confirm_one, crashes))
+
+    def confirm_one(self, bundle: Bundle, stopped: Callable[[], bool] = lambda: False) -> Bundle:
+        """Run a crash that is not fully confirmed yet once more; return it as it is then.
+
+        Args:
+            bundle: the crash.
+            stopped: asked now and then whether to give up.
+        """
+        is_settled = bundle.confirmed is not None and not bundle.result.why_no_escape
+        if is_settled or len(self.stops) or stopped():
+            return bundle
+        try:
+            found = confirm(
+                bundle,
+                lambda: bool(len(self.stops)) or stopped(),
+                failed=self.failed,
+                executors=self.executors,
+                trusted=self._is_made_now(bundle),
+            )
+        except UntrustedError as refusal:
+            note = f"{bundle.id} was not confirmed: {refusal.message}; {refusal.fix}"
+            if note not in self.notes:  # the end of the hunt asks again
+                self.notes.append(note)
+            return bundle
+        if found is None or not bundle.path.is_dir():  # a hunt with --keep may have given it up meanwhile
+            return bundle
+        found.write()
+        return found
+
+    def _is_made_now(self, bundle: Bundle) -> bool | None:
+        """Whether a bundle ran what this process has just taken a snapshot of, whose files need no second look."""
+        return True if bundle.snapshot == self.taken and is_bundle_made_here(bundle) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """A trial that has been run again.
+
+    Args:
+        result: what came of it.
+        runs: which ran it.
+        snapshot: the digest of its code.
+        scratch: the folder of the workers.
+        folder: of the hunt, for its bundle.
+    """
+
+    result: TrialResult
+    runs: TrialReruns
+    snapshot: str
+    scratch: Path
+    folder: str
+
+    def write(self, result: TrialResult, *, confirmed: bool | None = None) -> Bundle:
+        """Write the bundle: what it has left behind, with a result; return it."""
+        trial = scratch_of(self.scratch, result.spec.number)
+        return write_bundle(
+            self.runs.place.path, result, trial, hunt_seed=self.runs.settings.seed, snapshot=self.snapshot,
+            lanes=read_map(self.scratch, trial), place=self.folder, confirmed=confirmed,
+        )  # fmt: skip
+
+
+# What copies of trials have found, run from the start in fresh processes: only what crashes there again is a crash.
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """How a copy of a trial crashed.
+
+    Args:
+        spec: the same from the start.
+        outcome: of the copy.
+        step: at which it ended.
+    """
+
+    spec: TrialSpec
+    outcome: str
+    step: int
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationRuns:
+    """Runs from the start what copies have found.
+
+    Args:
+        again: runs trials of the hunt again.
+        disturber: knows how likely disturbances are; None where the hunt has no models.
+        kept: by folder and trial, what has been run already, and is not run again.
+    """
+
+    again: TrialReruns
+    disturber: DisturbanceSampler | None
+    kept: dict[str, dict[int, Bundle]] = field(default_factory=dict)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether somebody wants to stop: what was found may not have been run from the start then."""
+        return bool(len(self.again.stops))
+
+    def crashes(self, found: Sequence[Found], folder: str) -> tuple[tuple[Bundle, ...], int]:
+        """Return those that crashed in the same way at the same step, and once more to the bit, in their order.
+
+        The second value is how many could not be run to their end, so that nothing is known about them.
+
+        Args:
+            found: of different trials.
+            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. Where somebody wants
+                to stop, it stays.
+        """
+        if self.is_stopped:
+            return (), 0
+        place, kept = self.again.place.path / folder, self.kept.get(folder, {})
+        stay = {bundle.path.name for bundle in kept.values()}
+        for path in [one for one in place.iterdir() if one.name not in stay] if kept else [place]:
+            remove_at_once(path)
+        crashed, unanswered = self._run([one for one in found if one.spec.number not in kept], folder)
+        crashed = kept | crashed
+        return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
+
+    def crash(self, found: Found, folder: str) -> Bundle | None:
+        """Return one that crashed in the same way at the same step, and once more to the bit; it is kept.
+
+        Args:
+            found: how a copy crashed.
+            folder: of the hunt, for its bundle.
+        """
+        if self.is_stopped:
+            return None
+        crashed, _ = self._run([found], folder)  # one that was killed is run once more at the end of the hunt
+        self.kept.setdefault(folder, {}).update(crashed)
+        return crashed.get(found.spec.number)
+
+    def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
+        """Return the bundles of those that crashed as their copies did, and the numbers of those without an answer."""
+        wanted = {one.spec.number: one for one in found}
+        unanswered = set(wanted)
+        bundles: dict[int, Bundle] = {}
+        try:
+            for one in self.again.run([one.spec for one in found], folder):
+                result, copy = one.result, wanted[one.result.spec.number]
+                if result.was_killed_from_outside:
+                    continue
+                unanswered.discard(result.spec.number)
+                if (str(result.outcome), result.steps) != (copy.outcome, copy.step):
+                    self.again.failed.append(result)
+                    continue
+                if self.disturber is not None:
+                    result = replace(result, log_likelihood=self.disturber.log_likelihood_of(result))
+                bundles[result.spec.number] = one.write(result)
+        except CrashhuntError as error:
+            self.again.notes.append(f"what copies have found could not be run from the start: {error}")
+        with ThreadPoolExecutor(self.again.parallel) as threads:  # which only wait for their process
+            confirmed = list(threads.map(lambda bundle: self._confirmed(bundle, unanswered), bundles.values()))
+        return {bundle.result.spec.number: bundle for bundle in confirmed if bundle is not None}, unanswered
+
+    def _confirmed(self, bundle: Bundle, unanswered: set[int]) -> Bundle | None:
+        # It has just run here, so its code is trusted.
+        found = confirm(bundle, lambda: self.is_stopped, failed=self.again.failed, trusted=True)
+        if found is None or found.confirmed is None:
+            unanswered.add(bundle.result.spec.number)
+        if found is None or not found.confirmed:
+            self.again.failed.append(bundle.result)  # nothing has come of this run either
+            remove_at_once(bundle.path)
+            return None
+        found.write()
+        return found
+
+
+# The audit: a sample of trials that did not crash is run again, and has to be the same to the bit.
+#
+# A crash is confirmed in a fresh process anyway. A trial without one that depends on the trials before it in its
+# worker, on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
+
+
+@dataclass(frozen=True, slots=True)
+class Difference(Serializable):
+    """Where a trial went another way in a fresh process.
+
+    Args:
+        trial: its number.
+        step: the first that differs; None where there was no recording to compare, and only the digest differs.
+        agent: the agent or actor; empty where it is about neither.
+        field: what of it.
+        recorded: what it was in the hunt.
+        replayed: what it was in the fresh process.
+    """
+
+    trial: int
+    step: int | None
+    agent: str
+    field: str
+    recorded: object
+    replayed: object
+
+    def __str__(self) -> str:
+        whose = f" of {self.agent}" if self.agent else ""
+        where = "" if self.step is None else f"at step {self.step}, "
+        return (
+            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
+            f"{self.recorded} and is {self.replayed}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport(Serializable):
+    """What came of an audit.
+
+    Args:
+        trials: how many trials were run again.
+        differences: of those that were not the same.
+        not_finished: how many more were to be run again, and were not run to the end.
+    """
+
+    trials: int = 0
+    differences: tuple[Difference, ...] = ()
+    not_finished: int = 0
+
+    json_keys = ("trials", "not_finished", "differences")
+
+
+class Audit:
+    """Runs the sample again while the hunt goes on, one trial at a time.
+
+    Args:
+        settings: of the hunt; they say which trials.
+        failed: gets those that were not the same.
+    """
+
+    def __init__(self, settings: WorkerSettings, failed: list[TrialResult]) -> None:
+        self._settings = settings
+        self._failed = failed
+        self._scratch = settings.scratch / "audit"
+        self._scratch.mkdir(exist_ok=True)
+        again = replace(settings, scratch=self._scratch, audit=0.0, keep_trials=True)
+        self._executor = FreshProcessExecutor(again)
+        self._waiting: dict[int, TrialResult] = {}
+        self._done = 0
+        self._differences: list[Difference] = []
+        self._killed: set[int] = set()
+
+    @property
+    def left(self) -> list[int]:
+        """The numbers of the trials that were to be run again, and have not been run to the end yet."""
+        return sorted(self._killed | self._waiting.keys())
+
+    @property
+    def waiting(self) -> int:
+        """How many trials have not been run again yet."""
+        return len(self._waiting)
+
+    @property
+    def report(self) -> AuditReport:
+        """What has come of it so far."""
+        return AuditReport(self._done, tuple(self._differences), len(self.left))
+
+    @property
+    def parallel(self) -> int:
+        """How many trials run at a time."""
+        return self._executor.capacity
+
+    @parallel.setter
+    def parallel(self, parallel: int) -> None:
+        self._executor.capacity = parallel
+
+    def add(self, result: TrialResult) -> TrialResult:
+        """Take over the recording of a trial of the sample; return the trial as the hunt goes on with it."""
+        if not self._settings.is_audited(result):
+            return result
+        number = result.spec.number
+        recorded, folder = self._scratch / f"recorded-{number:06d}", scratch_of(self._settings.scratch, number)
+        recorded.mkdir()
+        (folder / layout.BLACK_BOX).rename(recorded / layout.BLACK_BOX)
+        self._waiting[number] = result
+        self._executor.submit(result.spec)
+        if self._settings.keep_trials:
+            return result
+        shutil.rmtree(folder, ignore_errors=True)
+        return replace(result, kept=False)
+
+    def look(self, timeout_s: float = 0.0) -> list[Difference]:
+        """Return what has been found since the last call, waiting so long for a trial to end, if one runs."""
+        if not self._waiting:
+            return []
+        found = []
+        for result in self._executor.completed(timeout_s):
+            was = self._waiting.pop(result.spec.number)
+            if result.was_killed_from_outside:  # which says nothing about the trial
+                self._killed.add(result.spec.number)
+                self._clean_up(result.spec.number)
+                continue
+            difference = self._compare(was, result)
+            self._done += 1
+            if difference is not None:
+                found.append(difference)
+                self._failed.append(result)
+        self._differences += found
+        return found
+
+    def close(self) -> None:
+        """Give up what has not been run again."""
+        self._executor.close()
+
+    def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:
+        number = was.spec.number
+        try:
+            folders = self._folders(number)
+            recorded, replayed = (Recording(read_black_box(folder / layout.BLACK_BOX)) for folder in folders)
+            found = first_divergence(recorded, replayed)
+        except BundleError:  # it could not even be set up
+            found = None
+        finally:
+            self._clean_up(number)
+        if found is not None:
+            return Difference(number, found.step, found.agent, found.field, found.recorded, found.replayed)
+        if (was.outcome, was.digest) != (now.outcome, now.digest):
+            return Difference(number, now.steps, "", "the outcome", str(was.outcome), str(now.outcome))
+        return None
+
+    def _folders(self, number: int) -> tuple[Path, Path]:
+        """Return where the recordings of a trial are: that of the hunt, and that of the fresh process."""
+        return self._scratch / f"recorded-{number:06d}", scratch_of(self._scratch, number)
+
+    def _clean_up(self, number: int) -> None:
+        for folder in self._folders(number):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+# Audits that an earlier run of a hunt did not bring to their end, as it was stopped or killed: made up for.
+#
+# The recordings are gone by then, so that digests are compared: they tell that a trial differs, and not where.
+
+_FOLDER = "audits"  # of the scratch folder
+
+
+class AuditsLeft:
+    """The trials that earlier runs of a hunt were to run again, and did not.
+
+    Args:
+        ledger: of the hunt.
+        before: its facts, as the earlier runs left them.
+        settings: of the workers; they say which trials belong to the sample.
+
+    Attributes:
+        numbers: of these trials.
+    """
+
+    def __init__(self, ledger: Ledger, before: Facts, settings: WorkerSettings) -> None:
+        left = set(before.get("audits_left") or ()) if settings.audit > 0.0 else set()
+        if settings.audit > 0.0 and before.get("state") == "running":
+            # It was killed; what ended after its last heartbeat is not noted.
+            ended = ledger.results_where("ended_at >= ?", before.get("heartbeat", 0.0))
+            left |= {result.spec.number for result in ended if settings.is_audited(result)}
+        self.numbers = sorted(left)
+
+    def note(self, audit: Audit, progress: Progress) -> None:
+        """Have the progress of the hunt say what came of its audit, and what is left of all audits."""
+        progress.audit = audit.report
+        progress.audits_left = sorted({*audit.left, *self.numbers})
+
+    def finish(self, again: TrialReruns, progress: Progress) -> None:
+        """Run them again, and add what comes of it to the progress of the hunt."""
+        left_now = set(progress.audits_left) - set(self.numbers)
+        now, (late, left) = progress.audit or AuditReport(), _finish(again, self.numbers)
+        progress.audit = AuditReport(
+            now.trials + late.trials, now.differences + late.differences, now.not_finished + late.not_finished
+        )
+        progress.audits_left = sorted({*left_now, *left})
+
+
+def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, list[int]]:
+    """Run trials again that are to be audited; return what came of it, and the numbers that are still left.
+
+    Args:
+        again: runs trials of the hunt again. Its ledger gets a remark for each trial that differs.
+        numbers: of the trials.
+    """
+    ledger = again.ledger
+    wanted = {number: result for number in numbers if (result := ledger.result(number)) is not None and result.digest}
+    left, differences = set(wanted), []
+    try:
+        for one in again.run([result.spec for result in wanted.values()], _FOLDER):
+            now, was = one.result, wanted[one.result.spec.number]
+            shutil.rmtree(scratch_of(one.scratch, now.spec.number), ignore_errors=True)
+            if now.was_killed_from_outside:
+                continue
+            left.discard(now.spec.number)
+            if (was.outcome, was.digest) != (now.outcome, now.digest):
+                difference = Difference(now.spec.number, None, "", "the digest", was.digest, now.digest)
+                ledger.remark(f"audit: {difference}")
+                differences.append(difference)
+                again.failed.append(now)
+    except CrashhuntError as error:
+        again.notes.append(f"trials could not be run again for the audit: {error}")
+    return AuditReport(len(wanted) - len(left), tuple(differences), len(left)), sorted(left)

@@ -1,0 +1,496 @@
+"""What a ledger says; whoever reads a row checks that it is as it was written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sqlite3
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict, cast
+
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.ledger._file import checked, damaged, explained, plain_trial
+from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS
+from crashhunt.trial import TrialResult, TrialSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from crashhunt.base.codec import JsonObject
+    from crashhunt.base.json_types import Plain
+    from crashhunt.ledger._schema import Shape
+
+
+__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Row", "Seal", "Turn"]
+
+
+# The shapes of what a ledger says besides trials.
+
+Row: TypeAlias = tuple[Any, ...]
+"""As SQLite returns one; whoever asks for it knows which columns there are."""
+
+
+class KindData(TypedDict):
+    """A kind of crashes in few words, as the ledger and ``--json`` have it."""
+
+    words: str
+    count: int
+    first: str
+    shortest: str
+
+
+class Owner(TypedDict):
+    """What tells a process from every other: ``started`` is in ticks since its machine did."""
+
+    host: str
+    pid: int
+    started: int
+
+
+class Noted(TypedDict, total=False):
+    """What is noted of a hunt besides its state; None where something no longer holds.
+
+    Args:
+        owner: who runs it, while somebody does.
+        began: when it was begun or resumed, in s since the epoch.
+        heartbeat: when it was there last, likewise.
+        done_before: how many trials had ended when it began.
+        planned: how many trials it has; 0 where only the time is limited.
+        until: when its time is up, in s since the epoch; None where it has all the time.
+        hunt_seed: what its trials are drawn from.
+        independent: whether they were drawn independently of each other.
+        plain_origin: of the trials that were, where its sampler keeps some apart that it does not guide; else None.
+        lag: by how many trials a sampler that learns is told late.
+        origins: whether its sampler says where trials come from.
+        core: whether the simulator's compiled core is used; None where it has none.
+        disturb: how often what disturbs its trials; None where nothing does.
+        copies: of its trials, which there are to be, some of ``probes`` and ``branches``; None where there are none.
+        confirmed: of these, how many trials were run from the start of what they found, and how many crashed there.
+        nodes: the machines on which it ran last, where there were several: fields of `NodeFigures`.
+        kinds: of crashes, the most frequent first, where it collects them all.
+        dropped: of each kind, in words, the trials whose crashes are in the ledger only, as shorter ones were kept.
+        newest_kind: when the last new one came, in s since the epoch; None where there was none, or nobody knows.
+        audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
+        failed_steps: how many steps were simulated to confirm something that was not confirmed.
+    """
+
+    owner: Owner | None
+    began: float
+    heartbeat: float
+    done_before: int
+    planned: int
+    until: float | None
+    hunt_seed: int
+    independent: bool
+    plain_origin: str | None
+    lag: int | None
+    origins: bool
+    core: str | None
+    disturb: list[str] | None
+    copies: list[str] | None
+    confirmed: Mapping[str, Sequence[int]] | None
+    nodes: list[dict[str, Any]]
+    kinds: list[KindData]
+    newest_kind: float | None
+    audits_left: list[int] | None
+    failed_steps: int
+    dropped: dict[str, list[int]]
+
+
+class Facts(Noted, total=False):
+    """All facts of a hunt.
+
+    Args:
+        state: as it was entered last, one of ``running``, ``error`` or why it stopped.
+        detail: why.
+    """
+
+    state: str
+    detail: str | None
+
+
+class Seal(TypedDict):
+    """What a ledger held when it was closed; earlier versions said less."""
+
+    outcomes: Mapping[str, int]
+    steps: int
+    table: str
+    dangers: NotRequired[str]
+    other_steps: NotRequired[int]
+    events: int
+    replaced: int
+    proposals: NotRequired[int]
+    facts: int
+
+
+_CHUNK = 4096
+_BY_TIME = (
+    "SELECT number, seed, outcome, steps, time_to_collision_s FROM trials INDEXED BY trials_by_outcome "
+    "ORDER BY outcome, time_to_collision_s, number"
+)
+_BY_DANGER = "SELECT outcome, danger, number FROM trials INDEXED BY trials_by_danger ORDER BY outcome, danger, number"
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn with a sampler that learns.
+
+    Args:
+        told: the numbers of the trials whose results it was told, in that order, after its turn before.
+        spec: the trial that it proposed then.
+    """
+
+    told: tuple[int, ...]
+    spec: TrialSpec
+
+
+class LedgerReader:
+    """Answers what a ledger says.
+
+    Args:
+        database: that is open.
+        path: of its file.
+        shape: what its tables have.
+    """
+
+    def __init__(self, database: sqlite3.Connection, path: Path, shape: Shape) -> None:
+        self._database = database
+        self._path = path
+        self._shape = shape
+
+    @property
+    def protected(self) -> bool:
+        """Whether every row has a digest; the earliest ledgers had none."""
+        return self._shape.protected
+
+    @property
+    def sealed(self) -> bool:
+        """Whether whoever wrote last has closed it."""
+        return self._seal() is not None
+
+    def events(self) -> list[tuple[float, str, str]]:
+        """Return when the hunt got into which state, and why."""
+        seal = self._seal()
+        rows = list(self._select(f"{self._shape.select('events')} ORDER BY rowid"))
+        self._compare_seal(seal, "events", len(rows))
+        return [self._checked(row, "what it says of its states")[:3] for row in rows]
+
+    def replaced(self) -> list[TrialResult]:
+        """Return the trials that ran again, as they were."""
+        seal = self._seal()
+        rows = list(self._select(f"{self._shape.select('replaced')} ORDER BY rowid"))
+        self._compare_seal(seal, "replaced", len(rows))
+        return [self._result(json.loads(self._checked(row, "a trial that ran again")[2])) for row in rows]
+
+    def turns(self) -> Iterator[Turn]:
+        """Yield what a sampler that learns has proposed, in order; nothing for any other.
+
+        Raises:
+            HuntDirectoryError: something of it is not as it was written, or missing; what was before was yielded.
+        """
+        if not self._proposing:
+            return
+        seal, count = self._seal(), 0
+        for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn"):
+            count += 1
+            yield self._turn(row)
+        self._compare_seal(seal, "proposals", count)
+
+    def intact_turns(self) -> list[Turn]:
+        """Return those that are as they were written, whatever has become of the others."""
+        found: list[Turn] = []
+        try:
+            for row in self._select(f"{self._shape.select('proposals')} ORDER BY turn") if self._proposing else ():
+                try:
+                    found.append(self._turn(row))
+                except HuntDirectoryError:
+                    continue
+        except HuntDirectoryError:  # the table cannot be read on
+            pass
+        return found
+
+    def facts(self) -> Facts:
+        """Return the facts about the hunt itself."""
+        seal = self._seal()
+        rows = [self._checked(row, "a fact") for row in self._select(self._shape.select("hunt"))]
+        self._compare_seal(seal, "facts", sum(row[0] != SEAL for row in rows))
+        try:
+            return cast(Facts, {row[0]: json.loads(row[1]) for row in rows if row[0] not in OWN_FACTS})
+        except (ValueError, TypeError, RecursionError) as error:
+            raise damaged(self._path, f"a fact cannot be read: {error}") from None
+
+    def finished(self) -> set[int]:
+        """Return the numbers of the trials that have ended."""
+        return {number for (number,) in self._select("SELECT number FROM trials")}
+
+    def outcomes(self) -> dict[str, int]:
+        """Return how many trials ended how."""
+        seal = self._seal()
+        found = self._outcomes()
+        self._compare_seal(seal, "outcomes", found)
+        return found
+
+    def traffic_events(self) -> dict[str, tuple[int, int]]:
+        """Return how many traffic events of each kind there were, and in how many trials."""
+        rows = self._select(
+            "SELECT event.key, sum(event.value), count(*) FROM trials, "
+            f"json_each(iif(json_valid(result), result, '{{}}'), '$.events') AS event "
+            f"WHERE {WITH_EVENTS} GROUP BY event.key"
+        )
+        return {kind: (count, trials) for kind, count, trials in rows}
+
+    def summed(self, what: str, of: str) -> list[Row]:
+        """Return sums over all trials, rows whose data cannot be read left out.
+
+        Args:
+            what: is selected of them.
+            of: the query for each, in which ``{stress.margin}`` is a value of its plain data and ``data`` all of it.
+        """
+        each = re.sub(r"{([\w.]+)}", r"json_extract(data, '$.\1')", of)
+        trials = "(SELECT number, iif(json_valid(result), result, '{}') AS data FROM trials)"
+        return list(self._select(f"SELECT {what} FROM ({each} FROM {trials})"))
+
+    def trial_steps(self) -> int:
+        """Return how many steps trials have taken."""
+        seal = self._seal()
+        found = self._steps()
+        self._compare_seal(seal, "steps", found)
+        return found
+
+    def steps_total(self) -> int:
+        """Return how many steps were simulated in all.
+
+        Those of trials, those before their first, those of their copies, and those of runs that were to confirm
+        something and ended otherwise; what a ledger of before does not say is not in it.
+        """
+        seal = self._seal()
+        other = self._other_steps()
+        self._compare_seal(seal, "other_steps", other)
+        return self.trial_steps() + other + (self.facts().get("failed_steps") or 0)
+
+    def results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[TrialResult]:
+        """Yield trials in the order of their numbers, all or those that ended in one of some ways."""
+        return map(self._result, self.plain_results(outcomes=outcomes))
+
+    def plain_results(self, *, outcomes: tuple[str, ...] = ()) -> Iterator[JsonObject]:
+        """Yield the same as plain data, which takes a third of the time.
+
+        Raises:
+            HuntDirectoryError: a trial is not as it was written, or one is missing; those before were yielded.
+        """
+        where = f"WHERE outcome IN ({','.join('?' * len(outcomes))})" if outcomes else ""
+        seal, count = self._seal(), 0
+        for row in self._select(f"{self._shape.select('trials')} {where} ORDER BY number", outcomes):
+            count += 1
+            yield self._plain(row)
+        if seal is not None:
+            said = {name: number for name, number in seal["outcomes"].items() if not outcomes or name in outcomes}
+            if count != sum(said.values()) and self._seal() == seal:
+                raise damaged(self._path, f"it has {count} such trials, and {sum(said.values())} were written")
+
+    def intact_rows(self, numbers: Iterable[int]) -> Iterator[tuple[int, Row | None]]:
+        """Yield the rows of trials, whatever has become of the others: None for one that is not as it was written."""
+        for number in numbers:
+            try:
+                row = self._row(number)
+                if row is not None:
+                    self._plain(row)
+                    yield number, row[:-1] if self.protected else row
+            except HuntDirectoryError:
+                yield number, None
+
+    def check_pages(self) -> None:
+        """Have SQLite look at the file.
+
+        Raises:
+            HuntDirectoryError: it is damaged.
+        """
+        for (found,) in self._select("PRAGMA integrity_check(1)"):
+            if found != "ok":
+                raise damaged(self._path, " ".join(str(found).split()))
+
+    def result(self, number: int) -> TrialResult | None:
+        """Return one trial, or None where it has not ended."""
+        row = self._row(number)
+        if row is None:
+            self.outcomes()  # which finds out whether one is missing
+            return None
+        return self._result(self._plain(row))
+
+    def results_where(self, condition: str, *values: float) -> Iterator[TrialResult]:
+        """Yield the trials whose rows fulfil a condition in SQL, in the order of their numbers."""
+        rows = self._select(f"{self._shape.select('trials')} WHERE {condition} ORDER BY number", values)
+        return (self._result(self._plain(row)) for row in rows)
+
+    def result_text(self, number: int) -> str | None:
+        """Return one trial as it is written, or None where it has not ended."""
+        row = self._row(number)
+        return None if row is None else str(self._plain(row) and row[10])
+
+    def snapshot_of(self, number: int) -> str:
+        """Return the digest of the snapshot that a trial ran from."""
+        row = self._row(number)
+        return str(self._plain(row) and row[9]) if row else ""
+
+    def nearest_miss(self) -> TrialResult | None:
+        """Return the trial that did not crash and came nearest to it: the most dangerous one.
+
+        In a ledger of before danger was measured, that with the least time to collision.
+        """
+        most = self.most_dangerous(1)
+        if most:
+            return self.result(most[0])
+        least = [
+            row
+            for outcome in ("survived", "finished")
+            for row in self._select(
+                "SELECT time_to_collision_s, number FROM trials WHERE outcome = ? AND time_to_collision_s IS NOT NULL "
+                "ORDER BY time_to_collision_s, number LIMIT 1",
+                (outcome,),
+            )
+        ]
+        return self.result(min(least)[1]) if least else None
+
+    def most_dangerous(self, count: int) -> list[int]:
+        """Return the numbers of the trials without a crash that were the most dangerous, the greatest danger first.
+
+        Of several that are equal, the first. Those without any, or of which nobody measured it, are none.
+        """
+        if "danger" not in self._shape.columns["trials"]:
+            return []
+        found = [
+            row
+            for outcome in ("survived", "finished")
+            for row in self._select(
+                "SELECT -danger, number FROM trials WHERE outcome = ? AND danger > 0 "
+                "ORDER BY danger DESC, number LIMIT ?",
+                (outcome, count),
+            )
+        ]
+        return [number for _, number in sorted(found)[:count]]
+
+    def table(self) -> Iterator[tuple[int, int, str, int, float | None]]:
+        """Yield number, seed, outcome, steps and least time to collision of every trial, in no particular order.
+
+        Raises:
+            HuntDirectoryError: they are not as they were written; they were yielded all the same.
+        """
+        seal = self._seal()
+        if seal is None:  # without one, only the whole rows say whether they are as they were written
+            for row in self._select(f"{self._shape.select('trials')} ORDER BY number"):
+                self._plain(row)
+                yield row[:5]
+            return
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+            yield from rows
+        self._compare_seal(seal, "table", said.hexdigest())
+
+    def last_ended_at(self) -> float | None:
+        """Return when the last trial ended, in s since the epoch; None where none has."""
+        row = next(self._select(f"{self._shape.select('trials')} ORDER BY number DESC LIMIT 1"), None)
+        return float(row[8]) if row and self._plain(row) else None
+
+    def _select(self, query: str, values: Row = ()) -> Iterator[Row]:
+        try:
+            for row in self._database.execute(query, values):  # noqa: UP028 - it would close the cursor, maybe too late
+                yield row
+        except sqlite3.Error as error:  # also in the middle of a file that is damaged
+            raise explained(self._path, error) from error
+
+    def _row(self, number: int) -> Row | None:
+        return next(self._select(f"{self._shape.select('trials')} WHERE number = ?", (number,)), None)
+
+    def _checked(self, row: Row, what: str) -> Row:
+        return checked(row, what, self._path) if self.protected else row
+
+    def _plain(self, row: Row) -> JsonObject:
+        return plain_trial(self._checked(row, f"trial {row[0]}"), self._path, trusted=self.protected)
+
+    def _result(self, data: JsonObject) -> TrialResult:
+        try:
+            return TrialResult.from_json(data)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(self._path, f"a trial cannot be read: {type(error).__name__}: {error}") from None
+
+    @property
+    def _proposing(self) -> bool:
+        return "proposals" in self._shape.columns
+
+    def _turn(self, row: Row) -> Turn:
+        try:
+            _, _, told, spec, *_ = self._checked(row, f"the proposal of trial {row[1]}")
+            return Turn(tuple(json.loads(told)), TrialSpec.from_json(json.loads(spec)))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(self._path, f"a proposal cannot be read: {type(error).__name__}: {error}") from None
+
+    def _seal(self) -> Seal | None:
+        if not self.protected:
+            return None
+        row = next(self._select(f"{self._shape.select('hunt')} WHERE key = ?", (SEAL,)), None)
+        if row is None:
+            return None
+        found: Seal = json.loads(self._checked(row, "its seal")[1])
+        return found
+
+    def _make_seal(self) -> Seal:
+        said = hashlib.blake2b(digest_size=16)
+        for rows in self._chunks():
+            said.update(_as_text(rows))
+        seal: Seal = {
+            "outcomes": self._outcomes(),
+            "steps": self._steps(),
+            "table": said.hexdigest(),
+            "events": self._count("events"),
+            "replaced": self._count("replaced"),
+            "proposals": self._count("proposals") if self._proposing else 0,
+            "facts": self._count(f"hunt WHERE key <> '{SEAL}'"),
+        }
+        if "danger" in self._shape.columns["trials"]:
+            ranked = hashlib.blake2b(digest_size=16)
+            for rows in self._chunks(_BY_DANGER):
+                ranked.update(_as_text(rows))
+            seal["dangers"] = ranked.hexdigest()
+        if "other_steps" in self._shape.columns["trials"]:
+            seal["other_steps"] = self._other_steps()
+        return seal
+
+    def _fits(self, seal: Seal) -> bool:
+        """Whether what is there is what was sealed, by a version that knew less or more, too."""
+        found: Plain = self._make_seal()
+        said: Plain = seal
+        return all(found[name] == said[name] for name in found.keys() & said.keys())
+
+    def _compare_seal(self, seal: Seal | None, name: str, found: object) -> None:
+        # A writer may have come meanwhile; then it is another seal, or none. One of before may say less.
+        if seal is not None and found != seal.get(name, found) and self._seal() == seal:
+            raise damaged(self._path, f"{name} are not those that were written")
+
+    def _outcomes(self) -> dict[str, int]:
+        return dict(self._select("SELECT outcome, count(*) FROM trials GROUP BY outcome ORDER BY outcome"))
+
+    def _count(self, table: str) -> int:
+        return int(next(self._select(f"SELECT count(*) FROM {table}"))[0])
+
+    def _steps(self) -> int:
+        return int(next(self._select("SELECT coalesce(sum(steps), 0) FROM trials"))[0])
+
+    def _other_steps(self) -> int:
+        if "other_steps" not in self._shape.columns["trials"]:
+            return 0
+        return int(next(self._select("SELECT coalesce(sum(other_steps), 0) FROM trials"))[0])
+
+    def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:
+        try:
+            cursor = self._database.execute(query)
+            while rows := cursor.fetchmany(_CHUNK):
+                yield rows
+        except sqlite3.Error as error:
+            raise explained(self._path, error) from error
+
+
+def _as_text(rows: list[Row]) -> bytes:
+    return "".join(map(repr, rows)).encode()

@@ -1,0 +1,272 @@
+"""The tables of a ledger, in this version and in those before and after it."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import HuntDirectoryError
+from crashhunt.base.files import whole_file
+from crashhunt.base.integrity import digest_of_row
+from crashhunt.ledger._file import checked, damaged
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+
+__all__ = [
+    "DANGER_INDEX",
+    "EVENTS_INDEX",
+    "FIRST",
+    "MIGRATIONS",
+    "OUTCOME_INDEX",
+    "OWN_FACTS",
+    "PROPOSALS",
+    "SEAL",
+    "VERSION",
+    "WITH_EVENTS",
+    "Shape",
+    "columns_of_trials",
+    "create",
+    "migrate",
+    "note_reader",
+    "shape_of",
+]
+
+
+VERSION = 5  # of the tables, as PRAGMA user_version
+_READER = 3  # the least version of a crashhunt that reads what this one writes
+_PROTECTED = 2  # the first version in which every row has a digest of its content
+_PROPOSING = 3  # the first version that has proposals
+SEAL, _READER_FACT = "seal", "reader"
+OWN_FACTS = (SEAL, _READER_FACT)  # what the ledger says of itself, beside the facts of the hunt
+
+PROPOSALS = """
+CREATE TABLE IF NOT EXISTS proposals (
+    turn INTEGER PRIMARY KEY, number INTEGER NOT NULL UNIQUE, told TEXT NOT NULL, spec TEXT NOT NULL,
+    digest INTEGER NOT NULL
+) STRICT;
+"""
+# Most trials have no traffic event, so that those that have some are counted without reading all the others.
+WITH_EVENTS = """instr(result, '"events": {"') > 0"""
+EVENTS_INDEX = f"CREATE INDEX IF NOT EXISTS trials_with_events ON trials (number) WHERE {WITH_EVENTS};"
+# What counts, ranks and compares trials reads this instead of the rows, which are fifty times as large.
+OUTCOME_INDEX = (
+    "CREATE INDEX IF NOT EXISTS trials_by_outcome "
+    "ON trials (outcome, time_to_collision_s, number, steps, seed, other_steps);"
+)
+DANGER_INDEX = "CREATE INDEX IF NOT EXISTS trials_by_danger ON trials (outcome, danger, number);"
+_SCHEMA = f"""
+CREATE TABLE IF NOT EXISTS trials (
+    number INTEGER PRIMARY KEY,
+    seed INTEGER NOT NULL,
+    outcome TEXT NOT NULL,
+    steps INTEGER NOT NULL,
+    time_to_collision_s REAL,
+    gap_m REAL,
+    required_deceleration REAL,
+    wall_s REAL NOT NULL,
+    ended_at REAL NOT NULL,
+    snapshot TEXT NOT NULL,
+    result TEXT NOT NULL,
+    digest INTEGER NOT NULL,
+    danger REAL,
+    other_steps INTEGER
+) STRICT;
+{OUTCOME_INDEX}
+{EVENTS_INDEX}
+{DANGER_INDEX}
+CREATE TABLE IF NOT EXISTS replaced (
+    number INTEGER, replaced_at REAL, result TEXT NOT NULL, digest INTEGER NOT NULL
+) STRICT;
+CREATE TABLE IF NOT EXISTS events (
+    at REAL NOT NULL, state TEXT NOT NULL, detail TEXT NOT NULL, digest INTEGER NOT NULL
+) STRICT;
+CREATE TABLE IF NOT EXISTS hunt (
+    key TEXT PRIMARY KEY, value TEXT NOT NULL, digest INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+{PROPOSALS}
+"""
+# The tables of version 1, each without its digest, and those that came later.
+FIRST = {
+    "trials": (
+        "number", "seed", "outcome", "steps", "time_to_collision_s", "gap_m", "required_deceleration",
+        "wall_s", "ended_at", "snapshot", "result",
+    ),
+    "replaced": ("number", "replaced_at", "result"),
+    "events": ("at", "state", "detail"),
+    "hunt": ("key", "value"),
+}  # fmt: skip
+# Columns that came later stand after the digest, where a migration puts them.
+_ADDED = {"trials": {"danger": 4, "other_steps": 5}}  # table to column to the first version that has it
+_LATER = {"proposals": ("turn", "number", "told", "spec")}
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What the tables of a ledger have.
+
+    Args:
+        version: of the tables.
+        columns: table to its columns but the digest, which is made over them in this order. A table of a newer version
+            may have more than is known here, after those that are; what an older version lacks is not there.
+    """
+
+    version: int
+    columns: Mapping[str, tuple[str, ...]]
+
+    @property
+    def protected(self) -> bool:
+        """Whether every row has a digest; the earliest ledgers had none."""
+        return self.version >= _PROTECTED
+
+    def select(self, table: str) -> str:
+        """Return the beginning of a query for whole rows, the digest last."""
+        return f"SELECT {', '.join((*self.columns[table], *(('digest',) if self.protected else ())))} FROM {table}"
+
+
+def columns_of_trials() -> tuple[str, ...]:
+    """Return the columns of a trial's row in this version, without its digest, in the order of which that is made."""
+    return (*FIRST["trials"], *_ADDED["trials"])
+
+
+def create(path: Path) -> None:
+    """Make an empty ledger, as a whole: whoever sees the file can read it."""
+    path.with_name(f"{path.name}-wal").unlink(missing_ok=True)  # SQLite would take that of an earlier one for its own
+    with whole_file(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as database:
+        database.execute("PRAGMA synchronous = OFF")  # the whole file is synced at once
+        database.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+        note_reader(database)
+
+
+def note_reader(database: sqlite3.Connection) -> None:
+    """Write down which crashhunt is needed to read the ledger, for those that are older than what wrote it."""
+    row = (_READER_FACT, json.dumps(_READER))
+    database.execute("INSERT OR REPLACE INTO hunt VALUES (?, ?, ?)", (*row, digest_of_row(row)))
+
+
+def shape_of(database: sqlite3.Connection, path: Path) -> Shape:
+    """Return what the tables have.
+
+    Raises:
+        HuntDirectoryError: they cannot be read, or are not those of their version.
+        sqlite3.Error: it is no database.
+    """
+    version = int(database.execute("PRAGMA user_version").fetchone()[0])
+    names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if not names & FIRST.keys():
+        raise HuntDirectoryError(
+            "not a ledger of crashhunt: it has none of its tables", fix="choose another directory", where=str(path)
+        )
+    if version < 1:
+        raise damaged(path, f"its version is {version}")
+    if version > VERSION:
+        _refuse_unreadable(database, path, version)
+    expected = {**FIRST, **(_LATER if version >= _PROPOSING else {})}
+    for table in names & _LATER.keys() - expected.keys():
+        raise damaged(path, f"it is not as version {version} is: with the table {table}")
+    return Shape(version, {table: _columns(database, path, version, table, expected[table]) for table in expected})
+
+
+def _columns(
+    database: sqlite3.Connection, path: Path, version: int, table: str, known: tuple[str, ...]
+) -> tuple[str, ...]:
+    there = tuple(name for _, name, *_ in database.execute(f"PRAGMA table_info({table})"))
+    added = tuple(name for name, since in _ADDED.get(table, {}).items() if version >= since)
+    expected = known if version < _PROTECTED else (*known, "digest", *added)
+    known = (*known, *added)
+    if version > VERSION and "digest" in there:
+        columns = tuple(name for name in there if name != "digest")
+        if columns[: len(known)] == known:
+            return columns
+    if there != expected:
+        odd = sorted(set(expected) ^ set(there))
+        what = f"{', '.join(odd)} of" if there and odd else "the columns of" if there else "without"
+        raise damaged(path, f"it is not as version {version} is: {what} the table {table}")
+    return known
+
+
+def _refuse_unreadable(database: sqlite3.Connection, path: Path, version: int) -> None:
+    """Refuse a ledger of a newer version that does not say that this one can read it."""
+    try:
+        row = database.execute("SELECT key, value, digest FROM hunt WHERE key = ?", (_READER_FACT,)).fetchone()
+        if row is not None and int(json.loads(checked(row, "what reads it", path)[1])) <= VERSION:
+            return
+    except (sqlite3.Error, ValueError, TypeError):
+        pass
+    raise HuntDirectoryError(
+        f"a ledger of version {version}, and this crashhunt reads the versions up to {VERSION}",
+        fix="use the crashhunt that made it, or run with --overwrite to begin anew",
+        where=str(path),
+    )
+
+
+# Ledgers of earlier versions become ledgers of this one, a version at a time, when somebody goes on with them.
+
+
+def _add_digests(database: sqlite3.Connection) -> None:
+    """What is there now is what digests will vouch for."""
+    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
+    for table, columns in FIRST.items():
+        database.execute(f"ALTER TABLE {table} ADD COLUMN digest INTEGER NOT NULL DEFAULT 0")
+        database.execute(f"UPDATE {table} SET digest = digest_of_row({', '.join(columns)})")
+
+
+def _add_proposals(database: sqlite3.Connection) -> None:
+    database.execute(PROPOSALS)
+    database.execute(EVENTS_INDEX)
+    note_reader(database)
+
+
+def _add_danger(database: sqlite3.Connection) -> None:
+    """Nobody measured the danger of what is there; a row that is not as it was written keeps a digest that says so."""
+    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
+    database.execute("ALTER TABLE trials ADD COLUMN danger REAL")
+    was = ", ".join(FIRST["trials"])
+    database.execute(f"UPDATE trials SET digest = digest_of_row({was}, danger) WHERE digest = digest_of_row({was})")
+    database.execute(DANGER_INDEX)
+
+
+def _add_other_steps(database: sqlite3.Connection) -> None:
+    """Of what is there, copies said how many steps they took; warm-ups did not, and nobody knows."""
+    database.create_function("digest_of_row", -1, lambda *values: digest_of_row(values), deterministic=True)
+    database.execute("ALTER TABLE trials ADD COLUMN other_steps INTEGER")
+    was = ", ".join((*FIRST["trials"], "danger"))
+    data = "iif(json_valid(result), result, '{}')"
+    copies = " + ".join(f"coalesce(json_extract({data}, '$.{name}.steps'), 0)" for name in ("stress", "branches"))
+    now = f"other_steps = {copies}, digest = digest_of_row({was}, {copies})"
+    database.execute(f"UPDATE trials SET {now} WHERE digest = digest_of_row({was})")
+    database.execute("DROP INDEX IF EXISTS trials_by_outcome")
+    database.execute(OUTCOME_INDEX)
+
+
+MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {
+    1: _add_digests,
+    2: _add_proposals,
+    3: _add_danger,
+    4: _add_other_steps,
+}
+"""Version to what makes of a ledger of it one of the next.
+
+A version may add tables, and columns at the end of a table, each with a value for the rows that are there. The digest
+of a row is over all columns in the order of the table, so that versions before can check rows that have columns which
+they do not know. A version that those before would read wrongly raises what it asks of whoever reads it.
+"""
+
+
+def migrate(database: sqlite3.Connection, version: int) -> None:
+    """Bring the tables of an earlier version to this one: all the way, or not at all."""
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        for earlier in range(version, VERSION):
+            MIGRATIONS[earlier](database)
+        database.execute(f"PRAGMA user_version = {VERSION}")
+        database.execute("COMMIT")
+    except BaseException:
+        if database.in_transaction:
+            database.execute("ROLLBACK")
+        raise

@@ -1,0 +1,81 @@
+"""Other seeds for SUMO's random generators while a simulation runs, by functions that libsumo exports.
+
+libsumo has no call for that: ``--seed`` is read at load, and ``simulation.loadState`` does not continue as the original
+did (`crashhunt guide sumo`). Its library exports the generators themselves and ``RandHelper::initRand``, by which SUMO
+seeds them at load. Their layout belongs to a version of libsumo, so other versions are refused, and each seed is read
+back after it was written.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+
+import numpy as np
+
+__all__ = ["reseed_generators", "why_no_reseeding"]
+
+_CHECKED = ("1.28.0",)
+"""The versions of libsumo in which the generators were found as they are described here."""
+_GENERATOR_BYTES = 5048  # a SumoRNG: its name, its count, and the 624 words of a Mersenne Twister
+_LANES = "_ZN6MSLane6myRNGsE"  # std::vector<SumoRNG>: noise of the drivers, by the lane on which a vehicle departs
+_SINGLE = (
+    "_ZN10RandHelper23myRandomNumberGeneratorE",  # everything that has no generator of its own
+    "_ZN16SUMORouteHandler12myParsingRNGE",  # what is drawn where routes are read, such as types from distributions
+    "_ZN8MSDevice14myEquipmentRNGE",  # which vehicles get a device
+    "_ZN9OUProcess5myRNGE",  # errors of perception of drivers with a driver state
+    "_ZN12MSDevice_ToC17myResponseTimeRNGE",  # response times of drivers who take over
+)
+_SEED = "_ZN10RandHelper8initRandEP7SumoRNGbi"  # RandHelper::initRand(SumoRNG*, bool random, int seed)
+_READ = "_ZN10RandHelper7getSeedEP7SumoRNG"  # RandHelper::getSeed(SumoRNG*)
+
+
+@cache
+def why_no_reseeding(libsumo: str, library: str) -> str:
+    """Return why the generators cannot be re-seeded with a version of libsumo; empty where they can.
+
+    Args:
+        libsumo: its version.
+        library: the path of its library, which is loaded.
+    """
+    if libsumo not in _CHECKED:
+        return f"libsumo {libsumo} was not checked for re-seeding (checked: {', '.join(_CHECKED)})"
+    try:
+        loaded = ctypes.CDLL(library)
+        for name in (_LANES, *_SINGLE, _SEED, _READ):
+            getattr(loaded, name)
+    except (OSError, AttributeError) as error:
+        return f"libsumo's generators cannot be re-seeded: {error}"
+    return ""
+
+
+def reseed_generators(library: str, seed: int) -> int:
+    """Give each generator of the running simulation a seed of its own, drawn from one seed.
+
+    Args:
+        library: the path of libsumo's library, for which `why_no_reseeding` returned nothing.
+        seed: from 0 on.
+
+    Returns:
+        How many generators have been re-seeded.
+
+    Raises:
+        RuntimeError: the generators are not as they are described here; nothing can be said of the simulation then.
+    """
+    loaded = ctypes.CDLL(library)
+    first, last, _ = (ctypes.c_void_p * 3).in_dll(loaded, _LANES)
+    size = (last or 0) - (first or 0)
+    if first is None or size <= 0 or size % _GENERATOR_BYTES:
+        raise RuntimeError(f"libsumo's lanes have generators of another layout ({size} bytes)")
+    places = [first + offset for offset in range(0, size, _GENERATOR_BYTES)]
+    places += [ctypes.addressof((ctypes.c_char * _GENERATOR_BYTES).in_dll(loaded, name)) for name in _SINGLE]
+    set_seed, get_seed = loaded[_SEED], loaded[_READ]
+    set_seed.argtypes, set_seed.restype = (ctypes.c_void_p, ctypes.c_bool, ctypes.c_int), None
+    get_seed.argtypes, get_seed.restype = (ctypes.c_void_p,), ctypes.c_int
+    # SUMO seeds all of them alike. A sequence keeps generators of successive seeds from sharing their numbers.
+    drawn = np.random.SeedSequence(seed).generate_state(len(places)) >> 1
+    for place, value in zip(places, drawn.tolist(), strict=True):
+        set_seed(place, False, value)
+        if get_seed(place) != value:
+            raise RuntimeError("libsumo's generators do not keep the seed that they get")
+    return len(places)

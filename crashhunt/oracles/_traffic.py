@@ -1,0 +1,148 @@
+"""The oracle of near misses."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from crashhunt.base.errors import ArgumentError
+from crashhunt.oracles._protocol import Finding
+from crashhunt.trial import Argument, Outcome
+from crashhunt.world import Event, on_one_level, outlines, rectangle_gap
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from crashhunt.trial import Category
+    from crashhunt.world import Scene
+
+
+__all__ = ["OffRoute", "RedLight", "Teleport", "TooClose", "TrafficEvents", "WrongWay"]
+
+
+class TooClose:
+    """Sees a near miss: an agent that moves comes nearer to another actor than a gap, without touching it.
+
+    Args:
+        gap_m: between the outlines.
+        speed: of the agent relative to the other, at least; 0 includes an agent that creeps up in a queue.
+    """
+
+    name = "too-close"
+    outcomes: Mapping[str, Category] = {"too_close": "traffic event"}
+
+    def __init__(
+        self,
+        gap_m: Annotated[float, Argument("gap_m", unit="m", help="between the outlines")] = 0.5,
+        speed: Annotated[float, Argument("speed", unit="m/s", help="relative to the other, at least")] = 1.0,
+    ) -> None:
+        for name, value in (("gap_m", gap_m), ("speed", speed)):
+            if not 0 <= value < float("inf"):
+                raise ArgumentError(f"{name} is {value:g}", fix="give 0 or more", where="--oracle too-close")
+        self._gap_m, self._speed = gap_m, speed
+
+    def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
+        """Return the nearest miss of each agent that has one in this scene."""
+        findings = []
+        for agent in agents:
+            row = scene.roster.index.get(agent)
+            near = [] if row is None else [found for other in self._others(scene, row) if (found := self._gap(*other))]
+            if row is not None and near:
+                gap_m, other = min(near)
+                (x, y), speed, lane = scene.points[row], scene.speeds[row], scene.agent_lanes.get(agent, "")
+                name = scene.roster.actors[other].id
+                what = f"{agent} came within {gap_m:.2f} m of {name}"
+                event = Event("too_close", agent, what, others=(name,), lane=lane, x=x, y=y, speed=speed)
+                findings.append(Finding(Outcome("too_close"), event=event))
+        return findings
+
+    def _others(self, scene: Scene, row: int) -> list[tuple[Scene, int, int]]:
+        """Who may be near enough; the circles around the outlines bound the gap from below."""
+        found = []
+        reaches = scene.roster.reaches
+        for squared, other in scene.neighbors(row):
+            if squared > (scene.roster.touch_distance + self._gap_m) ** 2:  # all further ones as well
+                break
+            if squared <= (reaches[row] + reaches[other] + self._gap_m) ** 2 and on_one_level(scene, row, other):
+                found.append((scene, row, other))
+        return found
+
+    def _gap(self, scene: Scene, row: int, other: int) -> tuple[float, int] | None:
+        """The gap to another actor, in m, and its row; None where it counts as no near miss."""
+        vx, vy = (
+            scene.speeds[row] * turn(scene.headings[row]) - scene.speeds[other] * turn(scene.headings[other])
+            for turn in (math.cos, math.sin)
+        )
+        if scene.speeds[row] <= 0 or math.hypot(vx, vy) < self._speed:
+            return None
+        pairs = [(one, two) for one in outlines(scene, row) for two in outlines(scene, other)]
+        places, turns = [], []
+        for (x, y, heading, length, _), (other_x, other_y, other_heading, other_length, _) in pairs:
+            dx = other_x - math.cos(other_heading) * other_length / 2 - x + math.cos(heading) * length / 2
+            dy = other_y - math.sin(other_heading) * other_length / 2 - y + math.sin(heading) * length / 2
+            c, s = math.cos(heading), math.sin(heading)
+            places.append((dx * c + dy * s, dy * c - dx * s))
+            turns.append(other_heading - heading)
+        halves = [
+            np.array([(length / 2, width / 2) for *_, length, width in side]) for side in zip(*pairs, strict=True)
+        ]
+        gap_m = float(rectangle_gap(np.array(places), np.array(turns), *halves).min())
+        return (gap_m, other) if 0.0 < gap_m < self._gap_m else None  # who touches has not missed
+
+
+# Oracles of traffic events, which use only the reports of the simulator.
+
+
+class TrafficEvents:
+    """Reports the simulator's own traffic events, such as red lights, standstills and teleports.
+
+    An episode asks it last, and only where ``--crash-on`` names one of them: a collision in the same step comes first.
+    """
+
+    name = "traffic-events"
+
+    def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
+        """Return the events that the agents have part in."""
+        return [Finding(Outcome(event.kind), event=event) for event in scene.events if event.agent in agents]
+
+
+class _ReportedEvent:
+    """Has a hunt stop on one kind of event: ``--oracle red-light`` is short for adding it to ``--crash-on``."""
+
+    name: str
+    outcomes: Mapping[str, Category]
+
+    def check(self, scene: Scene, agents: Sequence[str]) -> list[Finding]:
+        """Return the events of this kind that the agents have part in."""
+        events = [event for event in scene.events if event.kind in self.outcomes and event.agent in agents]
+        return [Finding(Outcome(event.kind), event=event) for event in events]
+
+
+class RedLight(_ReportedEvent):
+    """Sees an agent run a red light, where the simulator reports it."""
+
+    name = "red-light"
+    outcomes: Mapping[str, Category] = {"red_light": "traffic event"}
+
+
+class WrongWay(_ReportedEvent):
+    """Sees an agent drive against the traffic, where the simulator reports it."""
+
+    name = "wrong-way"
+    outcomes: Mapping[str, Category] = {"wrong_way": "traffic event"}
+
+
+class OffRoute(_ReportedEvent):
+    """Sees an agent miss its route, where the simulator reports it."""
+
+    name = "off-route"
+    outcomes: Mapping[str, Category] = {"off_route": "traffic event"}
+
+
+class Teleport(_ReportedEvent):
+    """Sees the simulator move an agent that was stuck, where it reports it."""
+
+    name = "teleport"
+    outcomes: Mapping[str, Category] = {"teleport": "traffic event"}

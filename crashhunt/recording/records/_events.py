@@ -1,0 +1,94 @@
+"""Records of what happens in a step: contacts and vehicles off the road, disturbances, traffic events."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, TypedDict
+
+from crashhunt.recording._divergence import Divergence
+from crashhunt.recording.records._type import RecordType, TextForm, scene_texts
+from crashhunt.trial import Disturbance
+from crashhunt.world import Contact, Event
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from crashhunt.recording._reading import Reading, StepRecord
+    from crashhunt.recording.records._agents import AgentChannel
+    from crashhunt.world import Scene
+
+
+__all__ = ["DISTURBANCES", "EVENTS", "NOTES", "encode_disturbance", "encode_events", "encode_notes"]
+
+
+# What touched, and who left the road, as JSON; only where anything did.
+
+_EVENTS_FIELDS = len(Contact.__slots__)
+
+
+class _Events(TypedDict, total=False):
+    contacts: list[list[Any]]
+    off_road: list[str]
+
+
+def encode_events(scene: Scene) -> bytes:
+    """Return the payload that says what touched and who left the road."""
+    contacts = [[getattr(contact, name) for name in Contact.__slots__] for contact in scene.contacts]
+    return json.dumps({"contacts": contacts, "off_road": list(scene.off_road)}).encode()
+
+
+def _read_events(reading: Reading, _aux: int, payload: bytes) -> None:
+    events: _Events = json.loads(payload)
+    # What a later version has added to a contact stands at its end.
+    reading.scene["contacts"] = tuple(Contact(*entry[:_EVENTS_FIELDS]) for entry in events.get("contacts", ()))
+    reading.scene["off_road"] = tuple(events.get("off_road", ()))
+
+
+EVENTS = RecordType(8, "events", "/events", TextForm(), _read_events, scene_texts("contacts", "off_road"))
+
+
+# Traffic events, as JSON. What we conclude from an episode is no part of it, nor of its digest; nor is it compared.
+
+
+def encode_notes(events: Iterable[Event]) -> bytes:
+    """Return the payload that says what else happened in the traffic."""
+    return json.dumps([event.to_json() for event in events]).encode()
+
+
+def _read_notes(reading: Reading, _aux: int, payload: bytes) -> None:
+    reading.events = tuple(Event.from_json(note) for note in json.loads(payload))
+
+
+NOTES = RecordType(11, "notes", "/traffic_events", TextForm(), _read_notes)
+
+
+# A disturbance as it takes place, as JSON: who turned out to be meant is part of the episode, and of its digest.
+
+_DISTURBANCES_NAME = "disturbance"
+_DISTURBANCES_NOTHING = "nothing"
+
+
+def encode_disturbance(disturbance: Disturbance) -> bytes:
+    """Return the payload that says what takes place."""
+    return json.dumps({"vehicle": "", **disturbance.to_json()}).encode()
+
+
+def _read_disturbances(reading: Reading, _aux: int, payload: bytes) -> None:
+    found = Disturbance.from_json(json.loads(payload))
+    reading.current.more.setdefault(_DISTURBANCES_NAME, []).append(found)
+
+
+def _difference_disturbances(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
+    each = [step.more.get(_DISTURBANCES_NAME, ()) for step in (left, right)]
+    exact = [str([one.to_json() for one in some]) for some in each]
+    if exact[0] == exact[1]:
+        return None
+    was, now = ["; ".join(f"{one.words} ({one.place})" for one in some) or _DISTURBANCES_NOTHING for some in each]
+    if was == now:  # such as two strengths that are rounded alike
+        was, now = exact
+    return Divergence(left.step, "", _DISTURBANCES_NAME, was, now)
+
+
+DISTURBANCES = RecordType(
+    12, _DISTURBANCES_NAME, "/disturbances", TextForm(), _read_disturbances, _difference_disturbances
+)

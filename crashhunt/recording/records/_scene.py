@@ -1,0 +1,295 @@
+"""Records of the scene: its actors, which of them are present, where each is, its height, shape and lane."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.recording._divergence import Divergence, first_difference
+from crashhunt.recording._reading import StepRecord
+from crashhunt.recording.records._type import SCENE, Form, RecordType, TextForm, scene_texts
+from crashhunt.world import Actor, Roster, Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from crashhunt.recording._reading import Reading, SceneParts
+    from crashhunt.recording.records._agents import AgentChannel, Prologue
+    from crashhunt.recording.records._type import Fields, Message
+    from crashhunt.world import Spine
+
+
+__all__ = [
+    "ACTORS",
+    "HEIGHTS",
+    "LANES",
+    "ROSTER",
+    "SPINES",
+    "STEP",
+    "encode_actors",
+    "encode_heights",
+    "encode_lanes",
+    "encode_roster",
+    "encode_spines",
+    "roster_difference",
+    "time_of",
+]
+
+
+# Actors that were not seen before, as JSON; each is numbered in order of appearance.
+
+_ACTORS_FIELDS = len(Actor.__slots__)
+
+
+def encode_actors(actors: Iterable[Actor]) -> bytes:
+    """Return the payload that introduces actors."""
+    known = [[actor.id, actor.kind, actor.length, actor.width, actor.height] for actor in actors]
+    return json.dumps([entry if entry[-1] else entry[:-1] for entry in known]).encode()
+
+
+def _read_actors(reading: Reading, _aux: int, payload: bytes) -> None:
+    # What a later version has added stands at the end.
+    reading.actors.extend(Actor(*entry[:_ACTORS_FIELDS]) for entry in json.loads(payload))
+
+
+ACTORS = RecordType(2, "actors", "/scene/actor_definitions", TextForm(), _read_actors)
+
+
+# The numbers of the actors that are present from here on, as uint32[].
+
+
+def encode_roster(numbers: list[int]) -> bytes:
+    """Return the payload that says who is present, by the numbers of the actors."""
+    return np.array(numbers, "<u4").tobytes()
+
+
+class _RosterForm(Form):
+    messages: Mapping[str, Mapping[str, str]] = {"Roster": {"actors": "uint32*"}}
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
+        return "Roster", {"actors": np.frombuffer(payload, "<u4").tolist()}
+
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
+        return encode_roster(message.actors)
+
+
+def _read_roster(reading: Reading, _aux: int, payload: bytes) -> None:
+    actors = reading.actors
+    reading.roster = Roster(tuple([actors[number] for number in np.frombuffer(payload, "<u4").tolist()]))
+
+
+def roster_difference(step: int, left: Roster, right: Roster) -> Divergence | None:
+    """Return the first difference between the actors of two scenes."""
+    if left.actors == right.actors:
+        return None
+    for was, now in zip(left.actors, right.actors, strict=False):
+        if was != now:
+            if was.id == now.id:
+                return Divergence(step, was.id, "actor", str(was), str(now))
+            break
+    missing = [actor.id for actor in left.actors if actor.id not in right.index]
+    if missing:
+        return Divergence(step, missing[0], "presence", 1, 0)
+    extra = [actor.id for actor in right.actors if actor.id not in left.index]
+    if extra:
+        return Divergence(step, extra[0], "presence", 0, 1)
+    return Divergence(step, "", "order of actors", [a.id for a in left.actors][:5], "another")
+
+
+# It is compared with the step, whose values stand in the order of the roster.
+ROSTER = RecordType(3, "roster", "/scene/roster", _RosterForm(), _read_roster)
+
+
+# A step that is complete: int64 step, float64 time in s, float64 reward of each agent, and the values of the scene.
+#
+# These are, of all actors of the roster, x and y alternating, then all headings, then all speeds.
+
+_STEP_HEAD = struct.Struct("<qd")
+
+
+def time_of(payload: bytes) -> float:
+    """Return the simulation time of a step, in s."""
+    time_s: float = _STEP_HEAD.unpack_from(payload)[1]
+    return time_s
+
+
+class _StepForm(Form):
+    messages: Mapping[str, Mapping[str, str]] = {
+        "Step": {
+            "step": "int64",
+            "time_s": "double",
+            "rewards": "double*",
+            "positions": "double*",
+            "headings": "double*",
+            "speeds": "double*",
+        }
+    }
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
+        step, time_s = _STEP_HEAD.unpack_from(payload)
+        values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size).tolist()
+        agents = len(prologue.agents)
+        rewards, scene = values[:agents], values[agents:]
+        count = len(scene) // 4
+        return "Step", {
+            "step": step,
+            "time_s": time_s,
+            "rewards": rewards,
+            "positions": scene[: 2 * count],
+            "headings": scene[2 * count : 3 * count],
+            "speeds": scene[3 * count :],
+        }
+
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
+        values = np.array([*message.rewards, *message.positions, *message.headings, *message.speeds], "<f8")
+        return _STEP_HEAD.pack(message.step, message.time_s) + values.tobytes()
+
+
+def _read_step(reading: Reading, _aux: int, payload: bytes) -> None:
+    agents, steps, current = reading.prologue.agents, reading.steps, reading.current
+    step, time_s = _STEP_HEAD.unpack_from(payload)
+    values = np.frombuffer(payload, "<f8", offset=_STEP_HEAD.size).tolist()
+    rewards, values = values[: len(agents)], values[len(agents) :]
+    count = len(reading.roster)
+    if step != len(steps) or len(rewards) != len(agents) or len(values) != 4 * count:
+        raise ValueError(f"step {step} follows {len(steps) - 1}")
+    points = list(zip(values[: 2 * count : 2], values[1 : 2 * count : 2], strict=True))
+    headings, speeds = values[2 * count : 3 * count], values[3 * count :]
+    parts: SceneParts = {"heights": [], "grades": [], **reading.scene}
+    scene = current.scene = Scene(time_s, reading.roster, points, headings, speeds, **parts)
+    if len(scene.heights) not in (0, count) or any(row >= count for row in scene.spines):
+        raise ValueError(f"step {step} is about more actors than there are")
+    scene.events = reading.events
+    scene.previous = steps[-1].scene if steps else None
+    current.step = step
+    current.rewards = {agent.id: reward for agent, reward in zip(agents, rewards, strict=True)}
+    steps.append(current)
+    reading.current, reading.scene, reading.events = StepRecord(step + 1), {}, ()
+
+
+def _difference_step(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
+    step, was, now = left.step, left.scene, right.scene
+    if was is None or now is None:
+        return None if was is now else Divergence(step, "", SCENE, was and "present", now and "present")
+    for name in left.rewards:
+        if np.float64(left.rewards[name]).tobytes() != np.float64(right.rewards[name]).tobytes():
+            return Divergence(step, name, "reward", left.rewards[name], right.rewards[name])
+    if was.time_s != now.time_s:
+        return Divergence(step, "", "time_s", was.time_s, now.time_s)
+    other = roster_difference(step, was.roster, now.roster)
+    if other is not None:
+        return other
+    was_data, now_data = was.data, now.data
+    if was_data.tobytes() == now_data.tobytes():
+        return None
+    row, column = first_difference(was_data, now_data)
+    name = ("x", "y", "heading", "speed")[column]
+    values = float(was_data[row, column]), float(now_data[row, column])
+    return Divergence(step, was.roster.actors[row].id, f"scene.{name}", *values, (SCENE, (column,)))
+
+
+def _value_step(step: StepRecord, actor: str, index: tuple[int, ...]) -> object:
+    if step.scene is None or actor not in step.scene.roster.index:
+        return None
+    return float(step.scene.data[step.scene.roster.index[actor], index[0]])
+
+
+STEP = RecordType(6, SCENE, "/scene", _StepForm(), _read_step, _difference_step, _value_step)
+
+
+# How high everybody is, then how steep it is there, as float64[]; only where the map is not flat.
+
+
+def encode_heights(scene: Scene) -> bytes:
+    """Return the payload that says how high everybody is, and how steep it is there."""
+    return np.array([*scene.heights, *scene.grades], "<f8").tobytes()
+
+
+class _HeightsForm(Form):
+    messages: Mapping[str, Mapping[str, str]] = {"Heights": {"heights": "double*", "grades": "double*"}}
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
+        heights, grades = np.frombuffer(payload, "<f8").reshape(2, -1).tolist()
+        return "Heights", {"heights": heights, "grades": grades}
+
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
+        return np.array([*message.heights, *message.grades], "<f8").tobytes()
+
+
+def _read_heights(reading: Reading, _aux: int, payload: bytes) -> None:
+    heights, grades = np.frombuffer(payload, "<f8").reshape(2, -1).tolist()
+    reading.scene["heights"], reading.scene["grades"] = heights, grades
+
+
+HEIGHTS = RecordType(9, "heights", "/scene/heights", _HeightsForm(), _read_heights, scene_texts("heights", "grades"))
+
+
+# Of each long vehicle that is bent: uint32 row, uint32 points, and float64 x, y and z of each point, in m.
+
+_SPINES_HEAD = struct.Struct("<II")
+
+
+def encode_spines(scene: Scene) -> bytes:
+    """Return the payload that says how the long vehicles are bent."""
+    return _encode_spines(scene.spines)
+
+
+def _encode_spines(spines: Mapping[int, Spine | NDArray[np.float64]]) -> bytes:
+    return b"".join(
+        _SPINES_HEAD.pack(row, len(spine)) + np.array(spine, "<f8").tobytes() for row, spine in spines.items()
+    )
+
+
+def _decode_spines(payload: bytes) -> dict[int, Spine]:
+    found, offset = {}, 0
+    while offset < len(payload):
+        row, count = _SPINES_HEAD.unpack_from(payload, offset)
+        offset += _SPINES_HEAD.size
+        points = np.frombuffer(payload, "<f8", 3 * count, offset).reshape(-1, 3).tolist()
+        found[row] = tuple((x, y, z) for x, y, z in points)
+        offset += 24 * count
+    return found
+
+
+class _SpinesForm(Form):
+    messages: Mapping[str, Mapping[str, str]] = {
+        "Spines": {"rows": "uint32*", "points": "uint32*", "coordinates": "double*"}
+    }
+
+    def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
+        spines = _decode_spines(payload)
+        coordinates = [value for spine in spines.values() for point in spine for value in point]
+        points = [len(spine) for spine in spines.values()]
+        return "Spines", {"rows": list(spines), "points": points, "coordinates": coordinates}
+
+    def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
+        values = np.array(list(message.coordinates), "<f8").reshape(-1, 3)
+        ends = np.cumsum(list(message.points))[:-1]
+        return _encode_spines(dict(zip(message.rows, np.split(values, ends), strict=True)))
+
+
+def _read_spines(reading: Reading, _aux: int, payload: bytes) -> None:
+    reading.scene["spines"] = _decode_spines(payload)
+
+
+SPINES = RecordType(10, "spines", "/scene/spines", _SpinesForm(), _read_spines, scene_texts("spines"))
+
+
+# The lane of each actor of the roster, as text, one a line; only in steps that looked.
+
+
+def encode_lanes(lanes: Iterable[str]) -> bytes:
+    """Return the payload that says where everybody drives."""
+    return "\n".join(lanes).encode()
+
+
+def _read_lanes(reading: Reading, _aux: int, payload: bytes) -> None:
+    reading.scene["lanes"] = tuple(payload.decode().split("\n"))
+
+
+LANES = RecordType(7, "lanes", "/scene/lanes", TextForm(), _read_lanes, scene_texts("lanes"))

@@ -1,0 +1,328 @@
+"""Judging a crash: its trial is run again, overruled or with something left out, to see what avoids it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.crashes import (
+    INTERRUPTED,
+    Attempt,
+    Judgement,
+    ending_of,
+    last_escape,
+    overruled_trial,
+    slowing,
+    visible_from,
+)
+from crashhunt.replays._causes import find_why
+from crashhunt.replays._prepare import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, prepare
+from crashhunt.trial import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.crashes import Bundle, Ending
+    from crashhunt.recording import Recording
+    from crashhunt.replays._prepare import Ended, Rerun
+    from crashhunt.trial import TrialResult
+
+
+__all__ = ["CannotError", "Search", "Tried", "judge"]
+
+
+# The search for the last step from which a manoeuvre avoids a collision: which runs it asks for, and in what order.
+
+_FOR_BRAKING = 0.6  # of the runs; the rest is for changing lanes
+_STANDS = 0.1  # m/s²
+_TOO_FEW = "no runs were left for changing lanes"
+
+
+class CannotError(Exception):
+    """A manoeuvre cannot be done at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """One run.
+
+    Args:
+        step: after which the agent was overruled.
+        ending: what became of the collision.
+        deceleration: the greatest, in m/s².
+    """
+
+    step: int
+    ending: Ending
+    deceleration: float = 0.0
+
+
+class _Enough(Exception):  # noqa: N818 - no error
+    """All runs have been used up, or no more would say anything."""
+
+
+@dataclass(slots=True)
+class _Tries:
+    """A manoeuvre, and what has come of it so far."""
+
+    manoeuvre: str
+    most: int
+    endings: dict[int, Ending] = field(default_factory=dict)
+    decelerations: list[float] = field(default_factory=list)
+
+    @property
+    def last(self) -> int | None:
+        """The last step from which it helped."""
+        return max((step for step, ending in self.endings.items() if ending == "avoided"), default=None)
+
+
+class Search:
+    """Bisects, and then runs what is left after the last step that helped: helping need not end for good.
+
+    Args:
+        end: the step of the crash.
+        start: where to begin.
+        run: runs a manoeuvre after each of some steps, and yields what comes of it; raises `CannotError`.
+        runs: the most runs.
+        parallel: how many to ask for at a time.
+    """
+
+    def __init__(
+        self, end: int, start: int, run: Callable[[str, list[int]], Iterator[Tried]], *, runs: int, parallel: int = 1
+    ) -> None:
+        self.why_not = ""
+        self._end, self._start, self._run = end, start, run
+        self._left, self._runs, self._parallel = runs, runs, max(1, parallel)
+        self._tries: list[_Tries] = []
+
+    def all(self) -> None:
+        """Try braking, and then whether changing lanes helps any longer."""
+        if self._end < 1:
+            self.why_not = "it crashed in its first step"
+            return
+        start = min(max(0, self._start), self._end - 1)
+        last = self._try("brake", int(self._runs * _FOR_BRAKING) or 1, start, 0)
+        first = 0 if last is None else last + 1
+        if last == self._end - 1:
+            return  # nothing can help any longer
+        for side, share in (("left", 2), ("right", 1)):
+            if self.why_not:
+                return
+            if self._left > 0:
+                self._try(side, self._left // share or 1, self._end - 1, first)
+            elif all(tries.last is None for tries in self._tries):  # else it would read as if nothing could help
+                self.why_not = _TOO_FEW
+
+    def judgement(self) -> Judgement:
+        """Return what has been found so far."""
+        attempts = [
+            Attempt(
+                tried.manoeuvre,
+                self._end,
+                dict(tried.endings),
+                max((value for value in tried.decelerations if value > _STANDS), default=None),
+            )
+            for tried in self._tries
+            if tried.endings
+        ]
+        return Judgement(tuple(attempts), self.why_not)
+
+    def _try(self, manoeuvre: str, most: int, start: int, first: int) -> int | None:
+        """Search for the last step from which a manoeuvre helps; return it, None where none was found."""
+        tries = _Tries(manoeuvre, most)
+        self._tries.append(tries)
+        try:
+            self._find(tries, start, first)
+            self._look_after(tries, first)
+        except _Enough:
+            pass
+        except CannotError as error:
+            if manoeuvre == "brake":
+                self.why_not = str(error)
+        return tries.last
+
+    def _find(self, tries: _Tries, start: int, first: int) -> None:
+        """Bisect between a step that helps and one that does not."""
+        self._ask(tries, {start, self._end - 1} if self._parallel > 1 else {start})
+        stride = 1
+        while True:
+            helps = tries.last
+            above = -1 if helps is None else helps
+            late = min((step for step in tries.endings if step > above), default=self._end)
+            if helps is None:
+                if late <= first:
+                    return
+                steps = {max(first, late - stride * 2**more) for more in range(self._parallel)}
+                stride *= 2**self._parallel
+            elif late - helps <= 1:
+                return
+            else:
+                parts = min(self._parallel, late - helps - 1) + 1
+                steps = {helps + (late - helps) * part // parts for part in range(1, parts)}
+            self._ask(tries, steps)
+
+    def _look_after(self, tries: _Tries, first: int) -> None:
+        """Run what is left after the last step that helped, the latest first."""
+        while True:
+            above = first - 1 if tries.last is None else tries.last
+            left = [step for step in range(self._end - 1, above, -1) if step not in tries.endings]
+            if not left:
+                return
+            self._ask(tries, left[: self._parallel])
+
+    def _ask(self, tries: _Tries, steps: Iterable[int]) -> None:
+        """Run the manoeuvre after each of some steps.
+
+        Raises:
+            _Enough: there are no runs left.
+        """
+        new = sorted(step for step in steps if step not in tries.endings)
+        new = new[: max(0, min(self._left, tries.most - len(tries.endings)))]
+        if not new:
+            raise _Enough
+        for tried in self._run(tries.manoeuvre, new):
+            self._left -= 1
+            tries.endings[tried.step] = tried.ending
+            tries.decelerations.append(tried.deceleration)
+            if tried.ending == "diverged":
+                self.why_not = f"the trial was not the same up to step {tried.step} when it was run again"
+                raise _Enough
+
+
+_GUESS = 4.5  # m/s², to begin the search somewhere
+
+
+def judge(
+    bundle: Bundle,
+    options: ReplayOptions | None = None,
+    *,
+    runs: int = 60,
+    why: int = 0,
+    parallel: int = 1,
+    watch: Watch | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Judgement:
+    """Return until when a collision could have been avoided, how, and what a crash hangs on, by running it again.
+
+    The agent is overruled after some step: it brakes as hard as its vehicle can, or changes lanes and brakes; the
+    others react as they then do. The search begins where a calculation guesses it, bisects, and then runs the steps
+    after the last one that helped, as many as it may: that it is too late after one step does not say that it is too
+    late after the next. What it hangs on is found by leaving one thing out at a time.
+
+    Args:
+        bundle: of a crash; of one that is no collision with somebody, only what it hangs on is run.
+        options: of the replays; only whose code drives, and whether it is trusted.
+        runs: the most trials to run to avoid it.
+        why: the most trials to run for what it hangs on; 0 leaves that out.
+        parallel: how many at a time.
+        watch: called with how many have been run, and the most.
+        stopped: asked now and then whether to give up; what has been found by then is returned.
+
+    Raises:
+        UsageError: it is a near miss or a hang, there is nothing to run, or ``runs`` is below 1.
+        BundleError: the bundle is damaged.
+        CrashhuntError: the trials could not be run.
+    """
+    if runs < 1:
+        raise UsageError(f"--runs is {runs}", fix="give at least 1")
+    result = bundle.result
+    hit = result.collision
+    of_two = result.outcome is Outcome.COLLISION and hit is not None and bool(hit.other)
+    _see_that_it_can_be_judged(bundle, of_two=of_two, why=why)
+    rerun = prepare(bundle, options or ReplayOptions())
+    with temporary_folder("judge") as scratch:
+        reruns = Reruns(rerun, scratch, parallel=parallel, stopped=stopped)
+
+        def tell(done: int) -> None:
+            if watch is not None:
+                watch(done, runs + why)
+
+        trials = _Trials(result, rerun.recorded, reruns, tell)
+        search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
+        found = None
+        try:
+            if of_two:
+                search.all()
+            if why > 0:
+                found = find_why(rerun, reruns, most=why, tell=lambda done: tell(trials.done + done))
+        except StoppedError:
+            search.why_not = INTERRUPTED
+        finally:
+            reruns.close()
+    visible = visible_from(rerun.recorded, hit.agent, hit.other) if of_two and hit is not None else None
+    return replace(search.judgement(), why=found, visible_step=visible)
+
+
+def _see_that_it_can_be_judged(bundle: Bundle, *, of_two: bool, why: int) -> None:
+    """See that there is something to run.
+
+    Raises:
+        UsageError: there is not.
+    """
+    outcome = bundle.result.outcome
+    if bundle.is_near_miss:
+        raise UsageError(f"{bundle.id} is a near miss, and nothing crashes in it", fix="give a crash")
+    if outcome is Outcome.HANG:
+        raise UsageError(
+            f"{bundle.id} is a hang, and every run of it would take its time limit",
+            fix=f"look where it hangs: crashhunt show {bundle.path}",
+        )
+    if not of_two and why == 0:
+        raise UsageError(
+            f"{bundle.id} is no collision with somebody else, so that only what it hangs on can be run",
+            fix="leave --why out, or give at least 1",
+        )
+
+
+def _start(rerun: Rerun) -> int:
+    """The step after which braking may just have helped, as far as a calculation says it."""
+    hit, end = rerun.bundle.result.collision, rerun.bundle.result.steps
+    assert hit is not None
+    guess = last_escape(rerun.recorded, hit.agent, hit.other, braking=_GUESS)
+    return end - 1 if guess is None else guess
+
+
+@dataclass(slots=True)
+class _Trials:
+    """Runs the trial of a collision with its agent overruled."""
+
+    result: TrialResult
+    recorded: Recording
+    reruns: Reruns
+    tell: Callable[[int], None]
+    done: int = 0
+
+    def run(self, manoeuvre: str, steps: list[int]) -> Iterator[Tried]:
+        """Yield what comes of a manoeuvre after each of some steps, as it ends.
+
+        Raises:
+            CannotError: the vehicle cannot do it.
+            CrashhuntError: the trials could not be run.
+        """
+        made = [overruled_trial(self.result, self.recorded, step, None, manoeuvre) for step in steps]
+        try:
+            for ended in self.reruns.run(made):
+                yield self._tried(steps[ended.place], ended)
+        except NotUnderstoodError as error:
+            raise CannotError(error.message) from error
+        except (RecorderError, CannotError):
+            raise
+        except CrashhuntError as error:
+            if manoeuvre == "brake":
+                raise
+            raise CannotError(str(error)) from error  # the crashhunt of an older snapshot knows braking only
+
+    def _tried(self, step: int, ended: Ended) -> Tried:
+        result, recording = ended.result, ended.recording
+        if result.outcome is Outcome.INVALID:
+            raise CannotError(result.failure.message if result.failure else "its trial could not be set up")
+        self.done += 1
+        self.tell(self.done)
+        assert self.result.collision is not None
+        if recording is None:
+            return Tried(step, "unclear")
+        ending = ending_of(self.result, self.recorded, step, result, recording)
+        return Tried(step, ending, slowing(self.result.collision.agent, step, result, recording))

@@ -1,0 +1,513 @@
+"""The danger of a crash or near miss in words and figures: the agent's own, and that by those behind it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from crashhunt.crashes import Attempt, Bundle, DangerCourse, Encounter, Factor, Judgement, Moment, Why
+    from crashhunt.hunts import HuntReport
+    from crashhunt.recording import Recording
+    from crashhunt.trial import Disturbance, TrialResult, Value
+    from crashhunt.world import DangerousMoment, Event
+
+
+__all__ = [
+    "COLUMNS",
+    "STANDS",
+    "about_danger",
+    "about_disturbances",
+    "about_events",
+    "about_gap",
+    "about_judgement",
+    "about_nearest",
+    "about_place",
+    "about_why",
+    "by_likelihood",
+    "danger_cells",
+    "danger_to_json",
+    "describe_branches",
+    "describe_disturbances",
+    "describe_probes",
+    "likeliest",
+    "may_be_disturbed",
+    "nearest_to_json",
+    "told_disturbances",
+    "traffic_of",
+    "window_of",
+]
+
+
+# How two stood to each other, in words.
+
+STANDS = 0.05  # m/s; what is less is shown as 0
+_PLACES = {
+    "ahead": "ahead of {agent}",
+    "behind": "behind {agent}",
+    "left": "to the left of {agent}",
+    "right": "to the right of {agent}",
+}
+_WAYS = {
+    "same": "going the same way",
+    "other": "going the other way",
+    "left": "crossing from right to left",
+    "right": "crossing from left to right",
+}
+
+
+def about_gap(encounter: Encounter, moment: Moment) -> str:
+    """Return how far apart the two were, and how fast."""
+    return (
+        f"they were {moment.gap_m:.1f} m apart, {_closing(moment.closing_speed)}; {encounter.agent} at "
+        f"{moment.speed:.1f} m/s, {encounter.other} at {moment.other_speed:.1f} m/s"
+    )
+
+
+def about_place(encounter: Encounter, moment: Moment) -> str:
+    """Return where the other one was, and where it went."""
+    position = encounter.position(moment.step)
+    assert position is not None
+    going = _WAYS[position.faces] if abs(moment.other_speed) >= STANDS else "standing"
+    return f"{encounter.other} was {_PLACES[position.place].format(agent=encounter.agent)}, {going}"
+
+
+def _closing(speed: float) -> str:
+    if abs(speed) < STANDS:
+        return "keeping their distance"
+    return f"{'closing' if speed > 0 else 'parting'} at {abs(speed):.1f} m/s"
+
+
+COLUMNS = ("danger", "from behind")
+"""The headings of the two numbers of a step."""
+
+
+def window_of(recording: Recording, last_s: float, nearest: DangerousMoment | None) -> tuple[int, int]:
+    """Return the first and the last step to be told: the last seconds of a crash, or those around a near miss."""
+    dt, end = recording.prologue.step_length_s, recording.steps
+    if nearest is None:
+        return end - round(last_s / dt), end
+    half = round(last_s / 2 / dt)
+    return max(0, nearest.step - half), min(end, nearest.step + half)
+
+
+def about_nearest(encounter: Encounter, nearest: DangerousMoment) -> list[str]:
+    """Return when a trial without a crash was nearest to one, to whom, and how they stood to each other."""
+    moment = next((one for one in encounter.moments if one.step == nearest.step), None)
+    if moment is None:
+        return []
+    when = f"at {moment.time_s:.1f} s, after step {nearest.step}"
+    return [
+        f"It was nearest to a crash {when}: a danger of {nearest.danger:.2f}, to {nearest.other}.",
+        f"At that time {about_gap(encounter, moment)}; {about_place(encounter, moment)}.",
+    ]
+
+
+def about_danger(course: DangerCourse) -> str:
+    """Return the greatest danger of both kinds, and what they add up to over the trial."""
+    parts = []
+    for whose, moment, total, who, nobody in (
+        (f"{course.agent}'s own", course.greatest, course.own_total, "towards", "nobody was seen near"),
+        (
+            "that by those behind it",
+            course.greatest_behind,
+            course.behind_total,
+            "by",
+            "nobody was seen to close in from behind",
+        ),
+    ):
+        if moment.danger <= 0:
+            parts.append(nobody)
+            continue
+        most = f"at most {moment.danger:.2f}, after step {moment.step}, {who} {moment.other}"
+        parts.append(f"{whose} was {most} ({total:.2f} over the trial)")
+    return f"Danger: {parts[0]}; {parts[1]}."
+
+
+def danger_cells(course: DangerCourse, step: int) -> list[str]:
+    """Return the two numbers of a step, for a table."""
+    found = course.of_step(step)
+    return ["-"] * len(COLUMNS) if found is None else [f"{one:.2f}" if math.isfinite(one) else "-" for one in found]
+
+
+def danger_to_json(course: DangerCourse | None, bundle: Bundle, first: int, last: int) -> dict[str, object] | None:
+    """Return the shape under ``danger`` of ``show --json``; None where nobody knows.
+
+    Args:
+        course: of the recording.
+        bundle: of the trial.
+        first: step of those that are told one by one.
+        last: likewise.
+    """
+    if course is None:
+        return None
+    return {
+        "ranked_by": bundle.result.danger,
+        "own": _summary(course.greatest, course.own_total),
+        "from_behind": _summary(course.greatest_behind, course.behind_total),
+        "steps": [
+            {"step": step, "own": _or_none(own), "from_behind": _or_none(behind)}
+            for step, own, behind in zip(course.steps, course.own, course.behind, strict=True)
+            if first <= step <= last
+        ],
+    }
+
+
+def nearest_to_json(nearest: DangerousMoment | None) -> dict[str, object] | None:
+    """Return the shape under ``nearest`` of ``show --json``; None of a crash."""
+    if nearest is None:
+        return None
+    return {"step": nearest.step, "danger": nearest.danger, "agent": nearest.agent, "other": nearest.other}
+
+
+def _or_none(danger: float) -> float | None:
+    return float(danger) if math.isfinite(danger) else None
+
+
+def _summary(moment: DangerousMoment, total: float) -> dict[str, object]:
+    known = moment.danger > 0
+    return {
+        "over_the_trial": total,
+        "greatest": moment.danger,
+        "step": moment.step if known else None,
+        "other": moment.other if known else None,
+    }
+
+
+# Disturbances in words: what happened before a crash, and which crash would be the likeliest.
+
+
+def about_disturbances(recording: Recording, result: TrialResult, first_step: int) -> list[str]:
+    """Return what disturbed a trial in its last steps, a sentence each, and how often anything did before.
+
+    Args:
+        recording: of the episode.
+        result: of it.
+        first_step: from which on.
+    """
+    step_length_s = recording.prologue.step_length_s
+    recent = [one for one in result.disturbances if one.step + one.how_long / step_length_s >= first_step]
+    earlier = len(result.disturbances) - len(recent)
+    told = [
+        f"{max(0, recording.steps - one.step + 1) * step_length_s:.1f} s before, from step {one.step} on: {one.words}"
+        f"{_where(one)}."
+        for one in recent
+    ]
+    if earlier:
+        told.insert(0, f"{earlier} {'disturbance was' if earlier == 1 else 'disturbances were'} over before that.")
+    return told
+
+
+def told_disturbances(result: TrialResult) -> list[str]:
+    """Return a line for each disturbance of a trial, and one for how likely all of it was."""
+    if not may_be_disturbed(result):
+        return []
+    lines = [f"disturbed from step {one.step} on: {one.words}{_where(one)}" for one in result.disturbances]
+    lines = lines or ["in undisturbed traffic: nothing that was planned had begun"]
+    if result.log_likelihood is not None:
+        lines.append(f"log-likelihood of those that were drawn, and no others: {result.log_likelihood:.2f}")
+    return lines
+
+
+def describe_disturbances(crashes: Sequence[Bundle]) -> list[str]:
+    """Return how many crashes of a hunt with disturbances had any, and which of those is the likeliest."""
+    if not any(may_be_disturbed(bundle.result) for bundle in crashes):
+        return []
+    disturbed = [bundle for bundle in crashes if bundle.result.disturbed]
+    lines = [f"Crashes: {len(crashes) - len(disturbed)} in undisturbed traffic, {len(disturbed)} with disturbances."]
+    first = likeliest(crashes)
+    if first is not None:
+        lines.append(f"The likeliest of those with disturbances: {first.id} (log-likelihood {_likely(first):.2f})")
+    return lines
+
+
+def likeliest(crashes: Sequence[Bundle]) -> Bundle | None:
+    """Return the likeliest of the crashes with disturbances; None where none of them was drawn."""
+    drawn = [bundle for bundle in crashes if bundle.result.disturbed and math.isfinite(_likely(bundle))]
+    return by_likelihood(drawn)[0] if drawn else None
+
+
+def traffic_of(bundle: Bundle, crashes: Sequence[Bundle]) -> str:
+    """Return which traffic a crash took place in, in words; empty where its hunt has no disturbances.
+
+    Args:
+        bundle: the crash.
+        crashes: all of the hunt.
+    """
+    if not may_be_disturbed(bundle.result):
+        return ""
+    if not bundle.result.disturbed:
+        return "in undisturbed traffic"
+    likely = f", log-likelihood {_likely(bundle):.1f}" * math.isfinite(_likely(bundle))
+    return f"with disturbances{likely}{': the likeliest' * (bundle is likeliest(crashes))}"
+
+
+def by_likelihood(crashes: Sequence[Bundle]) -> list[Bundle]:
+    """Return crashes in order: those in undisturbed traffic as they are, then the others, the likeliest first."""
+    return sorted(crashes, key=lambda bundle: (1, -_likely(bundle)) if bundle.result.disturbed else (0, 0.0))
+
+
+def may_be_disturbed(result: TrialResult) -> bool:
+    """Whether its hunt has disturbances, whatever of them took place."""
+    return result.log_likelihood is not None or bool(result.spec.disturbances)
+
+
+def _likely(bundle: Bundle) -> float:
+    found = bundle.result.log_likelihood
+    return -math.inf if found is None else found
+
+
+def _where(one: Disturbance) -> str:
+    return f" ({one.place})" if one.vehicle != one.agent else ""
+
+
+# Traffic events in words, as part of the story of a crash.
+
+_LAST = 5  # a jam has many
+
+
+def about_events(recording: Recording, first_step: int, *, besides: Event | None) -> list[str]:
+    """Return what else happened in the traffic in the last steps, a sentence each.
+
+    Args:
+        recording: of the episode.
+        first_step: from which on.
+        besides: what ended it, which has been told.
+    """
+    end = recording.steps * recording.prologue.step_length_s
+    told = [
+        (step.step, event)
+        for step in recording.all_steps[first_step:]
+        if step.scene is not None
+        for event in step.scene.events
+        if event != besides
+    ]
+    return [
+        f"{end - step * recording.prologue.step_length_s:.1f} s before, at step {step}: {event.what}."
+        for step, event in told[-_LAST:]
+    ]
+
+
+# Whether a collision could have been avoided, in words: only what was run is said.
+
+_BY = {
+    "brake": "by braking",
+    "left": "by changing to the lane on the left and braking",
+    "right": "by changing to the lane on the right and braking",
+}
+
+
+def about_judgement(judgement: Judgement, ago: Callable[[int], str], agent: str, other: str) -> list[str]:
+    """Return what was found out, a sentence each.
+
+    Args:
+        judgement: of the crash.
+        ago: says when a step was, such as ``0.4 s before, after step 68``.
+        agent: the controlled vehicle.
+        other: whom it collided with.
+    """
+    best, runs = judgement.best, f"{judgement.runs} {'run' if judgement.runs == 1 else 'runs'}"
+    sentences = []
+    if best is not None:
+        sentences = [_until(best, ago)]
+        rest = (attempt for attempt in judgement.attempts if attempt is not best and attempt.last_step is not None)
+        sentences += [_until(attempt, ago) for attempt in rest]
+    elif judgement.avoidable is False:
+        tried = " nor ".join(_BY.get(attempt.manoeuvre, attempt.manoeuvre) for attempt in judgement.attempts)
+        sentences = [f"None of {runs} avoided it, from the first step on: neither {tried}."]
+        if len(judgement.attempts) == 1:
+            sentences = [f"None of {runs} avoided it {tried}, from the first step on."]
+    elif judgement.runs:
+        sentences = [f"None of {runs} avoided it, and they do not say that nothing could have."]
+    visible = judgement.visible_step
+    if judgement.verdict == "invalid":
+        sentences.append(f"{agent} was put into it: that is an invalid trial, and says nothing about it.")
+    elif visible is not None and judgement.verdict == "too late when visible":
+        sentences.append(
+            f"When {agent} was first shown {other}, {ago(visible)}, it could not be avoided any more: it was run from "
+            "each step from then on."
+        )
+    elif visible is not None and judgement.runs:
+        sentences.append(f"{agent} was shown {other} {'all the time' if visible == 0 else f'from {ago(visible)}, on'}.")
+    if judgement.why_not:
+        sentences.append(f"Whether it could have been avoided is not fully known: {judgement.why_not}.")
+    return sentences
+
+
+def _until(attempt: Attempt, ago: Callable[[int], str]) -> str:
+    assert attempt.last_step is not None
+    braking = f" (at up to {attempt.deceleration:.1f} m/s²)" if attempt.deceleration is not None else ""
+    words = (
+        f"It could be avoided until {ago(attempt.last_step)}, {_BY.get(attempt.manoeuvre, attempt.manoeuvre)}{braking}"
+    )
+    if attempt.all_later_run and attempt.last_step < attempt.end - 1:
+        return f"{words}; that was run, and after each later step it was too late."
+    if attempt.too_late_step is not None:
+        return f"{words}; that was run, and one step later it was too late."
+    return f"{words}; that was run."
+
+
+# What a collision hangs on, in words: only what was run is said.
+
+_LEFT_OUT = {"braked": "it keeps its speed", "sped up": "it keeps its speed", "changed lanes": "it stays in its lane"}
+_NOUNS = {"braked": "braking", "sped up": "speeding up", "changed lanes": "change of lanes"}
+
+
+def about_why(why: Why, when: Callable[[int], str]) -> list[str]:
+    """Return what was found out, a sentence each: first what it hangs on, then what makes no difference.
+
+    Args:
+        why: what was run.
+        when: says when a step was, such as ``61.3 s``.
+    """
+    defaults = {factor.name: factor for factor in why.factors if (factor.kind, factor.what) == ("argument", "default")}
+    drawn = {
+        factor.name for factor in why.factors if (factor.kind, factor.what) == ("argument", "drawn") and factor.clear
+    }
+    sentences, alike = [], []
+    for factor in why.factors:
+        default = defaults.get(factor.name) if factor.kind == "argument" else None
+        if not factor.clear or (factor is default and factor.name in drawn):
+            continue
+        each = [factor, *([default] if default is not None and default is not factor else [])]
+        if all(one.same == one.clear for one in each):
+            alike.append(_short(factor, sum(one.clear for one in each), when))
+        else:
+            sentences.append(f"- {'; '.join(_sentence(one, when) for one in each if one.clear)}.")
+    if sentences:
+        sentences = [f"What it hangs on, in {why.runs} runs with one thing left out in each:", *sentences]
+    if alike:
+        sentences.append(f"No difference, in any run without it: {'; '.join(alike)}.")
+    if why.why_not:
+        sentences.append(f"What it hangs on is not fully known: {why.why_not}.")
+    return sentences
+
+
+def _sentence(factor: Factor, when: Callable[[int], str]) -> str:
+    return f"{_given(factor, when)}: {_outcome(factor)}"
+
+
+def _given(factor: Factor, when: Callable[[int], str]) -> str:
+    who, what = factor.name, factor.what
+    if factor.kind == "argument" and what == "default":
+        return f"{who} at its default {_number(factor.runs[0].given)}"
+    if factor.kind == "argument":
+        return f"other values of {who} (it was {_number(factor.was)})"
+    if factor.kind == "seed":
+        return "other seeds, and so other traffic"
+    if what == "there":
+        return f"without {who} (taken off the road {_steps(factor)})"
+    assert factor.step is not None
+    if factor.kind == "disturbance":
+        return f"without the disturbance {what} of {who} at {when(factor.step)}"
+    return f"{who} {what} at {when(factor.step)}; without that ({_LEFT_OUT[what]})"
+
+
+def _steps(factor: Factor) -> str:
+    steps = sorted(int(run.given) for run in factor.runs)
+    earlier = ", ".join(map(str, steps[:-1]))
+    return f"after step {earlier} or {steps[-1]}" if earlier else f"after step {steps[-1]}"
+
+
+def _outcome(factor: Factor) -> str:
+    of = factor.clear
+    if factor.kind in ("argument", "seed") and of > 1:
+        low, high = factor.interval or (0.0, 1.0)
+        words = f"{factor.crashed} of {of} runs crash ({100 * low:.0f} to {100 * high:.0f} %)"
+        if factor.crashed == factor.same:
+            return words
+        return f"{words}, {factor.same or 'none'} of them with the same one"
+    counts = (("no crash", of - factor.crashed), ("another crash", factor.crashed - factor.same))
+    several = [*counts, ("the same", factor.same)]
+    parts = [f"{words} in {number} of {of} runs" if of > 1 else words for words, number in several if number]
+    into = sorted({run.into for run in factor.runs if run.into})
+    more = f", though {factor.name} then drives into {' or '.join(into)} itself" if into else ""
+    return f"{' and '.join(parts)}{more}"
+
+
+def _short(factor: Factor, runs: int, when: Callable[[int], str]) -> str:
+    who, what = factor.name, factor.what
+    if factor.kind == "argument":
+        return f"the value of {who}, {_number(factor.was)} ({runs} {'other' if runs == 1 else 'others'})"
+    if factor.kind == "seed":
+        return f"the seed ({runs} others)"
+    if what == "there":
+        return who
+    assert factor.step is not None
+    return f"the {_NOUNS.get(what, what)} of {who} at {when(factor.step)}"
+
+
+def _number(value: Value | None) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+# What is told of the probes and branches of a hunt.
+
+
+def describe_probes(report: HuntReport) -> list[str]:
+    """Return how little it would have taken for trials to crash, and what has been run from the start of it."""
+    found = report.probes
+    if found is None or not (found.margins or found.not_fully_asked):
+        return []
+    steps = f"{found.steps} steps beside {report.trial_steps} of trials"
+    enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
+    lines = ["Stress margin: no trial was fully asked."]
+    if found.margins:
+        safe = sum(margin == 1.0 for margin in found.margins)
+        least, median = min(found.margins), statistics.median(found.margins)
+        said = f"nothing plausible made {safe} of them crash"
+        many = _many(len(found.margins), "trial")
+        lines = [f"Stress margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
+    lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
+    lines.append(f"  copies were asked {_many(found.probes, 'time')}, with {steps}{enough}")
+    if found.run_again:
+        lines.append(
+            f"  of the {found.run_again} mildest disturbances with which a trial crashed, {len(found.crashes)} made it "
+            f"crash from the start as well{_not_finished(found.not_finished)}:"
+        )
+    for bundle, by in zip(found.crashes, found.by, strict=True):
+        lines.append(f"  {bundle.path}: {bundle.result.summary}, {by.words}")
+    return lines
+
+
+def describe_branches(report: HuntReport) -> list[str]:
+    """Return what came of branches, and which of those that crashed have done so from the start as well."""
+    found = report.branches
+    if found is None or not found.trials:
+        return []
+    enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
+    moments = f"{_many(found.moments, 'moment')} of {_many(found.trials, 'trial')}"
+    crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
+    lines = [
+        f"Branches: copies went on with other disturbances {_many(found.branches, 'time')}, from {moments}; {crashed}.",
+        f"  they took {found.steps} steps beside {report.trial_steps} of trials{enough}",
+        *_not_fully_asked(found.not_fully_asked, found.why_unanswered),
+    ]
+    if found.run_again:
+        unfinished = _not_finished(found.not_finished)
+        lines.append(
+            f"  of the {found.run_again} likeliest, {len(found.crashes)} crashed from the start as well{unfinished}:"
+        )
+    for bundle in found.crashes:
+        likely = bundle.result.log_likelihood
+        said = f", log-likelihood {likely:.2f}" if likely is not None else ""
+        lines.append(f"  {bundle.path}: {bundle.result.summary}{said}")
+    return lines
+
+
+def _not_fully_asked(count: int, why: str) -> list[str]:
+    """Return the line on trials of which a question has no answer; none where there are none."""
+    if not count:
+        return []
+    return [f"  {_many(count, 'trial')} {'was' if count == 1 else 'were'} not fully asked: {why}"]
+
+
+def _not_finished(count: int) -> str:
+    return f", and {count} could not be run to the end" if count else ""
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -1,0 +1,147 @@
+"""Samplers by name: creates them, calls them, and turns each failure of a user's sampler into one clear line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from crashhunt.base.errors import CrashhuntError, PluginError
+from crashhunt.base.exceptions import blamed
+from crashhunt.base.plugins import locate
+from crashhunt.samplers._protocol import HuntFacts, Independent, OnlyAsked, PlainStream, Proposal, WantsHunt
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from crashhunt.samplers._protocol import Sampler, Space
+    from crashhunt.trial import TrialResult
+
+
+__all__ = ["NamedSampler", "varies_only_asked"]
+
+
+_SEEDS = 2**31
+
+
+class NamedSampler:
+    """A sampler by its name, of which everything that it answers is checked.
+
+    Args:
+        name: a registered name, ``optuna:NAME``, or ``module:attribute``.
+        space: what to sample.
+        points: how many values to try of a range without a step.
+        hunt: what one that wants it may know of the hunt.
+
+    Raises:
+        PluginError: there is no such sampler, it cannot be made, or it is none.
+        CrashhuntError: it refuses the space.
+    """
+
+    def __init__(self, name: str, space: Space, *, points: int, hunt: HuntFacts = HuntFacts()) -> None:  # noqa: B008
+        self._name = name
+        self._keys = space.keys()
+        make = _maker(name)
+        more = {"hunt": hunt} if isinstance(make, WantsHunt) and make.wants_hunt else {}
+        try:
+            self._sampler: Sampler = make(space, points=points, **more)
+        except CrashhuntError:
+            raise
+        except Exception as error:  # of a user's sampler
+            self._blame("cannot be made", error)
+        missing = [member for member in ("learns", "ask", "tell") if not hasattr(self._sampler, member)]
+        if missing:
+            raise PluginError(f"the sampler {name!r} has no {missing[0]!r}", fix="see crashhunt.samplers.Sampler")
+        if self.learns and self.independent:
+            raise PluginError(
+                f"the sampler {name!r} says that it learns, and that its draws are independent",
+                fix="set independent = False, or learns = False",
+            )
+
+    @property
+    def learns(self) -> bool:
+        """Whether it receives results."""
+        return self._sampler.learns
+
+    @property
+    def independent(self) -> bool:
+        """Whether it draws every trial independently of the others; one that does not say so does not."""
+        return isinstance(self._sampler, Independent) and self._sampler.independent
+
+    @property
+    def plain_origin(self) -> str:
+        """The origin of the trials that it draws independently of all others; empty where it keeps none apart."""
+        return self._sampler.plain_origin if isinstance(self._sampler, PlainStream) else ""
+
+    def ask(self, number: int, rng: np.random.Generator) -> Proposal:
+        """Return its proposal.
+
+        Raises:
+            PluginError: it fails, or what it answers is none.
+        """
+        try:
+            answer = self._sampler.ask(number, rng)
+        except CrashhuntError:
+            raise
+        except Exception as error:
+            self._blame(f"fails when it is asked for trial {number}", error)
+        proposal = answer if isinstance(answer, Proposal) else Proposal(answer)
+        wrong = self._wrong_with(proposal)
+        if wrong:
+            raise PluginError(f"the sampler {self._name!r} proposes for trial {number} {wrong}", fix="mend it")
+        return proposal
+
+    def tell(self, result: TrialResult) -> None:
+        """Tell it how a trial ended.
+
+        Raises:
+            PluginError: it fails.
+        """
+        try:
+            self._sampler.tell(result)
+        except CrashhuntError:
+            raise
+        except Exception as error:
+            self._blame(f"fails on the result of trial {result.spec.number}", error)
+
+    def _wrong_with(self, proposal: Proposal) -> str:
+        arguments = proposal.arguments
+        if not isinstance(arguments, Mapping):
+            return f"{type(arguments).__name__}, not arguments"
+        if arguments.keys() != self._keys:
+            odd = min(arguments.keys() ^ self._keys, key=str)
+            return f"{'no value for' if odd in self._keys else 'a value for'} {'.'.join(filter(None, map(str, odd)))}"
+        for (agent, name), value in arguments.items():
+            if not isinstance(value, bool | int | float | str):
+                return f"{'.'.join(filter(None, (agent, name)))} = {value!r}, not a plain bool, int, float or str"
+            if isinstance(value, float) and not math.isfinite(value):
+                return f"{'.'.join(filter(None, (agent, name)))} = {value!r}, not a finite number"
+        seed, parent = proposal.seed, proposal.parent
+        if seed is not None and not (type(seed) is int and 0 <= seed < _SEEDS):
+            return f"the seed {seed!r}, not one from 0 to {_SEEDS - 1}"
+        if parent is not None and not (type(parent) is int and parent >= 0):
+            return f"the parent {parent!r}, not the number of a trial"
+        if type(proposal.origin) is not str:
+            return f"the origin {proposal.origin!r}, not a word"
+        return ""
+
+    def _blame(self, what: str, error: Exception) -> NoReturn:
+        raise blamed(f"the sampler {self._name!r} {what}", error) from error
+
+
+def varies_only_asked(name: str) -> bool:
+    """Return whether a sampler varies only the arguments that the user asks for by name.
+
+    Raises:
+        PluginError: there is no such sampler.
+    """
+    kind = _maker(name)
+    return isinstance(kind, OnlyAsked) and kind.only_asked
+
+
+def _maker(name: str) -> Any:
+    if not name.lower().startswith("optuna:"):
+        return locate("samplers", name)
+    from crashhunt.samplers._optuna import optuna_maker  # no other sampler imports Optuna
+
+    return optuna_maker(name)

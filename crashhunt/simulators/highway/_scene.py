@@ -1,0 +1,199 @@
+"""The shapes of highway-env's lanes, and how far its vehicles are apart."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from highway_env.vehicle.objects import Obstacle
+
+from crashhunt.simulators._standstill import Standstill
+from crashhunt.trial import EVERYBODY
+from crashhunt.world import Contact, Event, Lane, rectangle_gap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from highway_env.road.road import Road, RoadNetwork
+    from highway_env.vehicle.kinematics import Vehicle
+    from highway_env.vehicle.objects import RoadObject
+
+    from crashhunt.world import Actor
+
+
+__all__ = ["Hidden", "HighwayEvents", "TakingPart", "contact_of", "gap", "lanes_of"]
+
+
+_LANE_STEP_M = 2.0  # between the points of a bend
+
+
+def lanes_of(network: RoadNetwork, named: Callable[[tuple[str, str, int]], str]) -> list[Lane]:
+    """Return all lanes of a network; those that bend as points 2 m apart."""
+    found = []
+    for index, lane in network.lanes_dict().items():
+        count = 2 if type(lane).__name__ == "StraightLane" else max(2, math.ceil(lane.length / _LANE_STEP_M) + 1)
+        points = [lane.position(lane.length * number / (count - 1), 0.0).tolist() for number in range(count)]
+        shape = tuple((float(x), -float(y)) for x, y in points)
+        found.append(Lane(named(index), float(lane.width_at(lane.length / 2)), shape))
+    return found
+
+
+def gap(one: RoadObject, two: RoadObject) -> float:
+    """Return the distance between two outlines, in m."""
+    x, y = (two.position - one.position).tolist()
+    c, s = math.cos(one.heading), math.sin(one.heading)
+    halves = [np.array([[thing.LENGTH / 2, thing.WIDTH / 2]]) for thing in (one, two)]
+    turn = np.array([two.heading - one.heading])
+    return float(rectangle_gap(np.array([[x * c + y * s, y * c - x * s]]), turn, *halves)[0])
+
+
+def contact_of(
+    agent: str,
+    vehicle: RoadObject,
+    things: Iterable[RoadObject],
+    actor_of: Callable[[RoadObject], Actor],
+    lane: str,
+) -> Contact:
+    """Return whom a controlled vehicle touches that has just crashed.
+
+    Args:
+        agent: its name.
+        vehicle: itself.
+        things: all that there are.
+        actor_of: returns what does not change about one of them.
+        lane: on which it is.
+    """
+    # An obstacle that something is pushed away from does not itself say so.
+    others = [other for other in things if other is not vehicle and (other.crashed or isinstance(other, Obstacle))]
+    hit = min(others, key=lambda other: gap(vehicle, other), default=None)
+    if hit is None:
+        return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
+    x, y = (hit.position - vehicle.position).tolist()
+    first, second = (agent, vehicle), (actor_of(hit).id, hit)
+    ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
+    if not ahead and not isinstance(hit, Obstacle):
+        first, second = second, first
+    return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))
+
+
+# Vehicles and obstacles that do not take part in an episode, though the environment has them.
+
+
+class TakingPart:
+    """Takes them off the road before the step after the one in which they have come.
+
+    They are named in the order in which they come, whether they stay or not. Where an environment lets others in by
+    and by, it may let other ones in where some are missing.
+
+    Args:
+        road: of the environment.
+        takes_part: the names of those that stay, as in scenes.
+        agents: those of the controlled vehicles, which stay as well.
+        things: returns all that there are.
+        actor_of: returns what does not change about one, such as its name.
+
+    Attributes:
+        entered: the names of all that have come, in their order; the agents are not among them.
+    """
+
+    def __init__(
+        self,
+        road: Road,
+        takes_part: Iterable[str],
+        agents: Iterable[str],
+        things: Callable[[], Iterable[RoadObject]],
+        actor_of: Callable[[RoadObject], Actor],
+    ) -> None:
+        self._road, self._things, self._actor_of = road, things, actor_of
+        self._agents = frozenset(agents)
+        self._takes_part = frozenset(takes_part) | self._agents
+        self.entered: list[str] = []
+        self._seen: set[str] = set()
+
+    def remove(self) -> bool:
+        """Remove those that have come; returns whether there were any."""
+        gone = set()
+        for thing in self._things():
+            name = self._actor_of(thing).id
+            if name not in self._seen and name not in self._agents:
+                self._seen.add(name)
+                self.entered.append(name)
+            if name not in self._takes_part and EVERYBODY not in self._takes_part:
+                gone.add(id(thing))
+        if gone:
+            self._road.vehicles = [thing for thing in self._road.vehicles if id(thing) not in gone]
+            self._road.objects = [thing for thing in self._road.objects if id(thing) not in gone]
+        return bool(gone)
+
+
+# A vehicle that an agent does not see for a while, where highway-env itself makes the observation.
+
+
+class Hidden:
+    """Takes one vehicle off the road for as long as an agent looks, from the next observation on.
+
+    Args:
+        road: of the episode.
+        seeing: what makes the agent's observations, of whatever kind: all of them look at the vehicles of the road.
+        vehicle: whom it does not see.
+    """
+
+    how_strong = 1.0
+
+    def __init__(self, road: Road, seeing: Any, vehicle: Any) -> None:
+        self._road = road
+        self._seeing = seeing
+        self._vehicle = vehicle
+        self._look = seeing.observe
+        seeing.observe = self._observe
+
+    def keep(self) -> None:
+        """It stays out of sight."""
+
+    def end(self) -> None:
+        """Show it again."""
+        self._vehicle = None
+
+    def _observe(self) -> Any:
+        everybody = self._road.vehicles
+        if self._vehicle is None:
+            return self._look()
+        self._road.vehicles = [vehicle for vehicle in everybody if vehicle is not self._vehicle]
+        try:
+            return self._look()
+        finally:
+            self._road.vehicles = everybody
+
+
+# Traffic events of highway-env: who stands, and who drives against its lane.
+
+
+class HighwayEvents:
+    """What is told of the controlled vehicles of one episode.
+
+    Args:
+        step_length_s: of a step.
+        events: `Scenario.events`, which says after how long somebody stands.
+        lanes_are_road: whether lanes are there to be driven along; where they are bays, no way is the wrong one.
+    """
+
+    def __init__(self, step_length_s: float, events: Mapping[str, float], *, lanes_are_road: bool) -> None:
+        self._standstill = Standstill(step_length_s, events)
+        self._lanes_are_road = lanes_are_road
+        self._wrong: set[str] = set()
+
+    def look(self, agent: str, vehicle: Vehicle, point: tuple[float, float], lane: str) -> Iterator[Event]:
+        """Tell what has happened to a vehicle in a step, after which it is at a point of a scene."""
+        speed = float(vehicle.speed)
+        if stood := self._standstill.look(agent, speed):
+            yield Event("not_moving", agent, f"{agent} had stood still for {stood:g} s", (), lane, *point, speed)
+        along, _ = vehicle.lane.local_coordinates(vehicle.position)
+        turn = float(vehicle.heading) - float(vehicle.lane.heading_at(along))
+        # Of lanes above each other, highway-env takes the one that runs as the vehicle does.
+        if not self._lanes_are_road or abs(speed) < Standstill.SPEED or math.cos(turn) * speed >= -0.5 * abs(speed):
+            self._wrong.discard(agent)
+        elif agent not in self._wrong:
+            self._wrong.add(agent)
+            how = "backwards" if speed < 0 else "the wrong way"
+            yield Event("wrong_way", agent, f"{agent} drove {how} on lane {lane}", (), lane, *point, speed)

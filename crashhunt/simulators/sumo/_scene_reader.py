@@ -1,0 +1,489 @@
+"""What a scene of SUMO has: the vehicles and persons near the controlled ones, at which height, and how bent."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING
+
+from libsumo import _libsumo as sumo
+
+from crashhunt.world import PERSON, Actor, Contact, Roster, Scene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from crashhunt.native import Columns, Core, Vehicles
+    from crashhunt.world import Spine
+
+    Lists = tuple[list[tuple[float, float]], list[float], list[float]]
+
+
+__all__ = ["LOOK_AROUND_EVERY", "SIGHT_M", "Bends", "Sight", "height_at", "is_articulated"]
+
+
+# How long vehicles of SUMO are bent: along the lanes that they are on, as SUMO itself has them.
+
+_RAILS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car"})
+_RIGID_M = 15.0  # no longer bus or lorry may be built in one piece (Directive 96/53/EC); what is longer has a joint
+_JOINT_M = 6.0  # between two joints of what has any: a shorter one is drawn as one piece
+_PIECE_M = 5.0  # a car's length; the corner of a piece in the tightest bend is off by centimetres
+_STRAIGHT_M = 0.05  # off the straight line is as good as straight
+_MISPLACED_M = 1.0  # from its lane; who has been put beside it, with moveToXY, is taken as straight
+
+Point = tuple[float, float]
+
+
+def is_articulated(actor: Actor) -> bool:
+    """Whether a vehicle is made of parts that follow each other: what runs on rails, trailers, and what is too long."""
+    jointed = actor.kind in _RAILS or actor.kind == "trailer"
+    return actor.length > (_JOINT_M if jointed else _RIGID_M)
+
+
+class Bends:
+    """Finds the centre lines of long vehicles.
+
+    SUMO moves the front of a vehicle along its lanes, and its back along the same ones; after a change of lanes all of
+    it is in the new one. So its centre line is that of the lanes from its front back along its route.
+
+    Args:
+        lateral: whether vehicles may be beside the middle of a lane.
+    """
+
+    def __init__(self, *, lateral: bool) -> None:
+        self._lateral = lateral
+        self._shapes: dict[str, tuple[list[Point], list[float], float]] = {}
+        self._sources: dict[str, list[str]] = {}
+        self._used: dict[str, dict[str, str]] = {}
+
+    def reset(self) -> None:
+        """Forget the vehicles of an episode."""
+        self._used.clear()
+
+    def spine(self, vehicle: str, length: float, front: Point, heading: float, *, high: bool) -> Spine | None:
+        """Return the centre line of a vehicle; None where it is straight.
+
+        Args:
+            vehicle: its id.
+            length: in m.
+            front: its front bumper's centre.
+            heading: SUMO's, in rad; of a train it is that of its first carriage.
+            high: whether the map has heights; otherwise z is 0.
+        """
+        lane = sumo.vehicle_getLaneID(vehicle)
+        if not lane:
+            return None
+        edge = sumo.lane_getEdgeID(lane)
+        self._used.setdefault(vehicle, {})[edge] = lane
+        pieces = max(2, math.ceil(length / _PIECE_M))
+        line = list(self._behind(vehicle, lane, sumo.vehicle_getLanePosition(vehicle), length))
+        distances = [0.0, *accumulate(math.dist(a, b) for (a, *_), (b, *_) in pairwise(line))]
+        if self._lateral:
+            line = _shifted(line, sumo.vehicle_getLateralLanePosition(vehicle))
+        if len(line) < 2 or math.dist(line[0][0], front) > _MISPLACED_M:
+            return None
+        found = []
+        for number in range(pieces + 1):
+            place = length * number / pieces
+            index = min(max(bisect_right(distances, place), 1), len(line) - 1)
+            (x, y), _, _ = line[index - 1]
+            (back_x, back_y), on, at = line[index]
+            share = (place - distances[index - 1]) / max(distances[index] - distances[index - 1], 1e-9)
+            # Beyond the beginning of its route, it goes straight on.
+            x, y = x + share * (back_x - x), y + share * (back_y - y)
+            found.append((x, y, height_at(on, at) if high else 0.0))
+        return None if _is_straight(found, length, heading) else tuple(found)
+
+    def _behind(self, vehicle: str, lane: str, position: float, length: float) -> Iterator[tuple[Point, str, float]]:
+        """The points of the lanes from the front of a vehicle backwards, each with its lane and position there."""
+        route = sumo.vehicle_getRoute(vehicle)
+        edge = sumo.vehicle_getRouteIndex(vehicle) - (not lane.startswith(":"))  # the one before this lane
+        driven = 0.0
+        while True:
+            points, places, scale = self._shape(lane)
+            place = min(position * scale, places[-1])
+            last = max(bisect_right(places, place), 1) - 1
+            if last + 1 < len(points) and places[last + 1] > places[last]:
+                share = (place - places[last]) / (places[last + 1] - places[last])
+                (x, y), (next_x, next_y) = points[last], points[last + 1]
+                yield (x + share * (next_x - x), y + share * (next_y - y)), lane, position
+            for index in range(last, -1, -1):
+                yield points[index], lane, places[index] / scale
+            driven += place
+            if driven >= length or edge < 0:
+                return
+            before = self._before(vehicle, lane, route[edge])
+            if not before:
+                return
+            lane, position = before, sumo.lane_getLength(before)
+            edge -= not lane.startswith(":")
+
+    def _before(self, vehicle: str, lane: str, edge: str) -> str:
+        """The lane from which a vehicle came onto another one, from an edge; nothing where there is none."""
+        if not self._sources:
+            self._find_sources()
+        used = self._used[vehicle].get(edge)
+        found = []
+        for source in self._sources.get(lane, ()):
+            start = source
+            while start.startswith(":") and start in self._sources:
+                (start, *_) = self._sources[start]  # an internal lane comes from one place only
+            if start.rpartition("_")[0] == edge:
+                found.append((start != used, source))
+        return min(found)[1] if found else ""
+
+    def _find_sources(self) -> None:
+        for lane in sumo.lane_getIDList():
+            for link in sumo.lane_getLinks(lane):
+                target = link[4] or link[0]
+                self._sources.setdefault(target, []).append(lane)
+
+    def _shape(self, lane: str) -> tuple[list[Point], list[float], float]:
+        """Its points, how far along each is (m), and how much longer they are than SUMO takes the lane to be."""
+        found = self._shapes.get(lane)
+        if found is None:
+            points = [(x, y) for x, y, *_ in sumo.lane_getShape(lane)]
+            places = [0.0, *accumulate(math.dist(a, b) for a, b in pairwise(points))]
+            found = self._shapes[lane] = points, places, max(places[-1], 1e-6) / max(sumo.lane_getLength(lane), 1e-6)
+        return found
+
+
+def _shifted(line: list[tuple[Point, str, float]], left: float) -> list[tuple[Point, str, float]]:
+    """A line that is followed backwards, moved to the left of those who drive along it."""
+    moved = []
+    for index, ((x, y), lane, place) in enumerate(line):
+        (ax, ay), (bx, by) = line[max(index - 1, 0)][0], line[min(index + 1, len(line) - 1)][0]
+        dx, dy = ax - bx, ay - by
+        norm = math.hypot(dx, dy) or 1.0
+        moved.append(((x - dy / norm * left, y + dx / norm * left), lane, place))
+    return moved
+
+
+def height_at(lane: str, position: float) -> float:
+    """Return z of the middle of a lane, in m; positions beyond its ends count as these."""
+    edge, _, index = lane.rpartition("_")
+    # SUMO refuses what is longer than the lane by a rounding error.
+    position = max(0.0, min(position, sumo.lane_getLength(lane) - 1e-6))
+    place = sumo.simulation_convert3D(edge, position, int(index), False)
+    return float(place[2]) if len(place) > 2 else 0.0
+
+
+def _is_straight(spine: Sequence[tuple[float, float, float]], length: float, heading: float) -> bool:
+    """Whether one rectangle with this heading is as good."""
+    (x, y, _), c, s = spine[0], math.cos(heading), math.sin(heading)
+    if math.dist(spine[-1][:2], (x - length * c, y - length * s)) > _STRAIGHT_M:
+        return False
+    return all(abs((px - x) * s - (py - y) * c) < _STRAIGHT_M for px, py, _ in spine)
+
+
+SIGHT_M = 150.0
+"""A scene has the vehicles and persons that were within this distance of a controlled one when it last looked around.
+What is further away has no part in a crash, and a town has thousands of them."""
+
+LOOK_AROUND_EVERY = 10
+"""Steps from one look around to the next, and whenever a vehicle enters or leaves; with long steps once a second. Also
+how often a scene says the lane of each vehicle: a string each is too dear for every step."""
+
+_LOOK_AROUND_S = 1.0  # in which two that come towards each other do not get through half of what is in sight
+_SIGHT_SQUARED = SIGHT_M**2
+_RADIANS = math.pi / 180.0
+_HEIGHT_EVERY_M = 20.0  # along each lane, to see whether the map is flat
+_FLAT_M = 0.5  # a map that rises less has no bridges
+_WITH_PERSONS = frozenset({"sharedLane", "junctionPedestrian", "crossing", "walkingarea"})
+"""SUMO's types of collision in which the victim is a person, who may have the id of a vehicle."""
+
+
+class Sight:
+    """Reads scenes from SUMO.
+
+    Persons are actors where they walk, ride a bicycle as persons do, or wait at the roadside; not inside of vehicles.
+    With SUMO's model ``nonInteracting`` they walk through vehicles and have no part in the traffic, nor in a scene.
+
+    Args:
+        controlled: the vehicles around which to look.
+        step_length_s: in s.
+        lateral: whether vehicles may be elsewhere than in the middle of a lane.
+        speeds: in m/s, of persons who are moved, by their ids in SUMO, which takes them for standing.
+        core: what reads faster, where it is there.
+
+    Attributes:
+        leaving: the ids of persons who are there and have no part any more.
+    """
+
+    def __init__(
+        self,
+        controlled: Sequence[str],
+        step_length_s: float,
+        *,
+        lateral: bool,
+        speeds: dict[str, float],
+        core: Core | None = None,
+    ) -> None:
+        self.core = core
+        self._controlled = tuple(controlled)
+        self._eyes: Vehicles | None = core.Vehicles(self._controlled, [], [], []) if core is not None else None
+        self._every = max(1, min(LOOK_AROUND_EVERY, round(_LOOK_AROUND_S / step_length_s)))
+        self._speeds = speeds
+        self.leaving: set[str] = set()
+        self._high: bool | None = None
+        self._bends = Bends(lateral=lateral)
+        self._known: dict[str, Actor] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the previous episode; the network is the same."""
+        self._known.clear()  # the same id may be another vehicle now
+        self._articulated: set[str] = set()
+        self._bends.reset()
+        self._speeds.clear()
+        self._touched: set[tuple[str, str]] = set()
+        self._see((), ())
+        self._all_persons: tuple[str, ...] = ()
+        self._persons_count: bool | None = None
+
+    def look(self, steps: int, off_road: Sequence[str]) -> Scene:
+        """Return the scene after so many steps."""
+        if self._persons_count is None:
+            self._persons_count = sumo.simulation_getOption("pedestrian.model") != "nonInteracting"
+            self._high = self._is_high() if self._high is None else self._high
+        time_to_look = steps % self._every == 0
+        if steps and self._plain is not None and self._eyes is not None and not (self._high or self._all_persons):
+            # What most steps come to, in one call.
+            columns = self._plain.look(self._eyes, _SIGHT_SQUARED if time_to_look else 0.0)
+            if isinstance(columns, tuple):
+                self._see(columns, ())
+                columns = None if self._plain is None else self._plain.read()
+            if columns is not None:
+                lanes: tuple[str, ...] = ()
+                if steps % LOOK_AROUND_EVERY == 0 or off_road:
+                    lanes = tuple(map(sumo.vehicle_getLaneID, self._ids))
+                return Scene(
+                    sumo.simulation_getTime(), self._roster, off_road=tuple(off_road), lanes=lanes, swept=True,
+                    core=self.core, columns=columns,
+                )  # fmt: skip
+        if (
+            time_to_look
+            or (self.core.is_coming_or_going() if self.core is not None else _is_coming_or_going())
+            or (self._persons_count and self._persons_changed())
+        ):
+            self._look_around()
+        ids, persons = self._ids, self._persons
+        contacts = self._contacts()
+        lanes = ()
+        if steps % LOOK_AROUND_EVERY == 0 or contacts or off_road:
+            lanes = tuple(map(sumo.vehicle_getLaneID, ids))
+        columns = self._vehicles.read() if self._vehicles is not None else None
+        points, headings, speeds = self._columns() if columns is None else _lists(columns)
+        if persons:
+            # As with vehicles, the position is that of the front.
+            points += map(sumo.person_getPosition, persons)
+            headings += [(90.0 - angle) * _RADIANS for angle in map(sumo.person_getAngle, persons)]
+            speeds += map(sumo.person_getSpeed, persons)
+            for person in self._speeds.keys() & set(persons) if self._speeds else ():
+                speeds[len(ids) + persons.index(person)] = self._speeds[person]
+            lanes = (*lanes, *map(sumo.person_getLaneID, persons)) if lanes else ()
+        if self.core is not None and self._vehicles is not None and (persons or columns is None):
+            columns = self.core.columns(self._vehicles, points, headings, speeds)
+        heights: list[float] = []
+        grades: list[float] = []
+        if self._high:
+            heights = [sumo.vehicle_getPosition3D(vehicle)[2] for vehicle in ids]
+            heights += [sumo.person_getPosition3D(person)[2] for person in persons]
+            grades = [math.tan(sumo.vehicle_getSlope(vehicle) * _RADIANS) for vehicle in ids]
+            grades += [math.tan(sumo.person_getSlope(person) * _RADIANS) for person in persons]
+        return Scene(
+            sumo.simulation_getTime(), self._roster, points, headings, speeds, contacts, tuple(off_road), lanes,
+            heights, grades, self._spines(points, headings) if self._long else {}, swept=True, core=self.core,
+            columns=columns,
+        )  # fmt: skip
+
+    @property
+    def around(self) -> tuple[Vehicles, int, float]:
+        """For the core: around which vehicles it looks, every how many steps, how far (m, squared)."""
+        assert self._eyes is not None
+        return self._eyes, self._every, _SIGHT_SQUARED
+
+    @property
+    def plain(self) -> tuple[Vehicles, tuple[str, ...]] | None:
+        """Who is in sight, for the core and by their ids; None where there is more about them than it knows."""
+        if self._plain is None or self._high or self._all_persons:
+            return None
+        return self._plain, self._ids
+
+    @property
+    def roster(self) -> Roster:
+        """Who is in sight."""
+        return self._roster
+
+    def see(self, ids: tuple[str, ...]) -> None:
+        """Take note of who is in sight, and that there is no person."""
+        self._see(ids, ())
+
+    def reads_right(self) -> bool:
+        """Whether the core reads what libsumo's getters return, to the bit."""
+        if self.core is None or self._vehicles is None:
+            return True
+        seen = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self._eyes is not None else self._in_sight()
+        numbers = self._vehicles.read()
+        read = None if numbers is None else _lists(numbers), self.core.is_coming_or_going(), seen
+        found = self._columns(), _is_coming_or_going(), self._in_sight()
+        at_once = self._vehicles.look(self._eyes, _SIGHT_SQUARED) if self._eyes is not None else None
+        if isinstance(at_once, tuple):
+            right = at_once == found[2][0] != self._ids
+        else:
+            quiet = not (found[1] or sumo.person_getIDCount() or sumo.simulation_getCollisions())
+            right = at_once is None or (quiet and self._ids == found[2][0] and repr(_lists(at_once)) == repr(found[0]))
+        return right and repr(read) == repr(found)  # all digits of each number
+
+    def distrust(self) -> None:
+        """Do without the core from now on, and forget the episode."""
+        self.core = None
+        self.reset()
+
+    def _see(self, ids: tuple[str, ...], persons: tuple[str, ...]) -> None:
+        self._ids, self._persons = ids, persons
+        known, actor = self._known.get, self._actor
+        actors = [known(vehicle) or actor(vehicle) for vehicle in ids]
+        self._roster = roster = Roster((*actors, *map(self._person, persons)) if persons else tuple(actors))
+        self._long = []
+        if self._articulated:
+            self._long = [row for row, vehicle in enumerate(ids) if vehicle in self._articulated]
+        self._vehicles: Vehicles | None = None
+        if self.core is not None:
+            self._vehicles = self.core.Vehicles(ids, roster.lengths, roster.widths, roster.reaches)
+        self._plain = None if persons or self._long else self._vehicles
+
+    def _columns(self) -> Lists:
+        ids = self._ids
+        # SUMO's angles are in degrees, clockwise from north.
+        headings = [(90.0 - angle) * _RADIANS for angle in map(sumo.vehicle_getAngle, ids)]
+        return list(map(sumo.vehicle_getPosition, ids)), headings, list(map(sumo.vehicle_getSpeed, ids))
+
+    def _spines(self, points: Sequence[tuple[float, float]], headings: Sequence[float]) -> dict[int, Spine]:
+        found = {}
+        for row in self._long:
+            place = points[row], headings[row]
+            spine = self._bends.spine(self._ids[row], self._roster.actors[row].length, *place, high=bool(self._high))
+            if spine is not None:
+                found[row] = spine
+        return found
+
+    def _persons_changed(self) -> bool:
+        """Whether a person came or left, or got into a vehicle."""
+        if not (sumo.person_getIDCount() or self._all_persons):
+            return False
+        if sumo.person_getIDList() != self._all_persons:
+            return True
+        return any(map(sumo.person_getVehicle, self._persons))
+
+    def _look_around(self) -> None:
+        """Choose who is in sight: those near a controlled vehicle, and the controlled ones themselves."""
+        found = self.core.in_sight(self._eyes, _SIGHT_SQUARED) if self.core is not None and self._eyes else None
+        ids, eyes = found or self._in_sight()
+        persons: tuple[str, ...] = ()
+        if self._persons_count and (sumo.person_getIDCount() or self._all_persons):
+            self._all_persons = sumo.person_getIDList()
+            near = _near(self._all_persons, list(map(sumo.person_getPosition, self._all_persons)), eyes)
+            persons = tuple([one for one in near if one not in self.leaving and not sumo.person_getVehicle(one)])
+        if ids != self._ids or persons != self._persons:
+            self._see(ids, persons)
+
+    def lose(self, vehicle: str) -> None:
+        """Take note that somebody has been taken off the road, which SUMO tells of only after the next step."""
+        if vehicle in self._ids:
+            self._see(tuple(name for name in self._ids if name != vehicle), self._persons)
+
+    def _in_sight(self) -> tuple[tuple[str, ...], list[tuple[float, float]]]:
+        """The vehicles in sight, and where the controlled ones are that are there."""
+        everybody = sumo.vehicle_getIDList()
+        points = list(map(sumo.vehicle_getPosition, everybody))
+        eyes = [points[everybody.index(eye)] for eye in self._controlled if eye in everybody]
+        return _near(everybody, points, eyes), eyes
+
+    def _actor(self, vehicle: str) -> Actor:
+        found = self._known.get(vehicle)
+        if found is None:
+            kind = sumo.vehicle_getVehicleClass(vehicle)
+            height = sumo.vehicle_getHeight(vehicle) if self._high else 0.0
+            size = sumo.vehicle_getLength(vehicle), sumo.vehicle_getWidth(vehicle), height
+            found = self._known[vehicle] = Actor(vehicle, kind, *size)
+            if is_articulated(found):
+                self._articulated.add(vehicle)
+        return found
+
+    def _person(self, person: str) -> Actor:
+        name = PERSON + person
+        found = self._known.get(name)
+        if found is None:
+            kind = sumo.person_getVehicleClass(person)
+            height = sumo.person_getHeight(person) if self._high else 0.0
+            size = sumo.person_getLength(person), sumo.person_getWidth(person), height
+            found = self._known[name] = Actor(name, kind, *size)
+        return found
+
+    def _contacts(self) -> tuple[Contact, ...]:
+        """The collisions that began in this step; SUMO repeats one as long as it lasts."""
+        found = []
+        for collision in sumo.simulation_getCollisions():
+            victim = collision.victim
+            if collision.type in _WITH_PERSONS:
+                if not self._persons_count:
+                    continue
+                victim = PERSON + victim
+            pair = (collision.collider, victim)
+            if pair not in self._touched:
+                self._touched.add(pair)
+                found.append(
+                    Contact(
+                        collision.collider,
+                        victim,
+                        collision.type,
+                        collision.lane,
+                        collision.colliderSpeed,
+                        collision.victimSpeed,
+                    )
+                )
+        return tuple(found)
+
+    def _is_high(self) -> bool:
+        """Whether the lanes of the network are not all on one plane."""
+        low = high = None
+        for lane in sumo.lane_getIDList():
+            length = sumo.lane_getLength(lane)
+            pieces = max(1, math.ceil(length / _HEIGHT_EVERY_M))
+            for piece in range(pieces + 1):
+                z = height_at(lane, length * piece / pieces)
+                low = z if low is None or z < low else low
+                high = z if high is None or z > high else high
+        return low is not None and high is not None and high - low > _FLAT_M
+
+
+def _lists(columns: Columns) -> Lists:
+    return columns.points, columns.headings, columns.speeds
+
+
+def _is_coming_or_going() -> bool:
+    """Whether a vehicle has entered or left in the last step."""
+    return bool(
+        sumo.simulation_getDepartedNumber()
+        or sumo.simulation_getArrivedNumber()
+        or sumo.simulation_getStartingTeleportNumber()
+        or sumo.simulation_getEndingTeleportNumber()
+    )
+
+
+def _near(
+    names: Sequence[str], points: Sequence[tuple[float, float]], eyes: Sequence[tuple[float, float]]
+) -> tuple[str, ...]:
+    """Those within sight of an eye, in their order."""
+    seen: set[str] = set()
+    for ex, ey in eyes:
+        seen.update(
+            [
+                name
+                for name, (x, y) in zip(names, points, strict=True)
+                if (x - ex) * (x - ex) + (y - ey) * (y - ey) < _SIGHT_SQUARED
+            ]
+        )
+    return tuple([name for name in names if name in seen])

@@ -1,5 +1,0 @@
-"""Triage: which crashes are the same one, and which are not."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,13 @@
+from ._counts import Counts as Counts, CountsData as CountsData, Run as Run
+from ._engine import FUTURES as FUTURES, WhatIfOptions as WhatIfOptions, what_if as what_if
+from ._interventions import (
+    Disturb as Disturb,
+    HandOver as HandOver,
+    Intervention as Intervention,
+    LeaveOut as LeaveOut,
+    Overrule as Overrule,
+    Reseed as Reseed,
+    SetArguments as SetArguments,
+    interventions_of as interventions_of,
+    step_before as step_before,
+)

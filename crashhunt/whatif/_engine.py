@@ -1,0 +1,293 @@
+"""The engine: runs the trial of a crash again with something changed, many times, and counts the outcomes.
+
+Every run starts at step 0, so that a claimed crash is a run that anybody can repeat. Where the change begins at a step,
+the recording of each run is compared with that of the crash up to this step, bit by bit. A run that differs does not
+count, and the counts say why: it would answer a question about another moment.
+
+Warm workers keep the simulator as it is after its set-up, and each run is a fork of that. Forks at the step itself
+would be cheaper, but would show nothing about the steps before.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crashhunt.base.errors import CrashhuntError, UsageError
+from crashhunt.base.temporary import temporary_folder
+from crashhunt.recording import first_divergence
+from crashhunt.replays import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, prepare, up_to
+from crashhunt.trial import EVERYBODY, Outcome, Reseeding
+from crashhunt.whatif._counts import Counts, Run
+from crashhunt.whatif._interventions import LeaveOut, Reseed, SetArguments
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from crashhunt.base.watching import Watch
+    from crashhunt.crashes import Bundle
+    from crashhunt.replays import Code, Ended, Rerun
+    from crashhunt.trial import TrialSpec
+    from crashhunt.whatif._interventions import Intervention
+
+
+__all__ = ["FUTURES", "WhatIfOptions", "future_seed", "what_if"]
+
+FUTURES = 50
+"""How many futures are run where the user gives no number: their interval is at most 0.27 wide."""
+_SELF_TEST = 4  # futures to begin with, of which one is run twice
+_RARE = 20  # futures that must not all be equal
+_NO_CRASH = (Outcome.SURVIVED, Outcome.FINISHED)
+_INTERRUPTED = "stopped"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WhatIfOptions:
+    """How what-if runs are run.
+
+    Args:
+        code: who drives, the code of the ``snapshot`` or the ``current`` code.
+        times: how many runs; 0 for `FUTURES` where there are futures, else 1.
+        parallel: how many at a time.
+        time_s: the most wall time for all of them, in s; None for no limit.
+        trusted: whether the code of the crash may run; None to find out.
+        force: run even from a snapshot that is damaged.
+        watch: called with how many have been run, and how many there are.
+        stopped: asked now and then whether to stop.
+    """
+
+    code: Code = "snapshot"
+    times: int = 0
+    parallel: int = 1
+    time_s: float | None = None
+    trusted: bool | None = None
+    force: bool = False
+    watch: Watch | None = None
+    stopped: Callable[[], bool] = field(default=lambda: False)
+
+
+def what_if(bundle: Bundle, interventions: Sequence[Intervention], options: WhatIfOptions | None = None) -> Counts:
+    """Run the trial of a crash again with changes, and count how the runs end.
+
+    Args:
+        bundle: the crash.
+        interventions: what is changed; without any, the trial is run as it was.
+        options: how.
+
+    Returns:
+        The counts; where it was stopped, of the runs that had ended.
+
+    Raises:
+        UsageError: an intervention or an option cannot be meant, or the simulator cannot do it.
+        UntrustedError: its code would run, and it is neither made here nor trusted.
+        CrashhuntError: the runs could not be run.
+    """
+    options = options or WhatIfOptions()
+    reseeds = [one for one in interventions if isinstance(one, Reseed)]
+    times = options.times or (FUTURES if reseeds else 1)
+    _check(bundle, interventions, options)
+    changes: dict[str, str] = {}
+    for one in interventions:
+        changes |= one.changes if isinstance(one, SetArguments) else {}
+    asked = ReplayOptions(code=options.code, changes=changes, trusted=options.trusted, force=options.force)
+    rerun = prepare(bundle, asked)
+    recorded_spec = rerun.spec
+    for one in interventions:
+        rerun = one.applied(rerun)
+    until = None if options.time_s is None else time.monotonic() + options.time_s
+    why = _Stop(options.stopped, until)
+    with temporary_folder("whatif") as scratch:
+        reruns = Reruns(rerun, scratch, parallel=max(1, options.parallel), stopped=why.is_asked)
+        runs = _Runs(rerun, reruns, _from_step(interventions), options, times)
+        try:
+            if exclusions := [one for one in interventions if isinstance(one, LeaveOut)]:
+                runs.leave_out(exclusions, recorded_spec)
+            if reseeds:
+                runs.run_futures(max(one.from_step for one in reseeds))
+            else:
+                runs.run_alike()
+        except StoppedError:
+            pass
+        except NotUnderstoodError as error:
+            raise _too_old() from error
+        except CrashhuntError as error:
+            if "which crashhunt" in error.message and rerun.code == "snapshot":
+                raise _too_old() from error
+            raise
+        finally:
+            reruns.close()
+    edits = [] if not rerun.edits else [", ".join(rerun.edits)]
+    return Counts(
+        crash=bundle.id,
+        interventions=(*edits, *(str(one) for one in interventions if not isinstance(one, SetArguments))),
+        from_step=runs.from_step,
+        code=rerun.code,
+        recorded=bundle.result.outcome,
+        recorded_steps=bundle.result.steps,
+        asked=times,
+        each=tuple(sorted(runs.found.values(), key=lambda run: run.number)),
+        interrupted=why.reason if len(runs.found) < times else "",
+        warnings=rerun.warnings,
+    )
+
+
+def future_seed(seed: int, number: int) -> int:
+    """Return the seed of a future: the same in every call for the same trial.
+
+    Args:
+        seed: of the trial.
+        number: of the future, from 0.
+    """
+    return int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0]) >> 1
+
+
+def _check(bundle: Bundle, interventions: Sequence[Intervention], options: WhatIfOptions) -> None:
+    if options.code == "log":
+        raise UsageError("recorded actions cannot react to a change", fix="use --code snapshot or --code current")
+    if options.times < 0:
+        raise UsageError(f"--times is {options.times}", fix="give at least 1")
+    last = bundle.result.steps - 1
+    for one in interventions:
+        if one.from_step is not None and not 0 <= one.from_step <= max(0, last):
+            raise UsageError(f"--from-step is {one.from_step}", fix=f"give 0 to {last}: it ends at step {last + 1}")
+
+
+def _from_step(interventions: Iterable[Intervention]) -> int | None:
+    """The last step that all interventions leave as it was recorded."""
+    steps = [one.from_step for one in interventions]
+    return None if None in steps else min((step for step in steps if step is not None), default=None)
+
+
+def _too_old() -> UsageError:
+    return UsageError(
+        "the crashhunt in the snapshot of this crash is too old for this change", fix="add --code current"
+    )
+
+
+class _Stop:
+    """Whether to stop, and why."""
+
+    def __init__(self, stopped: Callable[[], bool], until: float | None) -> None:
+        self._stopped, self._until = stopped, until
+        self.reason = ""
+
+    def is_asked(self) -> bool:
+        if self._stopped():
+            self.reason = _INTERRUPTED
+        elif self._until is not None and time.monotonic() >= self._until:
+            self.reason = "the time is over"
+        return bool(self.reason)
+
+
+class _Runs:
+    """Runs one specification, or its futures, and keeps what becomes of the runs."""
+
+    def __init__(self, rerun: Rerun, reruns: Reruns, from_step: int | None, options: WhatIfOptions, times: int) -> None:
+        self.found: dict[int, Run] = {}
+        self.from_step = from_step
+        self._rerun, self._reruns, self._times, self._watch = rerun, reruns, times, options.watch
+        self._spec = rerun.spec
+        self._prefix = None if from_step is None else up_to(rerun.recorded, from_step)
+
+    def leave_out(self, interventions: Sequence[LeaveOut], recorded: TrialSpec) -> None:
+        """Find out who takes part in the recorded trial, and leave some out."""
+        (ended,) = self._reruns.run([replace(recorded, only=(EVERYBODY,))])
+        same = ended.result.digest == self._rerun.bundle.result.digest
+        entered = ended.entered if same else ()
+        for one in interventions:
+            entered = one.taking_part(entered)
+        self._spec = replace(self._spec, only=entered)
+
+    def run_alike(self) -> None:
+        """Run the specification as often as asked."""
+        self._run(list(range(self._times)), lambda _: self._spec)
+
+    def run_futures(self, after: int) -> None:
+        """Run futures, and refuse where the simulator has none.
+
+        Raises:
+            UsageError: the first futures are all equal, or the same one differs when it is run again.
+        """
+
+        def future(number: int) -> TrialSpec:
+            seed = future_seed(self._spec.seed, number)
+            return replace(self._spec, reseeding=Reseeding(after, seed))
+
+        title = self._rerun.worker.scenario.backend.title
+        again = self._run([*range(_SELF_TEST), 0], future)
+        one, other = again[0], again[_SELF_TEST]
+        if not (one.excluded or other.excluded) and one.digest != other.digest:
+            raise UsageError(
+                f"--futures: {title} ran the same future twice in two ways, so its futures cannot be counted",
+                fix="leave --futures out",
+            )
+        tested = list(again.values())
+        begun = _SELF_TEST
+        if _equal_futures(tested):  # chance may be rare, so that a few say little
+            tested += self._run(list(range(begun, _RARE)), future).values()
+            begun = _RARE
+            if equal := _equal_futures(tested):
+                raise UsageError(
+                    f"--futures: {equal} futures with different seeds are bit-identical: {title} draws no random "
+                    f"number after step {after} that changes the run",
+                    fix="give an earlier step, or leave --futures out",
+                )
+        self._run(list(range(begun, self._times)), future)
+
+    def _run(self, numbers: Sequence[int], spec: Callable[[int], TrialSpec]) -> dict[int, Run]:
+        """Run some futures; return what became of them by place, and keep those that were asked for."""
+        if not numbers:
+            return {}
+        places: dict[int, Run] = {}
+        for ended in self._reruns.run([spec(number) for number in numbers]):
+            number = numbers[ended.place]
+            places[ended.place] = run = self._counted(number, ended)
+            if number < self._times and number not in self.found:
+                self.found[number] = run
+                if self._watch is not None:
+                    self._watch(len(self.found), self._times)
+        return places
+
+    def _counted(self, number: int, ended: Ended) -> Run:
+        """Return what became of a run.
+
+        Raises:
+            UsageError: it could not be set up, so that no other will be.
+        """
+        result = ended.result
+        if result.outcome is Outcome.INVALID and not result.was_killed_from_outside:
+            message = result.failure.message if result.failure else "its trial could not be set up"
+            raise UsageError(f"the run cannot be set up: {message}", fix="change the intervention")
+        crashed = result.outcome in self._rerun.worker.crash_on
+        return Run(
+            number=number,
+            outcome=result.outcome,
+            steps=result.steps,
+            digest=result.digest,
+            crashed=crashed,
+            excluded=self._why_excluded(ended, crashed=crashed),
+        )
+
+    def _why_excluded(self, ended: Ended, *, crashed: bool) -> str:
+        result = ended.result
+        if result.was_killed_from_outside:
+            return f"its process was killed from outside: {result.failure.message if result.failure else ''}"
+        if not crashed and result.outcome not in _NO_CRASH:
+            return f"{result.outcome} is no outcome that this hunt counts"
+        if self._prefix is None or self.from_step is None:
+            return ""
+        if ended.recording is None:
+            return "it left no recording"
+        if ended.recording.steps < self.from_step:
+            return f"it ended at step {ended.recording.steps}, before step {self.from_step}"
+        divergence = first_divergence(self._prefix, up_to(ended.recording, self.from_step))
+        return "" if divergence is None else f"it differs from the recording: {divergence}"
+
+
+def _equal_futures(runs: Iterable[Run]) -> int:
+    """Return how many futures there are where all are equal; 0 where they are not, or where there is only one."""
+    digests = {run.number: run.digest for run in runs if not run.excluded}
+    return len(digests) if len(digests) > 1 and len(set(digests.values())) == 1 else 0

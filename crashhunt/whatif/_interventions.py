@@ -1,0 +1,351 @@
+"""Interventions: what is changed in the trial of a crash before it is run again.
+
+Each is a value with one method, `applied`, which returns the run with the change. An intervention that begins at a step
+leaves everything before it as it was recorded, and the engine verifies that. One that holds from the start says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from crashhunt.base import layout
+from crashhunt.base.errors import ArgumentError, UsageError
+from crashhunt.base.text import one_of
+from crashhunt.plans import Owners, agent_of, takes_of
+from crashhunt.trial import OF_AGENT, Constant, Handover, Overruled, in_turn, parse_spec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from crashhunt.crashes import Bundle
+    from crashhunt.replays import Rerun
+    from crashhunt.trial import Disturbance, Value
+
+
+__all__ = [
+    "Disturb",
+    "HandOver",
+    "Intervention",
+    "LeaveOut",
+    "Manoeuvre",
+    "Overrule",
+    "Reseed",
+    "SetArguments",
+    "interventions_of",
+    "step_before",
+]
+
+Manoeuvre = Literal["brake", "left", "right", "keep_lane", "keep_speed"]
+_MANOEUVRES = ("brake", "left", "right", "keep_lane", "keep_speed")
+
+
+class Intervention(Protocol):
+    """What is changed in a trial."""
+
+    @property
+    def from_step(self) -> int | None:
+        """The last step that stays as it was recorded; None where the change holds from the start."""
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run with the change.
+
+        Raises:
+            UsageError: it cannot be made in this trial.
+        """
+
+    def __str__(self) -> str:
+        """What is changed, in words."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetArguments:
+    """Other values for arguments and disturbances, from the start; the same as ``replay --set``.
+
+    Args:
+        changes: ``NAME`` or ``AGENT.NAME`` to value. The engine gives them to `prepare`, which checks them.
+    """
+
+    changes: Mapping[str, str]
+
+    @property
+    def from_step(self) -> None:
+        """No step: it holds from the start."""
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run; `prepare` has made the change."""
+        return rerun
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name}={value}" for name, value in self.changes.items())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disturb:
+    """Disturbances in addition to those of the trial.
+
+    Args:
+        disturbances: at least one.
+    """
+
+    disturbances: tuple[Disturbance, ...]
+
+    @property
+    def from_step(self) -> int:
+        """The step before the first one; what an agent sees is decided one step earlier."""
+        return max(0, min(one.step - (2 if one.what in OF_AGENT else 1) for one in self.disturbances))
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run with the disturbances."""
+        spec = rerun.spec
+        return replace(rerun, spec=replace(spec, disturbances=in_turn([*spec.disturbances, *self.disturbances])))
+
+    def __str__(self) -> str:
+        return ", ".join(f"{one.agent}: {one.what} in step {one.step}" for one in self.disturbances)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overrule:
+    """An agent that does not drive as its code says.
+
+    Args:
+        from_step: the last step that stays as it was recorded.
+        manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
+            ``keep_lane`` or ``keep_speed``.
+        agent: its id; empty for the only agent.
+    """
+
+    from_step: int
+    manoeuvre: Manoeuvre = "brake"
+    agent: str = ""
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run with the agent overruled."""
+        if self.manoeuvre not in _MANOEUVRES:
+            raise UsageError(f"manoeuvre is {self.manoeuvre!r}", fix=one_of(self.manoeuvre, _MANOEUVRES))
+        agent = _agent_of(self.agent, rerun)
+        verb, _, kept = self.manoeuvre.partition("_")
+        overruled = Overruled(agent, self.from_step, keeps=kept) if kept else Overruled(agent, self.from_step, verb)
+        return replace(rerun, spec=replace(rerun.spec, overruled=overruled))
+
+    def __str__(self) -> str:
+        return f"{self.agent or 'the agent'} is overruled after step {self.from_step}: {self.manoeuvre}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeaveOut:
+    """Actors that do not take part, from the start.
+
+    Args:
+        actors: their ids.
+    """
+
+    actors: tuple[str, ...]
+
+    @property
+    def from_step(self) -> None:
+        """No step: it holds from the start."""
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run; the engine asks who takes part first."""
+        return rerun
+
+    def taking_part(self, entered: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the actors that are left.
+
+        Args:
+            entered: all that have entered in the recorded trial.
+
+        Raises:
+            UsageError: an actor to exclude is not among them.
+        """
+        for actor in self.actors:
+            if actor not in entered:
+                fix = one_of(actor, entered) if entered else "drop --leave-out: the simulator does not support it"
+                raise UsageError(f"--leave-out {actor!r}: no such actor enters", fix=fix)
+        return tuple(name for name in entered if name not in self.actors)
+
+    def __str__(self) -> str:
+        return f"without {', '.join(self.actors)}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandOver:
+    """Another agent, or the same with other arguments, that takes over at a step.
+
+    Up to the step the recorded actions are played, and no code of the agent runs. Then the new agent is reset with the
+    seed of the trial. The first observation that it is shown is that after the step: it has seen nothing before.
+
+    Args:
+        from_step: how many recorded actions are played.
+        driver: ``module:Name`` of the new agent; empty for the recorded one.
+        arguments: of the new agent. Of the recorded agent, all others keep their recorded values.
+        agent: the id of the vehicle; empty for the only one.
+        option: how the user wrote the arguments, for errors.
+    """
+
+    from_step: int
+    driver: str = ""
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    agent: str = ""
+    option: str = "--arg"
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run with the agent that takes over."""
+        agent = _agent_of(self.agent, rerun)
+        was = rerun.worker.scenario.agents[agent].agent
+        driver = self.driver or was
+        given: dict[str, Value] = dict(rerun.spec.arguments.get(agent, {})) if driver == was else {}
+        if self.arguments:
+            owners = Owners({agent: takes_of(driver, rerun.worker.code)})
+            for word, text in self.arguments.items():
+                owner = owners.of(word, option=self.option)
+                if owner is None:
+                    raise owners.unknown(word, option=self.option, whose=driver)
+                given[owner[1]] = _value(self.option, word, text)
+        worker = replace(rerun.worker, scenario=rerun.worker.scenario.with_agents({agent: driver}))
+        log = str((rerun.bundle.path / layout.LOG).resolve())
+        spec = replace(
+            rerun.spec,
+            arguments={**rerun.spec.arguments, agent: given},
+            handover=Handover(agent, self.from_step, log),
+        )
+        return replace(rerun, spec=spec, worker=worker)
+
+    def __str__(self) -> str:
+        who = f"{self.driver or 'the recorded agent'} takes over after step {self.from_step}"
+        return ", ".join([who, *(f"{name}={value}" for name, value in self.arguments.items())])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reseed:
+    """Other seeds of the simulator's random generators, another one in each run.
+
+    Args:
+        from_step: the last step that draws from the seed of the trial.
+    """
+
+    from_step: int
+
+    def applied(self, rerun: Rerun) -> Rerun:
+        """Return the run; the engine gives each run its seed."""
+        return rerun
+
+    def __str__(self) -> str:
+        return f"the simulator's generators have another seed in each run, after step {self.from_step}"
+
+
+def step_before(bundle: Bundle, seconds: float) -> int:
+    """Return the last step that is at least so long before the end of a crash.
+
+    Args:
+        bundle: the crash.
+        seconds: simulation time, in s.
+
+    Raises:
+        UsageError: that is before the start, or not before the crash.
+    """
+    length_s, steps = bundle.recording().prologue.step_length_s, bundle.result.steps
+    step = steps - round(seconds / length_s) if 0 < seconds < 1e9 else -1
+    if not 0 <= step < steps:
+        allowed = f"give {length_s:g} to {steps * length_s:g}"
+        raise UsageError(f"--before is {seconds:g}, and the trial lasts {steps * length_s:g} s", fix=allowed)
+    return step
+
+
+def _agent_of(name: str, rerun: Rerun) -> str:
+    agents = tuple(rerun.worker.scenario.agents)
+    if name:
+        if name not in agents:
+            raise UsageError(f"there is no agent {name!r}", fix=one_of(name, agents))
+        return name
+    if len(agents) > 1:
+        raise UsageError("the crash has several agents", fix=f"name one of {', '.join(agents)}")
+    return agents[0]
+
+
+def _value(option: str, name: str, text: str) -> Value:
+    distribution = parse_spec(text, None, where=f"{option} {name}")
+    if not isinstance(distribution, Constant):
+        raise ArgumentError(f"{option} {name}: {text!r} is not one value", fix="give one value")
+    return distribution.value
+
+
+def interventions_of(
+    bundle: Bundle,
+    *,
+    changes: Mapping[str, str],
+    from_step: int | None = None,
+    before_s: float | None = None,
+    agent: str = "",
+    arguments: Mapping[str, str] | None = None,
+    futures: bool = False,
+    overrule: str = "",
+    leave_out: tuple[str, ...] = (),
+    code: str | None = None,
+    more: tuple[Intervention, ...] = (),
+) -> list[Intervention]:
+    """Return the interventions that the options of ``crashhunt whatif`` ask for.
+
+    Args:
+        bundle: the crash.
+        changes: of ``--set``; from a step on they are for the agent alone.
+        from_step: the last step that stays as recorded.
+        before_s: the same, in s before the crash.
+        agent: ``module:Name`` of an agent that takes over, or ``ID=module:Name``.
+        arguments: of that agent.
+        futures: whether each run has other random numbers from that step on.
+        overrule: a manoeuvre from that step on.
+        leave_out: the ids of actors that do not take part.
+        code: whose code drives, where the user says so.
+        more: interventions that need none of these options.
+
+    Raises:
+        UsageError: they contradict each other, or nothing would be changed at the step.
+    """
+    step = step_before(bundle, before_s) if before_s is not None else from_step
+    option = "--before" if before_s is not None else "--from-step"
+    if arguments and not agent:
+        raise UsageError(f"--arg {next(iter(arguments))} is for --agent", fix="give --agent, or --set instead of --arg")
+    if futures and step is None:
+        raise UsageError("--futures needs a step", fix="give --from-step K or --before SECONDS")
+    if overrule and step is None:
+        raise UsageError(f"--overrule {overrule} needs a step", fix="give --from-step K or --before SECONDS")
+    if agent and changes:
+        raise UsageError("--set and --agent contradict each other", fix="give the agent's arguments by --arg")
+    found: list[Intervention] = [*more]
+    vehicle, equals, driver = agent.partition("=") if "=" in agent else ("", "", agent)
+    if equals and not (vehicle and driver):
+        raise UsageError(f"--agent is {agent!r}", fix="write --agent MODULE:NAME or --agent ID=MODULE:NAME")
+    if agent:
+        found.append(HandOver(from_step=step or 0, driver=driver, arguments=arguments or {}, agent=vehicle))
+    elif step is not None and (changes or code == "current"):
+        found.append(_handover_to_same(bundle, step, changes, option))
+    elif changes:
+        found.append(SetArguments(changes=changes))
+    if overrule:
+        assert step is not None
+        found.append(Overrule(from_step=step, manoeuvre=overrule))  # type: ignore[arg-type]
+    if leave_out:
+        found.append(LeaveOut(actors=leave_out))
+    if futures:
+        assert step is not None
+        found.append(Reseed(from_step=step))
+    if step is not None and not found:
+        raise UsageError(f"{option} is given, and nothing changes after it", fix="give --futures, --agent or --set too")
+    return found
+
+
+def _handover_to_same(bundle: Bundle, step: int, changes: Mapping[str, str], option: str) -> HandOver:
+    """Return a hand-over to the recorded agent with other arguments."""
+    agents = tuple(bundle.result.spec.arguments)
+    vehicles = {agent_of(name, agents) for name in changes} - {""}
+    if len(vehicles) > 1:
+        raise UsageError(f"--set names several agents: {', '.join(sorted(vehicles))}", fix="give one at a time")
+    odd = next((name for name in changes if name in bundle.result.spec.scenario_arguments), "")
+    if odd:
+        message = f"--set {odd} is an argument of the scenario, which holds from the start"
+        raise UsageError(message, fix=f"leave {option} out")
+    vehicle = next(iter(vehicles), "")
+    named = {name.removeprefix(f"{vehicle}.") if vehicle else name: value for name, value in changes.items()}
+    return HandOver(from_step=step, arguments=named, agent=vehicle, option="--set")

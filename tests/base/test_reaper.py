@@ -1,0 +1,85 @@
+"""The reaper of a process: it resumes what another process stops, and imports modules of old snapshots."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from crashhunt.base.processes import children_of
+from crashhunt.base.reaper import Kept
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="states of processes are read from /proc")
+def test_keeper_resumes_what_it_keeps_after_a_stop_from_outside(tmp_path):
+    (tmp_path / "waits.py").write_text("import time\ndef main():\n    time.sleep(60)\n")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    kept = Kept("waits", environment=environment, stdin=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 60
+        while not (children := children_of(kept.process.pid)):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        stat = Path(f"/proc/{children[0]}/stat")
+        os.kill(children[0], signal.SIGSTOP)
+        while stat.read_bytes().rpartition(b")")[2].split()[0] != b"T":
+            assert time.monotonic() < deadline
+        while stat.read_bytes().rpartition(b")")[2].split()[0] == b"T":
+            assert time.monotonic() < deadline, "it was not resumed"
+            time.sleep(0.01)
+    finally:
+        kept.end()
+
+
+def run_kept(folder: Path, source: str) -> int:
+    (folder / "old.py").write_text(source)
+    kept = Kept("old", environment={**os.environ, "PYTHONPATH": str(folder)}, stdin=subprocess.DEVNULL)
+    try:
+        return kept.process.wait(60)
+    finally:
+        kept.end()
+
+
+def test_snapshot_of_the_first_version_runs_without_pebble(tmp_path):
+    (tmp_path / "pebble.py").write_text("raise ModuleNotFoundError('not installed', name='pebble')\n")
+    source = "from pebble import ProcessExpired, ProcessPool\ndef main():\n    raise SystemExit(7)\n"
+    assert run_kept(tmp_path, source) == 7
+
+
+def test_other_missing_module_of_a_snapshot_ends_its_process(tmp_path):
+    assert run_kept(tmp_path, "import no_such_library\ndef main(): pass\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_of_a_terminal_does_not_end_a_reaper_while_its_python_starts(tmp_path, number):
+    (tmp_path / "waits.py").write_text("import time\ndef main():\n    time.sleep(0.3)\n")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    for attempt in range(20):
+        kept = Kept("waits", environment=environment, stdin=subprocess.DEVNULL)
+        try:
+            time.sleep(attempt * 0.004)  # Python needs 10 to 80 ms to start
+            os.kill(kept.process.pid, number)
+            assert kept.process.wait(60) == 0
+        finally:
+            kept.end()
+
+
+def test_kept_process_handles_signals_of_a_terminal(tmp_path):
+    (tmp_path / "tells.py").write_text(
+        "import signal, sys\n"
+        "def main():\n"
+        "    handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
+        "    sys.exit(7 if handled and not signal.pthread_sigmask(signal.SIG_BLOCK, ()) else 1)\n"
+    )
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    kept = Kept("tells", environment={**os.environ, "PYTHONPATH": str(tmp_path)}, stdin=subprocess.DEVNULL)
+    try:
+        assert kept.process.wait(60) == 7
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == blocked
+    finally:
+        kept.end()

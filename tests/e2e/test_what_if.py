@@ -1,0 +1,276 @@
+"""`crashhunt whatif` against runs of other commands, on the toy, SUMO and highway-env."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import crashhunt
+from crashhunt.base.errors import UsageError
+from crashhunt.crashes import find_bundle
+from crashhunt.recording import first_divergence
+from crashhunt.replays import ReplayOptions, Reruns, prepare, up_to
+from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
+from crashhunt.whatif import Reseed, WhatIfOptions, _engine, what_if
+
+SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
+
+
+def hunted(toy):
+    """One crash, for `made_once`: ego drives into the leader at step 53."""
+    toy.crashhunt("run", "h", "1", "20", "300", "--scenario", "toy", "--arg", "speed=14", "--seed", "1")
+
+
+def hunted_on_sumo(shell):
+    """One crash on SUMO, for `made_once`."""
+    words = ("--scenario", "loop", "--arg", "speed=20:25", "--seed", "1")
+    shell.crashhunt("run", "h", "2", "60", "400", *words)
+
+
+def hunted_on_highway(shell):
+    """One crash in each of two scenarios of highway-env, for `made_once`."""
+    shell.crashhunt("run", "h", "2", "60", "60", "--scenario", "highway", "--seed", "1")
+    shell.crashhunt("run", "i", "2", "60", "60", "--scenario", "intersection-highway-env", "--seed", "1")
+
+
+@pytest.fixture
+def crash(toy, made_once):
+    return made_once(hunted, toy)
+
+
+@pytest.mark.parametrize("step", [0, 1, 30, 52])
+def test_same_agent_from_any_step_on_crashes_as_it_was_recorded(crash, step):
+    was = find_bundle(crash.folder / "h").result
+    found = crash.crashhunt("whatif", "h", "--from-step", str(step), "--code", "current", "--times", "3", "--json").json
+    assert [(each["outcome"], each["steps"], each["digest"]) for each in found["each"]] == [
+        (str(was.outcome), was.steps, was.digest)
+    ] * 3
+    assert (found["runs"], found["crashed"], found["different"], found["interval"]) == (3, 3, 1, None)
+    assert (found["from_step"], found["excluded"]) == (step, {})
+
+
+def test_other_argument_counts_the_same_as_a_replay_with_it(crash):
+    for speed in ("8", "13", "14"):
+        words = ("--set", f"speed={speed}", "--json")
+        replayed = [crash.crashhunt("replay", "h", *words, expect=None).json for _ in range(2)]
+        found = crash.crashhunt("whatif", "h", *words, "--times", "2").json
+        assert [each["digest"] for each in found["each"]] == [one["digest_replayed"] for one in replayed]
+        assert found["outcomes"] == dict(Counter(one["outcome_replayed"] for one in replayed))
+        assert found["from_step"] is None
+
+
+def test_another_agent_takes_over_after_the_recorded_actions(crash):
+    slow = crash.crashhunt("whatif", "h", "--before", "2", *SPEED, "speed=8", "--json").json
+    late = crash.crashhunt("whatif", "h", "--before", "0.1", *SPEED, "speed=8", "--json").json
+    assert (slow["crashed"], slow["survived"], slow["from_step"]) == (0, 1, 33)
+    assert (late["crashed"], late["from_step"]) == (1, 52)
+    same = crash.crashhunt("whatif", "h", "--before", "2", "--set", "speed=8", "--json").json
+    assert same["each"][0]["digest"] == slow["each"][0]["digest"]
+    braking = crash.crashhunt("whatif", "h", "--before", "2", "--overrule", "brake").out
+    assert braking.startswith("000000-collision: 0 of 1 runs crashed\n  recorded: collision at step 53\n")
+    assert "matched the recording up to step 33" in braking
+
+
+def test_agent_of_today_is_found_in_the_working_directory(crash):
+    (crash.folder / "newcomer.py").write_text(
+        "class Late:\n"
+        "    def __init__(self, speed=3.0):\n        self.speed, self.seen = speed, None\n"
+        "    def reset(self, seed):\n        self.seen = 0\n"
+        "    def act(self, observation):\n"
+        "        self.seen += 1\n"
+        "        if self.seen == 4:\n            raise ValueError('the fourth observation')\n"
+        "        return self.speed, 0\n"
+    )
+    found = crash.crashhunt("whatif", "h", "--from-step", "10", "--agent", "newcomer:Late", "--json").json
+    (each,) = found["each"]
+    assert (each["outcome"], each["steps"], each["crashed"]) == ("agent_error", 13, True)
+    err = crash.crashhunt("whatif", "h", "--agent", "newcomer:Late", "--arg", "sped=1", expect=2).err
+    assert "--arg: newcomer:Late has no argument 'sped'" in err
+    assert "speed" in err
+
+
+def test_futures_are_the_same_in_every_call_and_share_the_recorded_steps(crash):
+    words = ("whatif", "h", "--from-step", "20", "--futures", "--times", "12", "--json")
+    one, two = (crash.crashhunt(*words, "--parallel", parallel).json for parallel in ("1", "2"))
+    assert one == two
+    assert (one["runs"], one["from_step"]) == (12, 20)
+    assert one["different"] > 6
+    assert [each["number"] for each in one["each"]] == list(range(12))
+    assert one["interval"][0] <= one["share"] <= one["interval"][1]
+
+
+def by_hand(folder, after, number):
+    """Run one future as a trial of its own; return its result and how its first steps differ from the recording."""
+    rerun = prepare(find_bundle(folder), ReplayOptions())
+    spec = replace(rerun.spec, reseeding=Reseeding(after, _engine.future_seed(rerun.spec.seed, number)))
+    reruns = Reruns(rerun, folder.parent, parallel=1, stopped=lambda: False)
+    try:
+        (ended,) = reruns.run([spec])
+    finally:
+        reruns.close()
+    return ended.result, first_divergence(up_to(rerun.recorded, after), up_to(ended.recording, after))
+
+
+@pytest.mark.parametrize("make", [hunted_on_sumo])
+def test_futures_on_sumo_are_real_and_agents_take_over(shell, made_once, make):
+    made_once(make, shell)
+    was = find_bundle(shell.folder / "h").result
+    same = shell.crashhunt("whatif", "h", "--before", "5", "--code", "current", "--json").json
+    assert [each["digest"] for each in same["each"]] == [was.digest]
+    words = ("whatif", "h", "--before", "5", "--futures", "--times", "8", "--json")
+    one, two = shell.crashhunt(*words).json, shell.crashhunt(*words).json
+    assert one == two
+    assert (one["runs"], one["excluded"], one["different"]) == (8, {}, 8)
+    assert was.digest not in {each["digest"] for each in one["each"]}
+    result, difference = by_hand(shell.folder / "h", one["from_step"], 5)
+    assert (result.digest, difference) == (one["each"][5]["digest"], None)
+    slow = shell.crashhunt("whatif", "h", "--before", "5", *SPEED, "speed=5", "--json").json
+    assert (slow["crashed"], slow["survived"]) == (0, 1)
+    other = find_bundle(shell.folder / "h").result.collision.other
+    without = shell.crashhunt("whatif", "h", "--leave-out", other, "--json").json
+    assert without["runs"] == 1
+    assert without["each"][0]["digest"] != was.digest
+    err = shell.crashhunt("whatif", "h", "--leave-out", "unicorn", expect=2).err
+    assert "--leave-out 'unicorn': no such actor enters" in err
+
+
+def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_once):
+    made_once(hunted_on_highway, shell)
+    err = shell.crashhunt("whatif", "h", "--from-step", "2", "--futures", expect=2).err
+    assert "20 futures with different seeds are bit-identical" in err
+    assert err.count("\n") == 1
+    found = shell.crashhunt("whatif", "i", "--from-step", "2", "--futures", "--times", "8", "--json").json
+    assert (found["runs"], found["different"] > 4) == (8, True)
+    assert len(found["outcomes"]) == 2
+    for hunt in ("h", "i"):
+        was = find_bundle(shell.folder / hunt).result
+        same = shell.crashhunt("whatif", hunt, "--before", "1", "--overrule", "keep_speed", "--json").json
+        assert (same["runs"], same["excluded"]) == (1, {})
+        assert same["from_step"] < was.steps
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--times", "-1"), "--times is -1"),
+        (("--parallel", "-2"), "--parallel is -2"),
+        (("--for", "soon"), "--for is 'soon'"),
+        (("--from-step", "53", "--futures"), "--from-step is 53; give 0 to 52"),
+        (("--from-step", "-1", "--futures"), "--from-step is -1"),
+        (("--before", "99", "--futures"), "--before is 99, and the trial lasts 5.3 s"),
+        (("--before", "nan", "--futures"), "--before is nan"),
+        (("--before", "1"), "--before is given, and nothing changes after it"),
+        (("--from-step", "3", "--before", "1"), "not allowed with"),
+        (("--futures",), "--futures needs a step"),
+        (("--overrule", "brake"), "--overrule brake needs a step"),
+        (("--overrule", "fly", "--before", "1"), "fly"),
+        (("--arg", "speed=1"), "--arg speed is for --agent"),
+        (("--agent", "nowhere:Nobody"), "nowhere"),
+        (("--agent", "bus=crashhunt.agents:CarFollowing"), "there is no agent 'bus'"),
+        (("--agent", "a:B", "--set", "speed=1"), "--set and --agent contradict each other"),
+        (("--set", "sped=1"), "'sped'"),
+        (("--set", "speed=1:3"), "is not one value"),
+        (("--set", "speed=1:3", "--before", "1"), "is not one value"),
+        (("--set", "gap_m=20", "--before", "1"), "holds from the start"),
+        (("--leave-out", "leader"), "--leave-out 'leader'"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(crash, words, said):
+    done = crash.crashhunt("whatif", "h", *words, expect=2)
+    assert said in done.err
+    assert (done.err.count("\n"), done.out) == (1, "")
+
+
+def test_ctrl_c_counts_the_runs_that_ended(toy):
+    toy.crashhunt(
+        "run", "h", "1", "20", "300", "--scenario", "toy", "--arg", "speed=14", "--set", "step_wall_s=0.01",
+        "--seed", "1",
+    )  # fmt: skip
+    words = ("whatif", "h", "--from-step", "5", "--futures", "--times", "5000", "--parallel", "2")
+    for more, why in ((("--for", "5s"), "the time is over"), ((), "stopped")):
+        running = toy.begin(*words, *more)
+        if not more:
+            time.sleep(6)
+            running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=60)
+        assert running.returncode == (0 if more else 130), err
+        assert "Traceback" not in err
+        assert f"  interrupted: {why}, after " in out
+        assert int(out.split(" of ")[1].split(" runs")[0]) > 0
+
+
+def test_python_counts_as_the_command_does(crash):
+    folder = crash.folder / "h"
+    told = crash.crashhunt("whatif", "h", "--before", "3", "--futures", "--times", "5", "--json").json
+    found = crashhunt.what_if(folder, before_s=3, futures=True, times=5)
+    assert found.to_json() == told
+    assert crashhunt.what_if(folder, changes={"speed": 8.0}).survived == 1
+    with pytest.raises(UsageError, match="recorded actions cannot react"):
+        crashhunt.what_if(folder, code="log")
+
+
+class Tampered(Reruns):
+    """Runs of which some are changed on the way."""
+
+    def run(self, specs, *, recorded=True):
+        for ended in super().run(specs, recorded=recorded):
+            if ended.place == 1:
+                failure = Failure(KILLED, "killed from outside 3 times", exit_code=-9)
+                killed = replace(ended.result, outcome=Outcome.INVALID, failure=failure)
+                yield replace(ended, result=killed, recording=None)
+            elif ended.place == 2:
+                yield replace(ended, recording=None)
+            elif ended.place == 3:
+                bundle = find_bundle(OTHER[0])
+                yield replace(ended, recording=bundle.recording())
+            else:
+                yield ended
+
+
+OTHER: list = []
+
+
+def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monkeypatch):
+    crash.crashhunt("run", "other", "1", "20", "300", "--scenario", "toy", "--arg", "speed=13", "--seed", "7")
+    OTHER[:] = [crash.folder / "other"]
+    monkeypatch.setattr(_engine, "Reruns", Tampered)
+    bundle = find_bundle(crash.folder / "h")
+    monkeypatch.chdir(crash.folder)
+    found = what_if(bundle, [Reseed(from_step=20)], WhatIfOptions(times=4))
+    assert found.runs == 1
+    killed, silent, strange = (run.excluded for run in found.each[1:])
+    assert killed == "its process was killed from outside: killed from outside 3 times"
+    assert silent == "it left no recording"
+    assert strange.startswith("it differs from the recording: step 0")
+    assert sum(found.excluded.values()) == 3
+
+
+@pytest.mark.parametrize("name", ["crashhunt-0.1.0", "crashhunt-0.1.0-packages"])
+def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
+    bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")
+    done = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", "--futures", "--times", "2", expect=2)
+    assert "is too old for this change; add --code current" in done.err
+    assert done.err.count("\n") == 1
+    found = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", *SPEED, "speed=5", "--json").json
+    assert (found["runs"], found["crashed"], found["from_step"], found["code"]) == (1, 0, 3, "current")
+
+
+def test_one_of_two_agents_is_replaced(shell):
+    words = ("--scenario", "loop-two-agents", "--seed", "1")
+    shell.crashhunt("run", "h", "2", "60", "400", *words)
+    bundle = find_bundle(shell.folder / "h")
+    agents = list(bundle.result.spec.arguments)
+    assert len(agents) == 2
+    err = shell.crashhunt("whatif", "h", "--before", "3", *SPEED[:2], expect=2).err
+    assert f"the crash has several agents; name one of {', '.join(agents)}" in err
+    driver = f"{bundle.driver}=crashhunt.agents:KeepLaneWithSpeed"
+    found = shell.crashhunt("whatif", "h", "--before", "3", "--agent", driver, "--arg", "speed=2", "--json").json
+    assert (found["runs"], found["excluded"]) == (1, {})
+    assert found["each"][0]["digest"] != bundle.result.digest
+    same = shell.crashhunt("whatif", "h", "--json").json
+    assert same["each"][0]["digest"] == bundle.result.digest

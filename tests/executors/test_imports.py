@@ -1,0 +1,115 @@
+"""A module of an agent that hangs, or ends its process, when it is imported: one error that names the import."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from conftest import mostly_nightly
+
+from crashhunt.base.errors import CrashhuntError
+from crashhunt.episode import WorkerSettings
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.executors._postmortem import agent_in_stack
+from crashhunt.executors._time_limits import START_UP_S
+from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.trial import CRASHES, TrialSpec
+
+LIMIT_S = 2.0
+DOES = {
+    "while True: pass": f"it takes more than {LIMIT_S:g} s",
+    "time.sleep(1e9)": f"it takes more than {LIMIT_S:g} s",
+    "os._exit(3)": "its process exited with 3 meanwhile",
+    "os._exit(0)": "its process exited with 0 meanwhile",
+    "os.kill(os.getpid(), signal.SIGSEGV)": "its process was killed by SIGSEGV meanwhile",
+    "os.kill(os.getpid(), signal.SIGKILL)": "its process was killed by SIGKILL meanwhile, ",
+    "os.fork() or time.sleep(1e9); os._exit(3)": "its process exited with 3 meanwhile",  # a copy holds what it inherits
+    "os.kill(os.getpid(), signal.SIGSTOP)": "",  # it is resumed
+}
+ALWAYS = [("while True: pass", PoolExecutor), ("os.kill(os.getpid(), signal.SIGKILL)", PoolExecutor),
+          ("while True: pass", FreshProcessExecutor), ("os._exit(3)", FreshProcessExecutor)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("does", "kind"), mostly_nightly([(does, kind) for does in DOES for kind in (PoolExecutor, FreshProcessExecutor)],
+                                     always=ALWAYS)
+)  # fmt: skip
+def test_import_that_hangs_or_ends_its_process_is_named_in_one_error(tmp_path, monkeypatch, does, kind):
+    (tmp_path / "driver.py").write_text(
+        f"import os, signal, time\nfrom crashhunt.agents import KeepLaneWithSpeed\n{does}\nAgent = KeepLaneWithSpeed\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="driver:Agent")})
+    # Imports may take START_UP_S longer than a trial; a negative limit of trials leaves them 2 s.
+    timeout_s = LIMIT_S - START_UP_S if DOES[does] else 20.0
+    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=timeout_s)
+    executor = kind(settings, parallel=1)
+    found, deadline = [], time.monotonic() + 60
+    try:
+        executor.submit(TrialSpec(0, 7, {"ego": {}}, {}, 5))
+        if not DOES[does]:
+            while not found:
+                found += executor.completed(0.2)
+                assert time.monotonic() < deadline
+            return
+        with pytest.raises(CrashhuntError) as caught:
+            found += executor.completed(60)
+    finally:
+        executor.close()
+    said = caught.value
+    assert said.message.startswith(f"the module 'driver' of agent ego cannot be imported: {DOES[does]}")
+    assert said.fix.startswith("see what the module does when it is imported")
+    assert (len(str(said).splitlines()), found) == (1, [])
+
+
+STACK = """Fatal Python error: Segmentation fault
+
+Current thread 0x00007f (most recent call first):
+  File "/usr/lib/python3.11/ctypes/__init__.py", line 5 in string_at
+  File "/home/me/pkg/driver.py", line 3 in handle
+  File "{ours}", line 9 in step
+  File "/home/me/pkg/other.py", line 3 in act
+
+Thread 0x00007e (most recent call first):
+  File "/home/me/pkg/other.py", line 3 in handle
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
+def test_import_that_is_killed_once_from_outside_is_repeated(tmp_path, monkeypatch, number):
+    (tmp_path / "driver.py").write_text(
+        "import os, pathlib, signal\nfrom crashhunt.agents import KeepLaneWithSpeed\n"
+        "first = pathlib.Path(__file__).with_name('imported')\n"
+        f"if not first.exists():\n    first.touch()\n    os.kill(os.getpid(), signal.{number})\n"
+        "Agent = KeepLaneWithSpeed\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scratch").mkdir()
+    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="driver:Agent")})
+    settings = WorkerSettings(
+        scenario=scenario, oracles=(), crash_on=CRASHES, scratch=tmp_path / "scratch", timeout_s=20.0
+    )
+    executor = FreshProcessExecutor(settings, parallel=1)
+    found, deadline = [], time.monotonic() + 60
+    try:
+        executor.submit(TrialSpec(0, 7, {"ego": {}}, {}, 5))
+        while not found:
+            found += executor.completed(0.2)
+            assert time.monotonic() < deadline
+    finally:
+        executor.close()
+    assert (tmp_path / "imported").exists()
+    assert [result.failure for result in found] == [None]
+
+
+def test_stack_names_the_agent_whose_code_lies_above_the_simulator():
+    from crashhunt.base import layout
+
+    stack = STACK.format(ours=layout.PACKAGE / "simulators" / "toy.py")
+    assert agent_in_stack(stack, {"ego": "pkg.driver"}) == "ego"
+    assert agent_in_stack(stack, {"ego": "driver", "two": "other"}) == "ego"
+    assert agent_in_stack(stack, {"ego": "pkg.other"}) == ""  # which only called the simulator, or ran beside it
+    assert agent_in_stack(stack, {"ego": "pkg.driver", "two": "pkg.driver"}) == ""
+    assert agent_in_stack("", {"ego": "pkg.driver"}) == ""

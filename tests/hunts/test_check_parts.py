@@ -1,0 +1,252 @@
+"""What `check` finds on disk, each kind of damage by itself."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from crashhunt.base.integrity import digest_of_data
+from crashhunt.crashes import export_crash, find_bundle
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import check
+from crashhunt.ledger import Ledger
+from crashhunt.trial import Outcome
+
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+CRASH = "000000-collision"
+
+
+@pytest.fixture
+def hunt(tmp_path):
+    """A hunt of four trials on the toy, of which 0 and 2 crashed."""
+    return Path(shutil.copytree(FROZEN, tmp_path / "h"))
+
+
+def found_in(path):
+    (found,) = check(path)
+    return found
+
+
+def only_finding(path):
+    (finding,) = found_in(path).findings
+    return finding
+
+
+def execute(hunt, *statements):
+    with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
+        for statement in statements:
+            database.execute(statement)
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[:-9])
+
+
+def signed(file, **change):
+    """Change a crash.json as a later crashhunt might have written it."""
+    data = json.loads(file.read_text()) | change
+    del data["integrity"]
+    file.write_text(json.dumps(data | {"integrity": digest_of_data(data)}))
+
+
+def test_what_is_whole_is_fine(hunt):
+    assert found_in(hunt).to_json() == {
+        "dir": str(hunt), "kind": "hunt", "fine": True, "protected": True, "trials": 4, "damaged_trials": [],
+        "crashes": [CRASH, "000002-collision"], "damaged_crashes": [], "findings": [],
+    }  # fmt: skip
+    shutil.copytree(hunt, hunt.parent / "town" / "0")
+    assert [found.dir for found in check(hunt.parent)] == [hunt, hunt.parent / "town" / "0"]
+    one = found_in(hunt / "crashes" / CRASH)
+    assert (one.kind, one.crashes, one.fine) == ("crash", [CRASH], True)
+    with pytest.raises(HuntDirectoryError):
+        check(hunt.parent / "nowhere")
+
+
+def test_a_row_that_has_changed_is_a_damaged_trial(hunt):
+    execute(hunt, "UPDATE trials SET steps = steps + 1 WHERE number = 1")
+    found = found_in(hunt)
+    assert (found.trials, found.damaged_trials, found.fine) == ({0, 2, 3}, {1}, False)
+    (finding,) = found.findings
+    assert finding.lost == "trials 1"
+    assert finding.where == str(hunt / "ledger.sqlite")
+    assert "--salvage TO" in finding.fix
+
+
+def test_many_damaged_trials_are_counted_and_some_are_named(hunt):
+    text = (hunt / "hunt.toml").read_text()
+    (hunt / "hunt.toml").write_text(text.replace("\ntrials = 4\n", "\ntrials = 9\n"))
+    execute(hunt, "UPDATE trials SET steps = steps + 1")
+    assert "trials 0, 1, 2, 3" in {finding.lost for finding in found_in(hunt).findings}
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE hunt SET value = '7' WHERE key = 'planned'",
+        "UPDATE events SET detail = 'x'",
+        "DELETE FROM trials WHERE number = 3",
+    ],
+)
+def test_everything_that_the_ledger_has_is_read(hunt, statement):
+    assert found_in(hunt).fine
+    execute(hunt, statement)
+    found = found_in(hunt)
+    assert not found.fine
+    assert any(finding.where.startswith(str(hunt / "ledger.sqlite")) for finding in found.findings)
+
+
+def test_replaced_and_proposed_trials_are_read(hunt):
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.replace([3])
+    assert found_in(hunt).trials == {0, 1, 2}
+    with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
+        columns = {name for _, name, *_ in database.execute("PRAGMA table_info(replaced)")}
+        database.execute(f"UPDATE replaced SET {'result' if 'result' in columns else 'steps'} = '{{}}'")
+    assert not found_in(hunt).fine
+
+
+def test_a_ledger_that_is_gone_or_no_ledger_is_told(hunt):
+    ledger = hunt / "ledger.sqlite"
+    ledger.write_bytes(b"no database" * 100)
+    finding = only_finding(hunt)
+    assert (finding.where, finding.lost) == (str(ledger), "all trials but the crashes")
+    ledger.unlink()
+    finding = only_finding(hunt)
+    assert (finding.where, finding.what, finding.lost) == (str(ledger), "is missing", "all trials but the crashes")
+    (hunt / "crashhunt-case.toml").touch()  # of a case in a corpus there is none
+    assert found_in(hunt).fine
+
+
+def test_settings_that_cannot_be_read_are_told_and_those_of_the_snapshot_serve(hunt):
+    (hunt / "hunt.toml").write_text("nothing")
+    finding = only_finding(hunt)
+    assert (finding.where, finding.lost) == (str(hunt / "hunt.toml"), "what the hunt was asked")
+    shutil.rmtree(hunt / "snapshots")
+    assert not found_in(hunt).fine
+
+
+@pytest.mark.parametrize("name", ["crash.json", "log.mcap"])
+def test_a_crash_that_cannot_be_read_is_damaged(hunt, name):
+    cut(hunt / "crashes" / CRASH / name)
+    found = found_in(hunt)
+    assert (found.crashes, found.damaged_crashes) == (["000002-collision"], [CRASH])
+    assert all(str(hunt / "crashes" / CRASH) in finding.where for finding in found.findings)
+    assert found.findings[0].damaged
+    one = found_in(hunt / "crashes" / CRASH)
+    assert (one.crashes, one.damaged_crashes, one.fine) == ([], [CRASH], False)
+
+
+def test_a_file_of_a_crash_that_has_changed_is_damage_and_one_that_was_added_is_not(hunt):
+    folder = hunt / "crashes" / CRASH
+    (folder / "more.txt").write_text("mine")
+    finding = only_finding(hunt)
+    assert (finding.where, finding.damaged, finding.lost) == (str(folder), False, "")
+    assert finding.what.endswith("was not there")
+    assert found_in(hunt).crashes == [CRASH, "000002-collision"]
+    (folder / "foxglove-layout.json").write_text("{}")
+    found = found_in(hunt)
+    assert found.damaged_crashes == [CRASH]
+    assert {finding.lost for finding in found.findings} == {"", "that file"}
+
+
+def test_a_crash_that_is_missing_is_told_unless_it_was_given_up(hunt):
+    shutil.rmtree(hunt / "crashes" / CRASH)
+    finding = only_finding(hunt)
+    assert finding.what == "trial 0 crashed, and its bundle is missing"
+    assert (finding.where, finding.lost) == (str(hunt / "crashes"), "its log and evidence")
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(dropped={"rear end": [0]})
+    found = found_in(hunt)
+    assert (found.findings, found.dropped) == ([], {0})
+
+
+def test_a_crash_of_another_hunt_or_trial_is_told(hunt):
+    file = hunt / "crashes" / CRASH / "crash.json"
+    whole = file.read_text()
+    signed(file, hunt_seed=9)
+    assert only_finding(hunt).what == "it is of a hunt with seed 9, and this one has 1"
+    file.write_text(whole)
+    assert found_in(hunt).fine
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        was = ledger.result(0)
+        for other in (replace(was, digest="0" * 32), replace(was, outcome=Outcome.OFF_ROAD), was):
+            ledger.replace([0])
+            ledger.record(other, snapshot="")
+            said = [finding.what for finding in found_in(hunt).findings if finding.damaged]
+            assert said == (["the ledger says something else about its trial"] if other != was else [])
+    execute(hunt, "UPDATE trials SET steps = steps + 1 WHERE number = 0")
+    assert [finding.lost for finding in found_in(hunt).findings] == ["trials 0"]
+
+
+def test_a_crash_that_the_ledger_does_not_know_is_told(hunt):
+    settings = hunt / "hunt.toml"
+    settings.write_text(settings.read_text().replace('    "collision",\n', ""))
+    assert {finding.what for finding in found_in(hunt).findings} == {"the ledger has no crash of its trial"}
+
+
+def test_snapshots_are_looked_at_and_missed(hunt):
+    (snapshot,) = (hunt / "snapshots").iterdir()
+    cut(snapshot / "manifest.json")
+    (finding,) = (each for each in found_in(hunt).findings if each.damaged)
+    assert str(snapshot) in finding.where
+    assert finding.lost == f"replays of {CRASH} and others by the code that ran"
+    assert not found_in(hunt / "crashes" / CRASH).fine
+    shutil.rmtree(snapshot)
+    finding = only_finding(hunt)
+    assert (finding.where, finding.what) == (str(snapshot), "is missing")
+
+
+def test_a_snapshot_that_no_crash_needs_is_looked_at_as_well(hunt):
+    shutil.rmtree(hunt / "crashes")
+    (snapshot,) = (hunt / "snapshots").iterdir()
+    (snapshot / "environment.json").write_text("{}")
+    assert "the code that ran" in {finding.lost for finding in found_in(hunt).findings}
+
+
+@pytest.mark.parametrize(
+    ("place", "option", "lost"),
+    [
+        ("near-misses", "--near-misses", "the near miss 000000-collision"),
+        ("probes", "--probe", "probes/000000-collision"),
+        ("branches", "--branch", "branches/000000-collision"),
+    ],
+)
+def test_bundles_beside_the_crashes_are_looked_at(hunt, place, option, lost):
+    shutil.copytree(hunt / "crashes" / CRASH, hunt / place / CRASH)
+    assert found_in(hunt).fine
+    cut(hunt / place / CRASH / "log.mcap")
+    found = found_in(hunt)
+    assert found.crashes == [CRASH, "000002-collision"]  # a crash is none of these
+    assert {finding.lost for finding in found.findings} == {lost}
+    assert found.findings[0].fix == f"remove it: the same hunt with {option} makes it again"
+
+
+def test_leftovers_are_told_and_harmless(hunt):
+    left = [hunt / "crashes" / ".000001-collision.tmp", hunt / "snapshots" / ".half", hunt / ".scratch-1-2-3"]
+    for path in left:
+        path.mkdir()
+    (hunt / "crashes" / ".000000-collision.small.jsonl").touch()
+    found = found_in(hunt)
+    assert found.fine
+    said = {Path(finding.where).name: finding.what for finding in found.findings}
+    assert said == {
+        **{path.name: "somebody was killed while writing it; it may be removed" for path in left},
+        ".000000-collision.small.jsonl": "shrink goes on from it; it may be removed",
+    }
+
+
+def test_an_exported_crash_is_looked_at(hunt, tmp_path):
+    file = tmp_path / "crash.zip"
+    export_crash(find_bundle(hunt, "0"), file)
+    found = found_in(file)
+    assert (found.kind, found.crashes, found.fine) == ("file", [CRASH], True)
+    cut(file)
+    found = found_in(file)
+    assert not found.fine
+    assert found.findings[0].lost == "the crash"

@@ -1,0 +1,273 @@
+"""What a hunt says about itself: its state on disk, the figures while it runs, and the report at its end."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import socket
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.base import layout
+from crashhunt.errors import HuntDirectoryError
+from crashhunt.hunts import HuntStatus, check, find_hunts, hunt_state, is_hunt, load, salvage
+from crashhunt.hunts._next_trials import Unanswered, find_unanswered
+from crashhunt.hunts._progress import Progress
+from crashhunt.hunts._state import draws_independently, ledger_owner
+from crashhunt.ledger import Ledger
+from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
+from crashhunt.world import ClosestApproach
+
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+
+
+@pytest.fixture
+def hunt(tmp_path):
+    """A hunt of four trials on the toy, of which 0 and 2 crashed."""
+    return Path(shutil.copytree(FROZEN, tmp_path / "h"))
+
+
+def note(hunt, **facts):
+    with closing(Ledger(hunt / "ledger.sqlite", writable=True)) as ledger:
+        ledger.note(**facts)
+
+
+def spec(number):
+    return TrialSpec(number, 1, {"ego": {"speed": 1.0}}, {}, 20)
+
+
+def result(number, outcome=Outcome.SURVIVED, **more):
+    return TrialResult(spec(number), outcome, steps=5, digest=f"{number:032x}", **more)
+
+
+@pytest.mark.parametrize(
+    ("said", "state"),
+    [
+        ("crash", "crashed"), ("distinct", "crashed"), ("all_trials", "crashed"), ("time", "crashed"),
+        ("no_valid_trial", "error"), ("error", "error"), ("interrupted", "interrupted"), ("queued", "queued"),
+        ("something later", "error"), ("running", "killed"),
+    ],
+)  # fmt: skip
+def test_how_a_hunt_ended_is_its_state(hunt, said, state):
+    note(hunt, state=said, detail="why", owner=None)
+    found = hunt_state(hunt)
+    assert found.state == state
+    assert found.detail == ("its process is gone" if state == "killed" else "why")
+    assert found.failed is (state in ("error", "interrupted", "killed"))
+    assert (found.trials_planned, found.trials_run, found.crashes, found.errors) == (4, 4, 2, 0)
+    shutil.rmtree(hunt / "crashes")
+    found = hunt_state(hunt)
+    assert found.crashes == 0
+    assert found.state == ("finished" if said in ("all_trials", "time") else state)
+
+
+def test_a_hunt_whose_process_is_there_runs(hunt):
+    me = ledger_owner()
+    assert me == {"host": socket.gethostname(), "pid": os.getpid(), "started": me["started"]}
+    assert me["started"] > 0
+    began = time.time() - 10
+    note(hunt, state="running", owner=me, began=began, done_before=2, planned=8)
+    found = hunt_state(hunt)
+    assert (found.state, found.owner_alive) == ("running", True)
+    assert found.rate_per_s == pytest.approx(2 / 10, rel=0.2)
+    assert found.seconds_left == pytest.approx(4 / found.rate_per_s, rel=0.05)
+    note(hunt, until=time.time() + 5)
+    assert hunt_state(hunt).seconds_left == pytest.approx(5, abs=3)
+    note(hunt, until=time.time() - 5)
+    assert hunt_state(hunt).seconds_left == 0
+    note(hunt, planned=0, until=None)
+    assert hunt_state(hunt).seconds_left is None
+    for other in ({**me, "started": me["started"] + 1}, {**me, "pid": 2**22 + 5}):
+        note(hunt, owner=other)
+        assert hunt_state(hunt).state == "killed"
+
+
+@pytest.mark.parametrize(("silent_s", "state"), [(5, "running"), (55, "running"), (65, "killed")])
+def test_on_another_machine_a_heartbeat_tells_that_it_runs(hunt, silent_s, state):
+    owner = {"host": "elsewhere", "pid": 1, "started": 1}
+    note(hunt, state="running", owner=owner, heartbeat=time.time() - silent_s)
+    assert hunt_state(hunt).state == state
+
+
+def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):
+    plain = hunt_state(hunt).to_json()
+    assert plain["dir"] == str(hunt)
+    assert {"disturbed", "core", "nodes", "probes", "branches", "kinds", "newest_kind_s"}.isdisjoint(plain)
+    kind = {"words": "w", "count": 2, "first": "a", "shortest": "b"}
+    note(hunt, disturb=["brake=0.1"], core="used", kinds=[kind], newest_kind=time.time() - 30)
+    more = hunt_state(hunt).to_json()
+    assert more.keys() - plain.keys() == {"disturbed", "core", "kinds", "newest_kind_s"}
+    assert (more["disturbed"], more["core"], more["kinds"]) == (0, "used", [kind])
+    assert more["newest_kind_s"] == pytest.approx(30, abs=5)
+
+
+def test_a_hunt_that_is_planned_is_queued_and_one_without_its_ledger_is_damaged(hunt, tmp_path):
+    planned = tmp_path / "p"
+    planned.mkdir()
+    assert not is_hunt(planned)
+    with pytest.raises(HuntDirectoryError, match="there is no hunt in"):
+        find_hunts(planned)
+    (planned / "request.json").write_text(json.dumps({"request": {"trials": 7}}))
+    assert is_hunt(planned)
+    found = hunt_state(planned)
+    assert (found.state, found.trials_planned, found.damaged) == ("queued", 7, False)
+    (planned / "request.json").write_text("{}")
+    assert hunt_state(planned).trials_planned == 0
+    (hunt / "ledger.sqlite").unlink()
+    found = hunt_state(hunt)
+    assert (found.state, found.damaged) == ("error", True)
+    assert "it is missing, or empty" in found.detail
+    (hunt / "ledger.sqlite").write_bytes(b"no database" * 99)
+    assert (hunt_state(hunt).state, hunt_state(hunt).damaged) == ("error", True)
+    with pytest.raises(HuntDirectoryError, match="does not exist"):
+        hunt_state(tmp_path / "nowhere")
+
+
+def test_hunts_of_a_suite_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("a/10", "a/2", "b", "a/.hidden", f"a/2{layout.REPLACED}1", "c/d/e"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "hunt.toml").touch()
+    found = [path.relative_to(tmp_path).as_posix() for path in find_hunts(tmp_path)]
+    assert found == ["a/2", "a/10", "b"]  # one that was replaced or is hidden is none, nor what lies deeper
+
+
+def test_trials_are_independent_where_the_sampler_said_so(hunt):
+    settings = load(hunt).settings
+    assert draws_independently({}, settings)
+    assert not draws_independently({}, replace(settings, sampler="guided"))
+    assert draws_independently({"independent": True}, replace(settings, sampler="guided"))
+    assert not draws_independently({"independent": False}, settings)
+    assert not draws_independently({"independent": True}, replace(settings, seeds=3))
+
+
+def status(**figures):
+    plain = {"phase": "hunting", "planned": 10, "done": 4, "outcomes": {}, "rate_per_s": 2.0, "elapsed_s": 2.0}
+    return HuntStatus(**plain | {"nearest": None, "workers": {}, "crashes": 0} | figures)
+
+
+@pytest.mark.parametrize(
+    ("figures", "left", "share"),
+    [
+        ({}, 3.0, 0.4),
+        ({"time_left_s": 1.0}, 1.0, 2 / 3),
+        ({"time_left_s": 8.0}, 3.0, 0.4),
+        ({"planned": 0}, math.inf, 0.0),
+        ({"planned": 0, "time_left_s": 6.0}, 6.0, 0.25),
+        ({"rate_per_s": 0.0}, math.inf, 0.4),
+        ({"elapsed_s": 0.0, "time_left_s": 0.0}, 0.0, 1.0),
+    ],
+)
+def test_how_long_it_takes_is_told_by_trials_or_by_the_clock(figures, left, share):
+    found = status(**figures)
+    assert found.seconds_left == pytest.approx(left)
+    assert found.share_done == pytest.approx(share)
+
+
+def near(number, ttc_s):
+    return result(number, closest=ClosestApproach(ttc_s, ttc_s, 0.0), danger=1 / (1 + ttc_s))
+
+
+def test_the_trial_that_came_nearest_is_kept():
+    progress = Progress()
+    for one in (near(0, 5.0), near(1, 2.0), near(2, 3.0)):
+        progress.count(one, crashed=False)
+        progress.take(one)
+    progress.count(result(3, Outcome.COLLISION), crashed=True)
+    progress.take(result(4, failure=Failure("ValueError", "no")))
+    assert progress.nearest.spec.number == 1
+    assert progress.ended_here == 4
+    assert progress.outcomes == {"survived": 3, "collision": 1}
+    assert progress.not_fully_asked == 0
+    assert progress.time_left_s == math.inf
+    assert Progress(until=time.monotonic() + 9).time_left_s == pytest.approx(9, abs=3)
+    assert Progress(until=time.monotonic() - 9).time_left_s == 0
+
+
+def saved(number):
+    return SimpleNamespace(result=result(number, Outcome.COLLISION), id=str(number))
+
+
+def test_a_hunt_ends_with_the_crash_of_the_least_number():
+    progress = Progress()
+    assert (progress.last_wanted, progress.is_done, progress.unsaved, progress.ended_by_copy) == (
+        None, False, None, None,
+    )  # fmt: skip
+    progress.found = {number: result(number, Outcome.COLLISION) for number in (7, 5)}
+    assert progress.last_wanted == 5
+    assert progress.unsaved == progress.found[5]
+    assert progress.disturbed == 0
+    progress.save(saved(5))
+    assert progress.unsaved is None
+    assert progress.is_done
+    progress.copied = {3: saved(3)}
+    assert progress.last_wanted == 3
+    assert progress.ended_by_copy is progress.copied[3]
+    assert progress.unsaved is None
+    progress.replace([])
+    assert progress.crashes == []
+
+
+def test_what_the_ledger_is_to_know_now_is_noted():
+    progress = Progress(failed_steps=3)
+    assert progress.noted()["heartbeat"] == pytest.approx(time.time(), abs=60)
+    assert progress.noted()["failed_steps"] == 3
+    progress.failed = [result(1, setup_steps=None)]
+    assert progress.noted()["failed_steps"] == 3 + 5 + progress.failed[0].other_steps
+    assert {"nodes", "kinds", "audits_left"}.isdisjoint(Progress().noted())
+    assert "failed_steps" not in Progress().noted()
+    progress.resume([], SimpleNamespace(keep_going=True, only_at_fault=False, distinct=2), {"newest_kind": 5.0})
+    assert (progress.noted()["kinds"], progress.noted()["newest_kind"]) == ([], 5.0)
+    assert progress.failed_steps == 0
+    only = Progress()
+    only.resume([], SimpleNamespace(keep_going=False, only_at_fault=False, distinct=0), {"failed_steps": 4})
+    assert (only.kinds, only.failed_steps) == (None, 4)
+
+
+KILLED_TRIAL = Failure(KILLED, "somebody killed it")
+
+
+def test_trials_that_were_killed_are_run_again_and_counted_once(tmp_path):
+    with closing(Ledger(tmp_path / "ledger.sqlite", writable=True)) as ledger:
+        for number in range(4):
+            ledger.record(
+                result(number, Outcome.INVALID, failure=KILLED_TRIAL) if number in (1, 3) else result(number),
+                snapshot="",
+            )
+        assert [one.spec.number for one in find_unanswered(ledger)] == [1, 3]
+        unanswered, progress = Unanswered(ledger), Progress()
+        progress.outcomes.update({"survived": 2, "invalid": 2})
+        assert [one.number for one in unanswered.specs] == [1, 3]
+        assert len(unanswered) == 2
+        again = replace(result(1), digest="f" * 32)
+        assert unanswered.account(again, progress)
+        assert progress.outcomes["invalid"] == 1
+        assert len(progress.notes) == 1
+        assert "is another one: it is not determined by its specification" in progress.notes[0]
+        assert not unanswered.account(result(3, Outcome.INVALID, failure=KILLED_TRIAL), progress)
+        assert progress.outcomes["invalid"] == 1
+        assert len(unanswered) == 1  # in the next run of the hunt
+        assert unanswered.account(result(9), progress)
+        assert len(unanswered) == 1
+
+
+def test_what_is_whole_is_saved_into_another_directory(hunt, tmp_path):
+    (hunt / "crashes" / "000000-collision" / "log.mcap").write_bytes(b"")
+    (checked,) = check(hunt)
+    assert [salvage(checked, tmp_path / "s") for _ in range(2)] == [{"trials": 3, "crashes": 1}] * 2
+    assert sorted(path.name for path in (tmp_path / "s" / "crashes").iterdir()) == ["000002-collision"]
+    found = hunt_state(tmp_path / "s")
+    assert (found.state, found.trials_run, found.trials_planned, found.crashes) == ("interrupted", 3, 4, 1)
+    assert [trial.spec.number for trial in load_quietly(tmp_path / "s").results()] == [1, 2, 3]
+    assert load_quietly(tmp_path / "s").settings == load(hunt).settings
+
+
+def load_quietly(path):
+    with pytest.warns(UserWarning, match="is not finished"):
+        return load(path)

@@ -1,0 +1,122 @@
+"""Whole hunts on the toy, in the process of the test: what they record, keep, confirm and report."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+
+import pytest
+
+import crashhunt
+from crashhunt.crashes import list_bundles, list_near_misses
+from crashhunt.errors import HuntDirectoryError, UsageError
+from crashhunt.hunts import check, hunt_state
+from crashhunt.ledger import Ledger
+
+TOY = """
+title = "A toy"
+schema = 1
+simulator = "toy"
+[arguments.gap_m]
+default = 12.0
+[agents.ego]
+agent = "crashhunt.agents:KeepLaneWithSpeed"
+[agents.ego.arguments.speed]
+default = 8.0
+range = "6:14"
+"""
+OPTIONS = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False}
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    (tmp_path / "toy.toml").write_text(TOY)
+    monkeypatch.chdir(tmp_path)
+
+
+def rows(hunt):
+    with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
+        return {one.spec.number: (str(one.outcome), one.digest) for one in ledger.results()}
+
+
+@pytest.mark.long
+def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
+    hunt, seen = tmp_path / "h", []
+    options = OPTIONS | {"keep_going": True, "near_misses": 2, "audit": 1.0, "keep": 1}
+    report = crashhunt.run(hunt, 2, 8, 60, watch=seen.append, **options)
+    found = rows(hunt)
+    crashed = [number for number, (outcome, _) in found.items() if outcome == "collision"]
+    fine = [number for number in found if number not in crashed]
+    assert sorted(found) == list(range(8))
+    assert len(crashed) >= 2
+    assert len(fine) >= 2
+    assert (report.stopped_because, report.directory) == ("all_trials", hunt)
+    assert report.outcomes == {"collision": len(crashed), "survived": len(fine)}
+    assert (report.audit.trials, report.audit.differences, report.audit.not_finished) == (len(fine), (), 0)
+    # Of one kind of crashes, the shortest is kept, and it has been confirmed.
+    (kind,) = report.kinds
+    (kept,) = report.crashes
+    assert kind.count == len(crashed)
+    assert kept.confirmed
+    with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
+        steps = {one.spec.number: one.steps for one in ledger.results()}
+        assert ledger.most_dangerous(2) == [bundle.result.spec.number for bundle in report.near_misses]
+        assert report.trial_steps == sum(steps.values()) == ledger.trial_steps()
+        assert report.steps_total == ledger.steps_total() >= report.trial_steps
+        (dropped,) = ledger.facts()["dropped"].values()
+    assert kept.result.steps == min(steps[number] for number in crashed)
+    assert sorted([*dropped, kept.result.spec.number]) == crashed
+    assert [bundle.confirmed for bundle in report.near_misses] == [True, True]
+    assert list_near_misses(hunt) == list(report.near_misses)
+    assert {status.phase for status in seen} >= {"hunting", "done"}
+    assert (seen[-1].done, seen[-1].planned, seen[-1].crashes) == (8, 8, len(list_bundles(hunt)))
+    data = report.to_json()
+    assert json.loads(json.dumps(data)) == data
+    assert data["trials_run"] == data["trials_planned"] == 8
+    assert [one["id"] for one in data["crashes"]] == [kept.id]
+    assert len(data["near_misses"]) == 2
+    assert data["audit"] == {"trials": len(fine), "not_finished": 0, "differences": []}
+    (checked,) = check(hunt)
+    assert checked.fine
+    assert {path.name for path in hunt.glob(".*")} <= {".lock"}
+
+    # The same command runs nothing again; more trials are added to those that are there.
+    again = crashhunt.run(hunt, 2, 8, 60, **options)
+    assert (again.outcomes, again.steps_total) == (report.outcomes, report.steps_total)
+    more = crashhunt.run(hunt, 1, 10, 60, **options)
+    assert sum(more.outcomes.values()) == 10
+    assert {number: rows(hunt)[number] for number in range(8)} == found
+    for other in ({"seed": 5}, {"sampler": "sobol"}):
+        with pytest.raises((HuntDirectoryError, UsageError)):
+            crashhunt.run(hunt, 2, 8, 60, **options | other)
+    anew = crashhunt.run(hunt, 2, 1, 60, overwrite=True, **OPTIONS)
+    assert sum(anew.outcomes.values()) == 1
+    assert rows(hunt) == {0: found[0]}
+
+
+@pytest.mark.long
+def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path):
+    found = {}
+    for parallel in (1, 3):
+        hunt = tmp_path / f"h{parallel}"
+        report = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)
+        assert report.stopped_because == "crash"
+        crash = min(report.crashes, key=lambda bundle: bundle.result.spec.number)
+        assert crash.confirmed
+        number = crash.result.spec.number
+        assert set(range(number + 1)) <= rows(hunt).keys()
+        assert all(rows(hunt)[before][0] == "survived" for before in range(number))
+        assert hunt_state(hunt).state == "crashed"
+        found[parallel] = number, crash.result.digest, [rows(hunt)[before] for before in range(number)]
+        assert report.kinds is None
+        assert "kinds" not in report.to_json()
+    assert found[1] == found[3]
+
+
+def test_a_hunt_without_one_valid_trial_says_why(tmp_path):
+    (tmp_path / "toy.toml").write_text(TOY + "\n[arguments.fail_reset]\ndefault = true\n")
+    report = crashhunt.run(tmp_path / "h", 2, 3, 60, **OPTIONS)
+    assert (report.stopped_because, report.outcomes) == ("no_valid_trial", {"invalid": 3})
+    assert report.reason
+    assert hunt_state(tmp_path / "h").state == "error"
+    assert report.crashes == ()

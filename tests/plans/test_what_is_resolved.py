@@ -1,0 +1,341 @@
+"""What a request becomes: the executor, the scenario, the settings and their file."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
+from crashhunt.executors import FreshProcessExecutor, PoolExecutor
+from crashhunt.plans import HuntOptions, Request, hunt_options, plan, read_settings, request_of, write_settings
+from crashhunt.plans._plan import Owners, Takes, agent_of, takes_of
+from crashhunt.plans._request import executor_of, parallel_here, sizes_itself
+
+EXECUTORS = """
+class Cluster:
+    sizes_itself = True
+
+    def __init__(self, worker, *, parallel, argument=""):
+        self.asked = worker, parallel, argument
+
+class Alone:
+    sizes_itself = False
+
+    def __init__(self, worker, *, parallel):
+        pass
+
+def anything(worker, **options):
+    return worker, options
+"""
+SCENARIO = """
+title = "A toy"
+schema = 1
+simulator = "toy"
+[arguments.gap_m]
+default = 12.0
+range = "5:20"
+[arguments.needed]
+{needed}
+[agents.ego]
+agent = "drives:Agent"
+[agents.ego.arguments.speed]
+default = 9.0
+range = "8:14"
+"""
+AGENT = """
+class Agent:
+    def __init__(self, speed: float = 7.0, mode: str = "a|b", needed=None, step_length_s=0.1):
+        pass
+    def reset(self, seed): ...
+    def act(self, observation): ...
+
+class Needs(Agent):
+    def __init__(self, speed: float, weights: str):
+        pass
+
+class Open(Agent):
+    def __init__(self, **options):
+        pass
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with executors, agents and a scenario, from which they are imported."""
+    (tmp_path / "ours.py").write_text(EXECUTORS)
+    (tmp_path / "drives.py").write_text(AGENT)
+    (tmp_path / "scenario.toml").write_text(SCENARIO.format(needed="default = 1"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+def asked(**options):
+    return Request(trials=3, max_steps=100, scenario="scenario.toml", seed=1, **options)
+
+
+def test_the_executor_that_is_meant_is_made(folder):
+    assert executor_of("pool") is PoolExecutor
+    assert executor_of("fresh") is FreshProcessExecutor
+    import ours
+
+    assert executor_of("ours:Cluster") is ours.Cluster
+    assert executor_of("ours:Cluster:host:10001")("w", parallel=3).asked == ("w", 3, "host:10001")
+    assert executor_of("ours:Cluster:")("w", parallel=3).asked == ("w", 3, "")
+    assert executor_of("ours:anything:x")("w", parallel=2) == ("w", {"parallel": 2, "argument": "x"})
+    for word in ("ours:Alone:x", "pool:x"):
+        with pytest.raises(UsageError, match=f"--executor {word}: '{word[:-2]}' takes no argument"):
+            executor_of(word)
+
+
+def test_how_many_run_here_is_known_of_each_executor(folder, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2})
+    assert [sizes_itself(word) for word in ("ours:Cluster:x", "ours:Alone", "ours:anything", "pool")] == [
+        True, False, False, False,
+    ]  # fmt: skip
+    assert [parallel_here("pool", count) for count in (0, 2, 9)] == [3, 2, 9]
+    assert [parallel_here("ours:Cluster", count) for count in (0, 2, 9)] == [3, 2, 3]
+    sizes = {}
+    for word in ("pool", "ours:Cluster", "ours:Alone"):
+        run = replace(asked().run, executor=word, parallel=0)
+        sizes[word] = plan(asked(run=run))[1].run.parallel
+    assert sizes == {"pool": 3, "ours:Cluster": 0, "ours:Alone": 3}
+    assert plan(asked(run=replace(asked().run, parallel=7)))[1].run.parallel == 7
+
+
+def test_an_option_says_what_it_means_and_whether_it_may_be_left_out():
+    options = {option.name: option for option in hunt_options()}
+    assert options["snapshot_code"].default is True
+    assert options["snapshot_code"].about.meaning.startswith("whether the snapshot has code")
+    assert options["snapshot_limit_mb"].default == 500.0
+    assert options["timeout_s"].help.endswith("; default: 60")
+    assert options["sampler"].help.endswith("; default: random")
+    assert "default" not in options["keep_going"].help
+    assert options["seed"].line == "seed: of the hunt; by default a new one, which is printed."
+    for option in options.values():
+        default = option.default
+        kinds = {
+            "flag": bool, "integer": int, "number": (int, float), "text": (str, Path), "list": (tuple, list),
+            "table": dict,
+        }  # fmt: skip
+        assert default is None or isinstance(default, kinds[option.form]), option.name
+        assert option.about.meaning
+        assert not option.about.meaning[0].isupper()
+
+
+def test_arguments_are_those_of_scenario_agent_and_request_in_this_order(folder):
+    def specs(request):
+        _, settings = plan(request)
+        arguments = {name: (spec.spec, spec.kind) for name, spec in settings.agents["ego"].arguments.items()}
+        return arguments, {name: (spec.spec, spec.kind) for name, spec in settings.scenario_arguments.items()}
+
+    own, its = specs(asked())
+    assert own == {"speed": ("8.0:14.0", "float")}  # "a|b" would be a choice, and None is no value
+    assert its == {"gap_m": ("5.0:20.0", "float"), "needed": ("1", "int")}
+    own, its = specs(asked(arguments={"speed": "3", "mode": "b"}, scenario_arguments={"gap_m": "7:9"}))
+    assert own == {"mode": ("b", "str"), "speed": ("3.0", "float")}
+    assert its["gap_m"] == ("7.0:9.0", "float")
+    # What a sweep was not asked to vary keeps its default.
+    own, its = specs(asked(sampler="sweep", arguments={"speed": "3:5"}))
+    assert own == {"speed": ("3.0:5.0", "float")}
+    assert its == {"gap_m": ("12.0", "float"), "needed": ("1", "int")}
+    own, _ = specs(asked(agents={"ego": "drives:Open"}, arguments={"other": "2:3"}))
+    assert own["other"][0] == "2:3"
+
+
+def test_what_an_agent_needs_has_to_be_given(folder):
+    with pytest.raises(ArgumentError, match="drives:Needs needs the argument 'weights'") as refused:
+        plan(asked(agents={"ego": "drives:Needs"}, arguments={"speed": "3"}))
+    assert refused.value.fix == "give --arg weights=SPEC"
+    _, settings = plan(asked(agents={"": "drives:Needs"}, arguments={"weights": "w", "speed": "3"}))
+    assert settings.agents["ego"].agent == "drives:Needs"
+    (folder / "scenario.toml").write_text(SCENARIO.format(needed='unit = "m"'))
+    with pytest.raises((ScenarioError, ArgumentError)):
+        plan(asked())
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"arguments": {"gap_m": "3"}}, "it is an argument of the scenario; write --set gap_m=SPEC"),
+        ({"arguments": {"spede": "3"}}, "did you mean 'speed'"),
+        ({"arguments": {"ego.spede": "3"}}, "--arg ego.spede: drives:Agent"),
+        ({"scenario_arguments": {"gap": "3"}}, "the scenario has no argument 'gap'"),
+        ({"agents": {"other": "drives:Agent"}}, "other"),
+        ({"action": "meta"}, "--action meta is for"),
+        ({"branch": True}, "--branch has copies of trials go on with other disturbances, and there are none"),
+        ({"disturb": ["brake@101=ahead:4:2"]}, "--disturb brake@101: a trial has 100 steps"),
+        ({"crash_on": ["red-light"]}, "did you mean 'red_light'"),
+    ],
+)
+def test_what_cannot_be_resolved_is_refused(folder, options, says):
+    with pytest.raises((ArgumentError, UsageError, ScenarioError)) as refused:
+        plan(asked(**options))
+    assert says in str(refused.value)
+
+
+def test_disturbances_are_those_that_are_asked_for_or_those_of_the_scenario(folder):
+    text = SCENARIO.format(needed="default = 1") + "[disturbances]\nbrake = 0.5\n"
+    (folder / "scenario.toml").write_text(text)
+    assert plan(asked())[1].disturb == ("brake=0.5",)
+    assert plan(asked(disturb=["stop=0.1"]))[1].disturb == ("stop=0.1",)
+    assert plan(asked(disturb=["brake@100=ahead:4:2"]))[1].disturb == ("brake@100=ahead:4.0:2.0",)
+    assert plan(asked(disturb=["none"]))[1].disturb in ((), ("none",))
+    assert plan(asked(branch=True))[1].branch
+    (folder / "scenario.toml").write_text(text.replace("brake", "brakes"))
+    with pytest.raises((UsageError, ScenarioError)) as refused:
+        plan(asked())
+    assert "--disturb" not in str(refused.value)
+
+
+def test_a_survey_sees_what_was_asked_and_its_scenario_is_planned(folder):
+    seen = []
+
+    def survey(scenario, request, settings):
+        seen.append((scenario.name, request.max_steps, settings.trials))
+        return replace(scenario, notes=(*scenario.notes, "surveyed"))
+
+    scenario, _ = plan(asked(), survey=survey)
+    assert seen[0][1:] == (100, 3)
+    assert "surveyed" in scenario.notes
+    assert plan(asked(), survey=lambda scenario, *_: scenario)[1] == plan(asked())[1]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ({"trials": -1}, "TRIALS is -1; give at least 0"),
+        ({"trials": True}, "TRIALS is True; give a whole number"),
+        ({"max_steps": 0}, "MAX_STEPS is 0; give at least 1"),
+        ({"max_steps": 2.5}, "MAX_STEPS is 2.5; give a whole number"),
+        ({"parallel": -1}, "PARALLEL is -1; give at least 0 (0: one per core)"),
+        ({"trials": 0}, "TRIALS is 0; give at least 1, or 0 (no limit) and a time with --for"),
+    ],
+)
+def test_numbers_that_cannot_be_meant_are_refused(numbers, says):
+    with pytest.raises(UsageError) as refused:
+        request_of(HuntOptions(), **{"trials": 1, "max_steps": 1, **numbers}).checked()
+    assert str(refused.value) == says
+
+
+def test_no_trials_are_fine_with_a_time_and_drivers_have_to_be_importable(folder):
+    options = {option.name for option in hunt_options()}
+    name = "duration" if "duration" in options else "for"
+    assert request_of(HuntOptions(**{name: "5s"}), trials=0, max_steps=1).checked().trials == 0
+    sys.modules.pop("drives", None)
+    import drives
+
+    assert request_of(HuntOptions(agent=drives.Agent), trials=1, max_steps=1).agents == {"": "drives:Agent"}
+    both = HuntOptions(agent="a:B", agents={"x": "c:D", "y": None})
+    assert request_of(both, trials=1, max_steps=1).agents == {"x": "c:D", "": "a:B"}
+    assert request_of(HuntOptions(agent=""), trials=1, max_steps=1).agents == {}
+
+    class Local: ...
+
+    elsewhere = type("Here", (), {"__module__": "__main__"})
+    for who in (Local, elsewhere, lambda: None):
+        with pytest.raises(UsageError, match="is in no module that a worker could import"):
+            request_of(HuntOptions(agent=who), trials=1, max_steps=1)
+
+
+def test_whose_an_argument_is():
+    owners = Owners(
+        {"a": Takes(("speed", "gap")), "a.b": Takes(("speed",)), "c": Takes((), open=True)}, ("gap", "rain")
+    )
+
+    def of(word):
+        return owners.of(word, option="--set")
+
+    assert of("a.speed") == ("a", "speed")
+    assert of("a.b.speed") == ("a.b", "speed")
+    assert of("a.rain") is None
+    assert of("c.rain") == ("c", "rain")
+    assert of("rain") == of("scenario.rain") == ("", "rain")
+    assert of("scenario.speed") is None
+    assert of("mood") == ("c", "mood")
+    with pytest.raises(ArgumentError, match=r"a and scenario have it; write --set a\.gap=… or --set scenario\.gap=…"):
+        of("gap")
+    with pytest.raises(ArgumentError, match=r"several agents take it; write --set a\.speed=… or --set a\.b\.speed=…"):
+        of("speed")
+    assert Owners({"a": Takes(("speed",))}).of("mood", option="--arg") is None
+    assert (agent_of("a.b.speed", owners.agents), agent_of("a.x", owners.agents), agent_of("x", owners.agents)) == (
+        "a.b", "a", "",
+    )  # fmt: skip
+    unknown = owners.unknown("speeed", option="--set", whose="the crash")
+    assert "the crash has no argument 'speeed'" in str(unknown)
+    assert "speed" in unknown.fix
+
+
+def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
+    owners = Owners({"a": Takes(("speed",)), "b": Takes(())}, ("rain",))
+    calls = []
+
+    def ask(agent):
+        calls.append(agent)
+        return Takes(("weights",) if agent == "b" else ())
+
+    assert owners.of_record("speed", ask, option="--set") == ("a", "speed")
+    assert owners.of_record("scenario.x", ask, option="--set") is None
+    assert owners.of_record("weights", None, option="--set") is None
+    assert calls == []
+    assert owners.of_record("weights", ask, option="--set") == ("b", "weights")
+    assert calls == ["a", "b"]
+    assert owners.of_record("b.weights", ask, option="--set") == ("b", "weights")
+    assert calls == ["a", "b", "b"]
+    assert owners.of_record("a.weights", ask, option="--set") is None
+
+
+def test_code_says_what_an_agent_takes(folder):
+    assert takes_of("drives:Agent") == Takes(("speed", "mode", "needed"))
+    assert takes_of("drives:Open") == Takes((), open=True)
+    assert takes_of("drives:Nothing") == Takes(open=True)  # whoever runs it says why
+    other = folder / "other"
+    other.mkdir()
+    (other / "drives.py").write_text("class Agent:\n    def __init__(self, other: int = 1): ...\n")
+    assert takes_of("drives:Agent", [str(other)]) == Takes(("other",))
+    assert takes_of("drives:Agent", folder=other) == Takes(("other",))
+    assert "speed" in takes_of("keep-lane").names
+
+
+def test_a_command_is_one_line_of_the_settings(folder):
+    _, settings = plan(asked())
+    path = folder / "hunt.toml"
+    write_settings(path, settings, ["crashhunt", "run", "a b", "x\\y", "one\ntwo\rthree"])
+    lines = path.read_bytes().split(b"\n")
+    assert lines[0] == rb"# crashhunt run 'a b' 'x\\y' 'one\ntwo\rthree'"
+    assert lines[1].startswith(b"scenario = ")
+    assert read_settings(path) == settings
+
+
+def test_settings_that_cannot_be_read_say_where_and_why(folder):
+    with pytest.raises(HuntDirectoryError, match=r"it has no hunt\.toml; give the directory that crashhunt run"):
+        read_settings(folder / "hunt.toml")
+    with pytest.raises(HuntDirectoryError, match=r"'.*nowhere' does not exist"):
+        read_settings(folder / "nowhere" / "hunt.toml")
+    (folder / "hunt.toml").write_text("a = ")
+    with pytest.raises(HuntDirectoryError, match=r"hunt\.toml: not valid TOML"):
+        read_settings(folder / "hunt.toml")
+    (folder / "hunt.toml").unlink()
+    (folder / "hunt.toml").mkdir()
+    with pytest.raises(HuntDirectoryError, match="cannot be read"):
+        read_settings(folder / "hunt.toml")
+
+
+def test_keys_of_a_later_version_are_kept_and_slips_are_refused(folder):
+    _, settings = plan(asked())
+    path = folder / "hunt.toml"
+    write_settings(path, settings, ["x"])
+    text = path.read_text().replace("schema = 1\n", 'schema = 1\nmood = "calm"\n')
+    path.write_text(text)
+    assert read_settings(path) == settings
+    write_settings(path, replace(settings, trials=9), ["y"])
+    assert 'mood = "calm"' in path.read_text()
+    write_settings(folder / "copy.toml", settings, ["z"], like=path)
+    assert 'mood = "calm"' in (folder / "copy.toml").read_text()
+    path.write_text(text.replace("max_steps = ", "max_step = "))
+    with pytest.raises(HuntDirectoryError, match="max_step"):
+        read_settings(path)

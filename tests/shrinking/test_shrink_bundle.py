@@ -1,0 +1,163 @@
+"""A bundle is made smaller, in the process that asks for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from crashhunt.crashes import find_bundle
+from crashhunt.errors import UntrustedError, UsageError
+from crashhunt.shrinking import _shrink, shrink
+from crashhunt.trial import Outcome
+
+FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "0.1.0-packages" / "hunt"
+
+
+@pytest.fixture
+def crash(tmp_path):
+    """A crash on the toy at 14.45 m/s, which an older version recorded without code."""
+    return find_bundle(Path(shutil.copytree(FROZEN, tmp_path / "h")), "0")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"budget": 0}, "the budget is 0; give at least 1 trial"),
+        ({"time_s": 0}, "the time is 0 s; give more than 0"),
+        ({"time_s": float("nan")}, "the time is nan s; give more than 0"),
+    ],
+)
+def test_a_budget_or_time_that_is_none_is_refused(crash, options, message):
+    with pytest.raises(UsageError) as refused:
+        shrink(crash, **options)
+    assert str(refused.value) == message
+
+
+def test_what_is_small_or_no_crash_is_refused(crash):
+    for outcome in (Outcome.SURVIVED, Outcome.FINISHED):
+        with pytest.raises(UsageError, match="is a near miss, and nothing crashes in it"):
+            shrink(replace(crash, result=replace(crash.result, outcome=outcome)))
+    small = replace(crash, path=crash.path.with_name(f"{crash.id}.small"))
+    with pytest.raises(UsageError, match="has been made smaller already; give --crash 000000-collision to begin anew"):
+        shrink(small)
+    with pytest.raises(UntrustedError):
+        shrink(crash, trusted=False)
+
+
+@pytest.mark.long
+def test_what_is_left_is_written_beside_it_and_confirmed(crash):
+    with_budget = shrink(crash, budget=1, parallel=1, trusted=True)
+    assert (with_budget.verdict, with_budget.ended, with_budget.small) == ("unchanged", "budget", None)
+    assert with_budget.to_json()["path"] is None
+    memory = crash.path.with_name(".000000-collision.small.jsonl")
+    assert len(memory.read_text().splitlines()) == 1
+    seen = []
+    found = shrink(crash, parallel=1, trusted=True, watch=lambda count, budget: seen.append((count, budget)))
+    assert (found.verdict, found.ended, found.why) == ("shrunk", "done", "")
+    assert not memory.exists()
+    assert seen[-1] == (found.trials, 500)
+    small = found.small
+    assert small.path == crash.path.with_name("000000-collision.small")
+    assert small.confirmed is True
+    assert small.result.outcome is Outcome.COLLISION
+    assert small.added["shrunk"]["of"] == crash.id
+    assert small.added["shrunk"]["changed"] == {name: list(values) for name, values in found.changed.items()}
+    assert {name: now for name, (_, now) in found.changed.items()} == {
+        **{f"ego.{name}": value for name, value in small.result.spec.arguments["ego"].items()
+           if value != crash.result.spec.arguments["ego"][name]},
+        **{name: value for name, value in small.result.spec.scenario_arguments.items()
+           if value != crash.result.spec.scenario_arguments[name]},
+    }  # fmt: skip
+    assert "ego.speed" in found.changed
+    told = found.to_json()
+    assert (told["crash"], told["path"], told["verdict"]) == (crash.id, str(small.path), "shrunk")
+    assert (told["steps_before"], told["steps_after"]) == (52, small.result.steps)
+    assert (told["actors_before"], told["actors_after"]) == (2, 2)
+    assert (told["signature_kept"], told["confirmed"], told["scripted"], told["steps_cut"]) == (True, True, None, 0)
+    assert told["trials_run"] == found.trials > 3
+    assert told["steps_run"] == found.steps > 52
+    assert any("can leave nobody out" in note for note in told["notes"])
+
+
+class AskedError(Exception):
+    """Ends `shrink` where it would begin to run."""
+
+
+@pytest.mark.parametrize("parallel", [0, 3])
+def test_as_many_run_at_a_time_as_is_asked_or_as_there_are_cores(crash, monkeypatch, parallel):
+    def runs(*_, **options):
+        raise AskedError(options)
+
+    monkeypatch.setattr(_shrink, "Runs", runs)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3, 4} if pid == 0 else {0})
+    with pytest.raises(AskedError) as asked:
+        shrink(crash, parallel=parallel, trusted=True)
+    assert asked.value.args[0]["parallel"] == (parallel or 5)
+    assert (asked.value.args[0]["budget"], asked.value.args[0]["time_s"]) == (500, None)
+
+
+@pytest.mark.parametrize(("confirmed", "tries"), [(True, 1), (False, 3)])
+def test_of_what_does_not_come_again_the_next_larger_is_taken(crash, tmp_path, monkeypatch, confirmed, tries):
+    crash = replace(crash, confirmed=confirmed)
+    specs = [replace(crash.result.spec, number=number) for number in range(3)]
+    ran = []
+
+    def run_fresh(rerun, spec):
+        ran.append(spec.number)
+        path = tmp_path / f"small-{len(ran)}"
+        path.mkdir()
+        return replace(crash, path=path, result=replace(crash.result, spec=spec))
+
+    search = SimpleNamespace(
+        smaller=specs, best=None, removed=lambda: ("a",), changed=lambda: {"ego.speed": (1.0, 2.0)}, steps_cut=7
+    )
+    monkeypatch.setattr(_shrink, "_run_fresh", run_fresh)
+    monkeypatch.setattr(_shrink, "_kept", lambda small: small)
+    monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: spec.number == 1)
+    monkeypatch.setattr(_shrink, "signature_of", lambda bundle: None)
+    small = _shrink._written(SimpleNamespace(bundle=crash), search, None)
+    assert ran == [2] * tries + [1]
+    assert search.best is specs[1]
+    assert [path.name for path in sorted(tmp_path.glob("small-*"))] == [f"small-{tries + 1}"]
+    assert small.added["shrunk"] == {
+        "of": crash.id, "removed": ["a"], "changed": {"ego.speed": [1.0, 2.0]}, "steps_cut": 7,
+    }  # fmt: skip
+    monkeypatch.setattr(_shrink, "is_same", lambda found, wanted, spec: False)
+    assert _shrink._written(SimpleNamespace(bundle=crash), search, None) is None
+
+
+def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
+    path = Path(shutil.copytree(crash.path, tmp_path / "small"))
+    small = replace(crash, path=path)
+    written = []
+    monkeypatch.setattr(type(crash), "write", lambda self: written.append(self.confirmed))
+    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: replace(bundle, confirmed=False))
+    assert _shrink._kept(replace(small, confirmed=None)).confirmed is False
+    assert written == [None, False]
+    monkeypatch.setattr(_shrink, "confirm", lambda bundle, *, trusted: None)
+    assert _shrink._kept(small) is small
+    assert path.exists()
+
+    def stops(bundle, *, trusted):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_shrink, "confirm", stops)
+    with pytest.raises(KeyboardInterrupt):
+        _shrink._kept(small)
+    assert not path.exists()
+
+
+def test_a_crash_that_does_not_come_again_is_told(crash, monkeypatch):
+    runs = SimpleNamespace(
+        most_steps=9, count=3, steps=30, first=lambda specs, *, again=False: None, close=lambda: None
+    )  # fmt: skip
+    monkeypatch.setattr(_shrink, "Runs", lambda *_, **options: runs)
+    found = shrink(crash, trusted=True)
+    assert (found.verdict, found.ended, found.why) == ("not_reproduced", "done", "it did not come again in 3 runs")
+    assert (found.small, found.actors, found.trials, found.steps) == (None, (2, 2), 3, 30)
+    assert found.to_json()["signature_kept"] is False
