@@ -1,6 +1,22 @@
-"""``python -m crashhunt``."""
+"""The command ``crashhunt``, and ``python -m crashhunt``."""
 
-from crashhunt.cli import main
+import sys
+from typing import NoReturn
+
+from crashhunt.base.signals import remember_interrupts
+
+__all__ = ["main"]
+
+
+def main() -> NoReturn:
+    """Run the command line and exit."""
+    remember_interrupts()  # before the imports that may drop one
+    try:
+        from crashhunt.cli import main as run
+    except KeyboardInterrupt:
+        sys.exit(130)
+    run()
+
 
 if __name__ == "__main__":
     main()

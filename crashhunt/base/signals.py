@@ -17,6 +17,7 @@ __all__ = [
     "describe_death",
     "ended_by_signals",
     "is_sent_from_outside",
+    "remember_interrupts",
     "stop_requests",
 ]
 
@@ -27,13 +28,28 @@ _SENT_FROM_OUTSIDE: Final = frozenset(
 # Bound here, before an agent is imported that could replace them.
 _set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
 
-# Bound here, before an agent is imported that could replace them.
-_set_mask, _ALL = signal.pthread_sigmask, tuple(signal.valid_signals())
-
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SAME_REQUEST_S = 1.0
 """GNU timeout and batch systems send a signal to the process and then to its group. Two signals within this time are
 therefore one request, not a second request of an impatient user."""
+
+
+_interrupts: Final[list[int]] = []
+"""Interrupts that `remember_interrupts` has seen."""
+
+
+def remember_interrupts() -> None:
+    """Have the next `stop_requests` learn of a Ctrl-C whose `KeyboardInterrupt` Python dropped.
+
+    Python drops what is raised in a callback of a weak reference, and importing a module runs one of these each time.
+    """
+
+    def interrupt(number: int, _frame: object) -> None:
+        _interrupts.append(number)
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not under nohup, which ignores it
+        signal.signal(signal.SIGINT, interrupt)
 
 
 class _EndedError(BaseException):
@@ -96,10 +112,11 @@ def blocked_signals() -> Iterator[None]:
 def stop_requests() -> Iterator[list[int]]:
     """Collect requests to stop, as numbers of signals, instead of ending; a later second one ends the process at once.
 
+    An interrupt that `remember_interrupts` has seen is collected at once: the command has gone on, so it was dropped.
     Hang-ups stay ignored where they are ignored already, as under nohup. In a thread other than the main one nothing is
     collected, because the embedding program handles signals there.
     """
-    asked: list[int] = []
+    asked = [*_interrupts[:1]]
     first_at: list[float] = []
 
     def stop(number: int, _frame: object) -> None:

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -83,3 +85,31 @@ def test_blocking_drops_what_a_handler_raises(monkeypatch):
     block_signals()
     assert len(calls) == 2
     assert signal.SIGALRM in calls[1][1]
+
+
+_DROPPED = """
+import os, signal, weakref
+from crashhunt.base.signals import remember_interrupts, stop_requests
+
+class Module: pass
+
+remember_interrupts()
+module = Module()
+reference = weakref.ref(module, lambda _: os.kill(os.getpid(), signal.SIGINT))
+del module  # runs the callback, in which Python drops the KeyboardInterrupt
+with stop_requests() as asked:
+    print(*asked)
+"""
+
+
+def test_an_interrupt_that_python_drops_still_stops():
+    done = subprocess.run([sys.executable, "-c", _DROPPED], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(int(signal.SIGINT))]
+    assert "KeyboardInterrupt" in done.stderr  # what Python says when it drops one
+
+
+def test_an_ignored_interrupt_stays_ignored():
+    program = "import crashhunt.base.signals as s, signal; s.remember_interrupts(); print(repr(signal.getsignal(2)))"
+    ignoring = ["sh", "-c", 'trap "" INT; exec "$@"', "-", sys.executable, "-c", program]
+    done = subprocess.run(ignoring, capture_output=True, text=True, check=True)
+    assert "SIG_IGN" in done.stdout
