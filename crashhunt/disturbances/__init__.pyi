@@ -13,7 +13,14 @@ from ._models import (
     stop as stop,
     unseen as unseen,
 )
-from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn
+from ._onsets import (
+    COPIES_PER_ROOT as COPIES_PER_ROOT,
+    FIRST_STEP as FIRST_STEP,
+    FirstOnsets as FirstOnsets,
+    Onset as Onset,
+    first_forcing as first_forcing,
+)
+from ._protocol import DisturbanceModel as DisturbanceModel, Drawn as Drawn, Enumerates as Enumerates
 from ._rates import (
     FORM as FORM,
     NONE as NONE,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base.draws import one_of
 from crashhunt.disturbances._protocol import Drawn
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     import numpy as np
 
@@ -54,6 +55,14 @@ class Choices:
     def draw(self, rng: np.random.Generator) -> Drawn:
         """Draw the three, in this order."""
         return Drawn(one_of(self.who, rng), one_of(self.how_strong, rng), one_of(self.how_long, rng))
+
+    def possibilities(self) -> Iterator[tuple[Drawn, float]]:
+        """Yield everything that `draw` can return, with its probability."""
+        totals = [sum(part.values()) for part in (self.who, self.how_strong, self.how_long)]
+        for who, strong, long in product(self.who.items(), self.how_strong.items(), self.how_long.items()):
+            share = who[1] * strong[1] * long[1] / math.prod(totals)
+            if share > 0:
+                yield Drawn(who[0], strong[0], long[0]), share
 
     def log_likelihood(self, drawn: Drawn) -> float:
         """Return the sum of the three logarithms."""

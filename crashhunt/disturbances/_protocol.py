@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
 
-__all__ = ["DisturbanceModel", "Drawn"]
+__all__ = ["DisturbanceModel", "Drawn", "Enumerates"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,3 +49,11 @@ class DisturbanceModel(Protocol):
 
     def log_likelihood(self, drawn: Drawn) -> float:
         """Return the natural logarithm of the probability that one that happens is this; -inf where it never is."""
+
+
+@runtime_checkable
+class Enumerates(Protocol):
+    """A model that can list what it draws, so that draws without a vehicle to disturb are skipped in closed form."""
+
+    def possibilities(self) -> Iterable[tuple[Drawn, float]]:
+        """Return everything that `DisturbanceModel.draw` can return, each with its probability; the sum is 1."""

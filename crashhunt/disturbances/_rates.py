@@ -264,7 +264,7 @@ class DisturbanceSampler:
             for name in self.models:
                 key = (_STREAM, number, *name.encode())
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
-                found += self._between(0, max_steps, name, agent, rng)
+                found += self.draw_between(0, max_steps, name, agent, rng)
         return self._with_fixed(found, 0, max_steps)
 
     def draw_another(self, seed: int, number: int, after: int, soon: int, last: int) -> tuple[Disturbance, ...]:
@@ -279,10 +279,10 @@ class DisturbanceSampler:
         """
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_BRANCH, after, number)))
         places = [(agent, name) for agent in self.agents for name in self.models]
-        chances = np.array([self._chance(name) for _, name in places])
+        chances = np.array([self.chance(name) for _, name in places])
         agent, name = places[int(rng.choice(len(places), p=chances / chances.sum()))]
-        first = self._one(after + 1 + int(rng.integers(soon)), name, agent, rng)
-        others = [one for agent, name in places for one in self._between(first.step, last, name, agent, rng)]
+        first = self.draw_one(after + 1 + int(rng.integers(soon)), name, agent, rng)
+        others = [one for agent, name in places for one in self.draw_between(first.step, last, name, agent, rng)]
         return self._with_fixed([first, *others], after, last)
 
     def draw_strongest(self, seed: int, number: int, after: int, soon: int) -> tuple[tuple[Disturbance, ...], ...]:
@@ -302,7 +302,7 @@ class DisturbanceSampler:
         for agent in self.agents:
             for name in self.models:
                 step = after + 1 + int(rng.integers(soon))
-                drawn = dict.fromkeys(self._one(step, name, agent, rng) for _ in range(_TRIED))
+                drawn = dict.fromkeys(self.draw_one(step, name, agent, rng) for _ in range(_TRIED))
                 found.append(tuple(sorted(drawn, key=_strength, reverse=True)))
         return tuple(found)
 
@@ -312,15 +312,24 @@ class DisturbanceSampler:
         taken = {_key(one) for one in given}
         return in_turn([*(one for one in drawn if _key(one) not in taken), *given])
 
-    def _between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
-        """What a model begins around an agent after a step, up to another one."""
-        chance, step, found = self._chance(name), after, []
+    def draw_between(self, after: int, last: int, name: str, agent: str, rng: np.random.Generator) -> list[Disturbance]:
+        """Return what a model begins around an agent.
+
+        Args:
+            after: the first step is the next one.
+            last: the last step.
+            name: of the model.
+            agent: identifier of the controlled vehicle.
+            rng: draws steps and disturbances.
+        """
+        chance, step, found = self.chance(name), after, []
         # A waiting time can be longer than any number of steps: that of a rate near 0.
         while (step := step + int(min(rng.geometric(chance), last + 1))) <= last:
-            found.append(self._one(step, name, agent, rng))
+            found.append(self.draw_one(step, name, agent, rng))
         return found
 
-    def _one(self, step: int, name: str, agent: str, rng: np.random.Generator) -> Disturbance:
+    def draw_one(self, step: int, name: str, agent: str, rng: np.random.Generator) -> Disturbance:
+        """Return a disturbance that a model begins around an agent in a step."""
         drawn = _drawn(name, self.models[name], rng)
         strong, long = float(drawn.how_strong), float(drawn.how_long)
         one = Disturbance(step, drawn.who, self.models[name].what, strong, long, agent)
@@ -343,7 +352,7 @@ class DisturbanceSampler:
         total = 0.0
         for agent in self.agents:
             for name, model in self.models.items():
-                chance = self._chance(name)
+                chance = self.chance(name)
                 mine = [one for one in begun if one.agent == agent and one.what == model.what]
                 for one in mine:
                     total += math.log(chance) + model.log_likelihood(Drawn(one.who, one.how_strong, one.how_long))
@@ -365,7 +374,8 @@ class DisturbanceSampler:
         drawn = [one for one in result.spec.disturbances if (one.step, one.agent, one.what) in there]
         return self.log_likelihood(drawn, result.steps_begun)
 
-    def _chance(self, name: str) -> float:
+    def chance(self, name: str) -> float:
+        """Return the probability that a model begins a disturbance around an agent in one step."""
         return min(1.0, self.rates[name] * self.step_length_s)
 
 

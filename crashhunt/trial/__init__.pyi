@@ -25,6 +25,8 @@ from ._outcome import (
 from ._result import (
     Branch as Branch,
     Branches as Branches,
+    Forced as Forced,
+    ForcedCopy as ForcedCopy,
     Stress as Stress,
     TrialResult as TrialResult,
     in_effect as in_effect,
@@ -45,6 +47,7 @@ from ._space import (
 )
 from ._specification import (
     EVERYBODY as EVERYBODY,
+    Forcing as Forcing,
     Handover as Handover,
     Overruled as Overruled,
     Reseeding as Reseeding,

@@ -13,7 +13,7 @@ from crashhunt.trial._outcome import Outcome, outcome_of
 from crashhunt.trial._specification import TrialSpec
 from crashhunt.world import ClosestApproach, Event
 
-__all__ = ["Branch", "Branches", "Stress", "TrialResult", "in_effect", "summarize"]
+__all__ = ["Branch", "Branches", "Forced", "ForcedCopy", "Stress", "TrialResult", "in_effect", "summarize"]
 
 
 _NOT_ALL_ANSWERED = written_if(lambda branches: branches.unanswered)
@@ -71,6 +71,57 @@ class Branches(Serializable):
     def extent(self) -> str:
         """How much of it was asked, in words: "asked 12 of 13"."""
         return f"asked {self.asked} of {self.asked + self.unanswered}"
+
+
+# How often it would have crashed: copies of a root, each with a first onset that was forced.
+
+
+@dataclass(frozen=True, slots=True)
+class ForcedCopy(Serializable):
+    """What came of a copy with a forced first onset.
+
+    Args:
+        cell: the model and strength of the onset, as in `Forcing.ratios`.
+        onset: step of the onset.
+        weight: probability of the onsets that this copy represents, given the root.
+        branched: the step after which it left the root.
+        crash: the outcome where that is one of the hunt's crashes, else empty.
+        step: at which the copy ended.
+        disturbed: whether any disturbance had an effect on the copy.
+        disturbances: of a crash, all that were planned from the start of the trial.
+    """
+
+    cell: str
+    onset: int
+    weight: float
+    branched: int
+    crash: str = ""
+    step: int = 0
+    disturbed: bool = True
+    disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
+
+
+@dataclass(frozen=True, slots=True)
+class Forced(Serializable):
+    """What came of the copies of a root.
+
+    Args:
+        survival: probability that no first onset begins before the root ends.
+        masses: by cell, the probability that the first onset is of this cell and begins before the root ends.
+        copies: in the order of their onsets.
+        steps: how many steps they took.
+        unanswered: how many further copies there were to be, of which nothing is known.
+        why_unanswered: the reason for the first of them; empty where there is none.
+        may_be_asked_again: whether a reason lies outside of the trial, so that another run may get all answers.
+    """
+
+    survival: float
+    masses: Mapping[str, float]
+    copies: tuple[ForcedCopy, ...] = ()
+    steps: int = 0
+    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
+    why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
+    may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
 
 
 # How little it would have taken: what copies of a trial have found out while it ran.
@@ -173,6 +224,7 @@ class TrialResult(Serializable):
         branches: what else might have happened where it came near to a crash; None where nobody asked.
         setup_steps: how many steps were simulated before the first one, as for traffic to warm up; None where nobody
             counted. Where trials share a warm-up, it is that of the first of them.
+        forced: what came of copies with a forced first onset; None where there were to be none.
     """
 
     spec: TrialSpec
@@ -197,11 +249,12 @@ class TrialResult(Serializable):
     branches: Branches | None = field(default=None, metadata=OMIT_DEFAULT)
     setup_steps: int | None = field(default=None, metadata=OMIT_DEFAULT)
     why_no_escape: str = field(default="", metadata=OMIT_DEFAULT)
+    forced: Forced | None = field(default=None, metadata=OMIT_DEFAULT)
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
-        "stress", "branches", "setup_steps", "why_no_escape",
+        "stress", "branches", "setup_steps", "why_no_escape", "forced",
     )  # fmt: skip
 
     @classmethod
@@ -226,14 +279,15 @@ class TrialResult(Serializable):
 
         Its processes were killed from outside, or those of its copies.
         """
-        unasked = (one for one in (self.stress, self.branches) if one is not None)
+        unasked = (one for one in (self.stress, self.branches, self.forced) if one is not None)
         return self.was_killed_from_outside or any(one.may_be_asked_again for one in unasked)
 
     @property
     def is_fully_asked(self) -> bool:
         """Whether every question to its copies has an answer; also where there were to be none."""
         unasked = self.stress is not None and self.stress.margin is None
-        return not unasked and not (self.branches is not None and self.branches.unanswered)
+        asked = (one for one in (self.branches, self.forced) if one is not None)
+        return not unasked and not any(one.unanswered for one in asked)
 
     @property
     def steps_begun(self) -> int:
@@ -243,7 +297,9 @@ class TrialResult(Serializable):
     @property
     def other_steps(self) -> int:
         """How many steps were simulated for it beside its own: before the first one, and by copies of it."""
-        return (self.setup_steps or 0) + sum(one.steps for one in (self.stress, self.branches) if one is not None)
+        return (self.setup_steps or 0) + sum(
+            one.steps for one in (self.stress, self.branches, self.forced) if one is not None
+        )
 
     @property
     def nearness(self) -> tuple[float, float]:

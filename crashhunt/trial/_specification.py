@@ -14,7 +14,7 @@ from crashhunt.trial._disturbance import Disturbance
 from crashhunt.trial._space import Value
 from crashhunt.world import Paths
 
-__all__ = ["EVERYBODY", "Handover", "Overruled", "Reseeding", "TrialSpec"]
+__all__ = ["EVERYBODY", "Forcing", "Handover", "Overruled", "Reseeding", "TrialSpec"]
 
 EVERYBODY = "*"
 """In `TrialSpec.only`: nobody is left out, but who enters is written down."""
@@ -70,6 +70,20 @@ class Reseeding(Serializable):
 
 
 @dataclass(frozen=True, slots=True)
+class Forcing(Serializable):
+    """How copies of a root are given their first onset: a root is a trial without disturbances after its first step.
+
+    Args:
+        spacing: proposed probability per copy. One copy is made in each interval of this length.
+        ratios: by cell, how many times more often than by its own law a first onset is proposed; 1 where it is missing.
+            A cell is a model with one strength, such as ``brake=4.0``.
+    """
+
+    spacing: float
+    ratios: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class TrialSpec(Serializable):
     """Everything that determines one trial.
 
@@ -88,6 +102,7 @@ class TrialSpec(Serializable):
             do, and the traffic takes no part. None where the others drive.
         handover: which agent takes over from recorded actions, and when; None where all agents drive from the start.
         reseeding: when the simulator's generators get another seed; None where they keep that of the trial.
+        forcing: how copies of it are disturbed; None where there are none. It determines nothing of the trial itself.
     """
 
     number: int
@@ -103,6 +118,7 @@ class TrialSpec(Serializable):
     script: Paths | None = field(default=None, metadata=_ESSENTIAL)
     handover: Handover | None = field(default=None, metadata=_ESSENTIAL)
     reseeding: Reseeding | None = field(default=None, metadata=_ESSENTIAL)
+    forcing: Forcing | None = field(default=None, metadata=OMIT_DEFAULT)
 
     def to_json(self) -> JsonObject:
         """Return plain dicts and numbers; ``requires`` names what another version must know."""

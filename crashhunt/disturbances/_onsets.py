@@ -1,0 +1,240 @@
+"""The law of the first onset: proposes first onsets in a running root, each with an exact weight.
+
+A root is a trial in which no disturbance begins after step 1. Each trial of the hunt has either no effective onset
+before it ends, or a first one, of a model in a step. For independent chances per step the probability of each case has
+a closed form. Copies of the root cover the second case. Each begins with one first onset, and every later disturbance
+is drawn as in any trial.
+
+Let S be the probability that no onset is effective so far, and c the chance of a model per step. Let a be the
+probability that its draw finds a vehicle. The first onset is of this model with probability S * c * a, and then S is
+multiplied by 1 - c * a. Draws without a vehicle have no effect, so they neither begin nor end anything. Which draws
+find a vehicle is known one step ahead, since the root is undisturbed up to there.
+
+The proposal multiplies the law of each cell (a model with one strength) by a ratio. The proposed probability
+accumulates along the root. Each interval of `Forcing.spacing` of it gets one onset, at a uniform point. The weight of
+an onset is spacing / ratio.
+
+Invariant: the expected sum of weights over any set of first onsets is the probability of that set, given the root.
+The estimate is the weighted crashes of all copies, plus S at the end where the root itself crashes. So it has no bias,
+for all ratios above 0 and for any spacing.
+
+Why intervals of fixed length, and not eight equal parts of each root: the total is known only at the end of the root.
+A second run would cost its steps again. The spacing is learned, so that a root has eight copies on average.
+
+Order within a step: disturbances of the agent first, because the agent notices them one step earlier, when the vehicles
+around it in the next step are not known. Models later in this order are drawn as ever in the step of the onset. Models
+before it are drawn on the condition that they are not effective.
+
+Source: stratified importance sampling (Owen, Monte Carlo theory, methods and examples, 2013, chapters 8 and 9).
+Cost: per step of the root one look at each place around the agent at which a model may find a vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crashhunt.base.capabilities import supports
+from crashhunt.disturbances._protocol import Drawn, Enumerates
+from crashhunt.trial import KINDS, OF_AGENT, Disturbance, Forcing, in_turn
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from crashhunt.disturbances._rates import DisturbanceSampler
+
+__all__ = ["COPIES_PER_ROOT", "FIRST_STEP", "FirstOnsets", "HasTarget", "Onset", "cell_of", "first_forcing"]
+
+HasTarget = Callable[[Disturbance], bool]
+"""Whether a disturbance that begins in the next step finds a vehicle."""
+
+COPIES_PER_ROOT: Final = 8
+"""Mean number of copies: more share one root and are correlated, fewer leave the root's own steps unused."""
+FIRST_STEP: Final = 2
+"""The first step in which an onset is forced: a fork after step 0 is too late for what an agent sees in step 1."""
+_POINTS = 0x6F6E7365  # separates these draws from others with the seed of the trial
+_LATER = 0x6C617465
+_ANY = Drawn("", 0.0, 0.0)  # of a model that cannot list what it draws
+_DEPENDS_ON_STRENGTH = "step_out"  # of the kinds of crashhunt the only one whose target depends on more than the place
+
+
+@dataclass(frozen=True, slots=True)
+class Onset:
+    """A first onset for a copy of the root.
+
+    Args:
+        cell: the model and strength, such as ``brake=4.0``.
+        weight: probability of the onsets that it represents.
+        step: in which it begins.
+        planned: the onset and all later disturbances of the copy, in turn.
+    """
+
+    cell: str
+    weight: float
+    step: int
+    planned: tuple[Disturbance, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    key: str
+    drawn: Drawn
+    share: float  # of the draws of its model
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """One model around one agent, with its cells by the disturbance that is asked for a target."""
+
+    agent: str
+    name: str
+    what: str
+    chance: float
+    cells: Mapping[Drawn, tuple[_Cell, ...]]
+
+
+def cell_of(name: str, how_strong: float | None = None) -> str:
+    """Return the key of a cell; without a strength of a model that cannot list what it draws."""
+    return name if how_strong is None else f"{name}={how_strong!r}"
+
+
+def first_forcing(sampler: DisturbanceSampler, last: int) -> Forcing:
+    """Return the forcing of the first roots: the law itself, and the spacing for eight copies at most.
+
+    Args:
+        sampler: of the hunt.
+        last: the last step of a trial.
+    """
+    none = 1.0
+    for name in sampler.models:
+        none *= (1.0 - sampler.chance(name)) ** (len(sampler.agents) * max(0, last - FIRST_STEP + 1))
+    return Forcing(max((1.0 - none) / COPIES_PER_ROOT, np.finfo(float).tiny))
+
+
+class FirstOnsets:
+    """Proposes the first onsets of one root while it runs.
+
+    Args:
+        sampler: of the hunt, without disturbances that are fixed.
+        forcing: of the root.
+        seed: of the root.
+        last: the last step of the root.
+
+    Attributes:
+        survival: probability that no onset was effective so far.
+        masses: by cell, the probability that the first onset is of this cell and begins so far.
+    """
+
+    def __init__(self, sampler: DisturbanceSampler, forcing: Forcing, seed: int, last: int) -> None:
+        self.survival = 1.0
+        self.masses: dict[str, float] = {}
+        self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
+        places = [self._place(agent, name) for agent in sampler.agents for name in sampler.models]
+        self._of_agent = [place for place in places if place.what in OF_AGENT]
+        self._traffic = [place for place in places if place.what not in OF_AGENT]
+        self._points = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_POINTS,)))
+        self._proposed = 0.0
+        self._number = 0
+        self._point = self._points.random() * forcing.spacing
+
+    def after(self, step: int, has_target: HasTarget) -> list[Onset]:
+        """Return the onsets for copies that leave the root after a step; it has to be called after every step from 0.
+
+        Args:
+            step: the step that is complete.
+            has_target: answers for disturbances that begin in the next step.
+        """
+        found: list[Onset] = []
+        begins = step + 1
+        if FIRST_STEP <= begins <= self._last:
+            skipped: list[tuple[_Place, frozenset[Drawn]]] = []
+            for number, place in enumerate(self._traffic):
+                there = [
+                    asked for asked in place.cells if asked is _ANY or has_target(_disturbance(place, asked, begins))
+                ]
+                cells = [cell for asked in there for cell in place.cells[asked]]
+                later = [*skipped, *((one, None) for one in self._traffic[number + 1 :])]
+                found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
+                skipped.append((place, frozenset(cell.drawn for cell in cells)))
+        begins = step + 2
+        if begins <= self._last:
+            for number, place in enumerate(self._of_agent):
+                cells = [cell for some in place.cells.values() for cell in some]
+                later = [(one, None) for one in (*self._of_agent[number + 1 :], *self._traffic)]
+                found += [self._onset(place, cell, begins, later, n) for cell, n in self._propose(place, cells)]
+        return found
+
+    def _place(self, agent: str, name: str) -> _Place:
+        model, ratios = self._sampler.models[name], self._forcing.ratios
+        by_place = model.what in KINDS and model.what != _DEPENDS_ON_STRENGTH
+        cells: dict[Drawn, list[_Cell]] = {}
+        if supports(model, Enumerates):
+            for drawn, share in model.possibilities():
+                key = cell_of(name, drawn.how_strong)
+                asked = Drawn(drawn.who, 1.0, 1.0) if by_place else drawn
+                cells.setdefault(asked, []).append(_Cell(key, drawn, share, ratios.get(key, 1.0)))
+        else:  # every draw counts, whether it finds a vehicle or not
+            cells[_ANY] = [_Cell(cell_of(name), _ANY, 1.0, ratios.get(name, 1.0))]
+        frozen = {asked: tuple(some) for asked, some in cells.items()}
+        return _Place(agent, name, model.what, self._sampler.chance(name), frozen)
+
+    def _propose(self, place: _Place, cells: Sequence[_Cell]) -> list[tuple[_Cell, int]]:
+        """Return the cells at the points that fall on a place in a step, with their numbers, and move past it."""
+        found = []
+        here = self.survival * place.chance
+        share = proposed = 0.0
+        for cell in cells:
+            mass = here * cell.share
+            share += cell.share
+            self.masses[cell.key] = self.masses.get(cell.key, 0.0) + mass
+            proposed += mass * cell.ratio
+            # One point lies uniformly in each interval, so the cell under it is drawn by its proposed probability.
+            while self._point < self._proposed + proposed:
+                found.append((cell, self._number))
+                self._number += 1
+                self._point = (self._number + self._points.random()) * self._forcing.spacing
+        self._proposed += proposed
+        self.survival *= 1.0 - place.chance * share
+        return found
+
+    def _onset(
+        self, place: _Place, cell: _Cell, step: int, in_step: Sequence[tuple[_Place, frozenset[Drawn] | None]],
+        number: int,
+    ) -> Onset:  # fmt: skip
+        """Return an onset with all later disturbances.
+
+        Args:
+            place: of the onset.
+            cell: of the onset.
+            step: in which it begins.
+            in_step: the other places from which a disturbance may begin in the same step, each with the draws that are
+                excluded because they are effective; None to draw as ever.
+            number: of the onset in the root.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_LATER, number)))
+        sampler, last = self._sampler, self._last
+        if cell.drawn is _ANY:
+            planned = [sampler.draw_one(step, place.name, place.agent, rng)]
+        else:
+            planned = [_disturbance(place, cell.drawn, step)]
+        for other, excluded in in_step:
+            begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
+            while excluded and any(_drawn(one) in excluded for one in begun):
+                begun = sampler.draw_between(step - 1, step, other.name, other.agent, rng)
+            # A model that cannot list its draws is effective whenever it begins.
+            planned += [] if excluded is not None and _ANY in excluded else begun
+        for other in (*self._of_agent, *self._traffic):
+            planned += sampler.draw_between(step, last, other.name, other.agent, rng)
+        return Onset(cell.key, self._forcing.spacing / cell.ratio, step, in_turn(planned))
+
+
+def _disturbance(place: _Place, drawn: Drawn, step: int) -> Disturbance:
+    return Disturbance(step, drawn.who, place.what, float(drawn.how_strong), float(drawn.how_long), place.agent)
+
+
+def _drawn(one: Disturbance) -> Drawn:
+    return Drawn(one.who, one.how_strong, one.how_long)

@@ -1,0 +1,128 @@
+"""The rare-event estimator, against a Markov model whose crash probability is known."""
+
+from __future__ import annotations
+
+import math
+import statistics
+
+import pytest
+from markov import Model, run_roots
+
+from crashhunt.disturbances import first_forcing
+from crashhunt.rates import Root, learn_forcing, rare_estimate
+from crashhunt.trial import Forced, ForcedCopy, Forcing
+
+SPARSE = {"late_action": 1e-4, "brake": 2e-4, "stop": 1e-4}
+DENSE = {"late_action": 0.05, "brake": 0.1, "stop": 0.02}
+TWO = {"late_action": 2e-3, "brake": 4e-3}
+
+
+def z_score(values, truth):
+    return (statistics.fmean(values) - truth) / (statistics.stdev(values) / math.sqrt(len(values)))
+
+
+@pytest.mark.parametrize("model", [Model(SPARSE), Model(DENSE), Model(TWO), Model(SPARSE, hidden=1e-2)])
+def test_roots_estimate_both_parts_without_bias(model):
+    roots = run_roots(model, 96, 5)
+    undisturbed, disturbed = model.truth()
+    assert abs(z_score([root.disturbed for root in roots], disturbed)) < 3
+    if undisturbed:
+        assert abs(z_score([root.undisturbed for root in roots], undisturbed)) < 3
+    else:
+        assert not any(root.undisturbed for root in roots)
+    estimate = rare_estimate(roots)
+    assert estimate.disturbed == pytest.approx(sum(estimate.parts.values()), rel=0.2)
+    assert all(root.value - root.own <= root.bound for root in roots)
+
+
+def test_copies_take_far_fewer_steps_than_plain_trials_for_a_rare_crash():
+    estimate = rare_estimate(run_roots(Model(SPARSE), 64, 2))
+    assert estimate.plain_equivalent_steps > 50 * estimate.steps
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("scale", [1e-2, 1e-4, 1e-6])
+def test_estimate_is_unbiased_and_its_interval_covers(scale):
+    model = Model({"late_action": scale, "brake": 2 * scale, "stop": scale})
+    truth = sum(model.truth())
+    found = [rare_estimate(run_roots(model, 200, 100 + number)) for number in range(100)]
+    assert abs(z_score([one.estimate for one in found], truth)) < 3
+    covering = [one.estimated.low <= truth <= one.estimated.high for one in found if one.estimated is not None]
+    assert len(covering) >= 50
+    # Of 100 intervals of 95 %, fewer than 88 cover the truth with a probability of 0.4 %.
+    assert statistics.fmean(covering) >= 0.88
+
+
+def test_estimate_with_a_hidden_mode_leaves_it_to_the_certain_bound():
+    asked = []
+
+    def certain(values, bound, confidence):
+        asked.append((max(values) <= bound, confidence))
+        return 0.0, 3.4 / len(values) * bound
+
+    estimate = rare_estimate(run_roots(Model(SPARSE, hidden=1e-6), 96, 1), certain=certain)
+    assert estimate.undisturbed_crashes == 0
+    assert asked == [(True, 0.975), (True, 0.975)]
+    assert estimate.certain is not None
+    assert estimate.certain[1] >= 3.4 / 96
+
+
+def test_ratios_prefer_cells_that_crash_and_have_a_mean_of_one():
+    masses = {"brake=2.0": 0.03, "stop=6.0": 0.01}
+    copies = [ForcedCopy("brake=2.0", 3, 0.1, 2) for _ in range(30)]
+    copies += [ForcedCopy("stop=6.0", 3, 0.1, 2, "collision", 9) for _ in range(10)]
+    found = learn_forcing([Forced(0.96, masses, tuple(copies))], Forcing(0.5))
+    mean = sum(masses[cell] * ratio for cell, ratio in found.ratios.items()) / 0.04
+    assert mean == pytest.approx(1.0)
+    assert 0.1 <= found.ratios["brake=2.0"] < 1 < found.ratios["stop=6.0"]
+    assert found.spacing == pytest.approx(0.04 / 8)
+
+
+def test_forcing_stays_the_first_one_without_earlier_roots():
+    start = first_forcing(Model(SPARSE).sampler(), 40)
+    assert learn_forcing([], start) is start
+    assert learn_forcing([Forced(1.0, {})], start) is start
+
+
+def roots(*values):
+    return [Root(0.0, value, bound=1.0) for value in values]
+
+
+@pytest.mark.parametrize(
+    ("some", "says"),
+    [
+        (roots(*[0.0] * 50), "none of 50 roots has a crash"),
+        (roots(*[0.0] * 50, *[1e-3] * 10), "10 roots have a crash"),
+        (roots(*[1e-3] * 30, 0.1), "of the sum (at most 20%)"),
+        (roots(*[1e-3] * 30, 0.1), "effective sample size is 1.7"),
+    ],
+)
+def test_interval_is_withheld_with_the_reason(some, says):
+    estimate = rare_estimate(some)
+    assert estimate.estimated is None
+    assert says in estimate.why_not
+    assert estimate.estimate == pytest.approx(statistics.fmean(root.value for root in some))
+    assert (estimate.more_roots is None) == ("none of" in estimate.why_not)
+    assert estimate.relative_error == math.inf
+
+
+def test_interval_is_reported_where_the_roots_carry_it():
+    estimate = rare_estimate(roots(*[0.0] * 60, *[1e-3] * 40))
+    assert estimate.why_not == ""
+    assert estimate.estimated.low < 4e-4 < estimate.estimated.high
+    assert estimate.estimated.effective == pytest.approx(40)
+    assert rare_estimate(roots(*[0.0] * 60, *[1e-3] * 40), confidence=0.5).relative_error < estimate.relative_error
+
+
+def test_nothing_is_estimated_with_too_many_incomplete_roots():
+    estimate = rare_estimate(roots(*[1e-3] * 40), excluded=3)
+    assert estimate.estimate is None
+    assert "3 of 43 roots" in estimate.why_not
+    assert estimate.to_json()["estimate"] is None
+    assert rare_estimate(roots(*[1e-3] * 60), excluded=3).estimate is not None
+
+
+def test_estimate_without_roots_is_none():
+    estimate = rare_estimate([])
+    assert estimate.estimate is None
+    assert estimate.to_json()["estimated"] is None
