@@ -7,6 +7,7 @@ from ._action_override import (
 from ._branches import Brancher as Brancher
 from ._episode import Episode as Episode, MakeAgent as MakeAgent, Reset as Reset
 from ._failures import failure_of as failure_of, message_of_error as message_of_error
+from ._forced_onsets import OnsetForcer as OnsetForcer
 from ._observers import (
     Nearness as Nearness,
     Observer as Observer,

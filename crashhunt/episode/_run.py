@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from crashhunt.agents import Agent
     from crashhunt.episode._branches import Brancher
     from crashhunt.episode._episode import MakeAgent, Reset
+    from crashhunt.episode._forced_onsets import OnsetForcer
     from crashhunt.episode._observers import Observer
     from crashhunt.episode._probes import Prober
     from crashhunt.episode._questions import FirstCopy
@@ -70,6 +71,7 @@ def run_episode(
     prober: Prober | None = None,
     brancher: Brancher | None = None,
     first_copy: FirstCopy | None = None,
+    forcer: OnsetForcer | None = None,
 ) -> TrialResult:
     """Run one trial from its specification, recorded and measured, with the generators of the process seeded.
 
@@ -85,6 +87,7 @@ def run_episode(
         prober: asks copies of it how little it would take for a crash.
         first_copy: sees at once whether there can be copies.
         brancher: has copies of it go on with other disturbances where somebody is near.
+        forcer: makes copies with a forced first onset, where the trial is a root.
 
     Returns:
         The result. Whatever agent or simulator raise is in it.
@@ -94,7 +97,7 @@ def run_episode(
     """
     began = time.monotonic()
     seed_everything(spec.seed)
-    asking = [one for one in (first_copy, prober, brancher) if one is not None]
+    asking = [one for one in (first_copy, prober, brancher, forcer) if one is not None]
     watching = [] if brancher is None else [brancher]
     try:
         with Episode(
@@ -109,6 +112,8 @@ def run_episode(
         ) as episode:
             result = episode.start()
             try:
+                if result is None and forcer is not None and forcer.is_due(episode):
+                    forcer.ask(episode)  # the first onset may begin in step 2, which an agent notices before step 1
                 while result is None:
                     if spec.reseeding is not None and episode.steps == spec.reseeding.after:
                         result = episode.reseed(spec.reseeding.seed)

@@ -56,6 +56,8 @@ class WorkerSettings:
             for never.
         branch: how often what disturbs copies that go on otherwise where somebody is near, ``NAME=RATE``
             each; empty for no such copies.
+        force: the rates of disturbances of copies with a forced first onset, ``NAME=RATE`` each; empty for no such
+            copies.
     """
 
     scenario: Scenario
@@ -73,6 +75,7 @@ class WorkerSettings:
     warm_copies: int = 0
     probe_s: float = 0.0
     branch: tuple[str, ...] = ()
+    force: tuple[str, ...] = ()
 
     def is_audited(self, result: TrialResult) -> bool:
         """Whether a trial belongs to the sample that is run again, which its number and the hunt's seed decide."""
@@ -110,6 +113,8 @@ class WorkerSettings:
             data["probe_s"] = self.probe_s
         if self.branch:
             data["branch"] = self.branch
+        if self.force:
+            data["force"] = self.force
         if requires:
             data["requires"] = requires
         return data
@@ -150,6 +155,7 @@ class WorkerSettings:
             warm_copies=data.get("warm_copies", 0),
             probe_s=data.get("probe_s", 0.0),
             branch=tuple(data.get("branch", ())),
+            force=tuple(data.get("force", ())),
         )
 
 

@@ -26,6 +26,7 @@ from crashhunt.episode import (
     BUDGET_BESIDE,
     Brancher,
     FirstCopy,
+    OnsetForcer,
     Parts,
     Prober,
     TakingOver,
@@ -92,7 +93,9 @@ class TrialProcess:
         self._shared: SharedState | None = None
         self._home = Path.cwd()
         self._notices: list[str] = []
-        self._asking: tuple[tuple[Prober | Brancher, str], ...] = ()  # copies of the trial, and what people call them
+        self._asking: tuple[
+            tuple[Prober | Brancher | OnsetForcer, str], ...
+        ] = ()  # copies of the trial, and what people call them
         # Line by line, so that what a dying process printed last is in the file.
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
         sys.stderr = io.TextIOWrapper(os.fdopen(2, "wb", 0, closefd=False), "utf-8", "replace", write_through=True)
@@ -170,7 +173,7 @@ class TrialProcess:
             # Writes down where every thread is, without needing the interpreter; then the supervisor ends the process.
             watchdog.arm(settings.timeout_s, self._stack)
             made = time.monotonic()
-            prober, brancher = self._copies()
+            prober, brancher, forcer = self._copies()
             result = run_episode(
                 spec,
                 simulator=simulator,
@@ -181,7 +184,8 @@ class TrialProcess:
                 reset=reset,
                 prober=prober,
                 brancher=brancher,
-                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and (prober or brancher) else None,
+                first_copy=FirstCopy(self._cannot_copy) if job["tries_copy"] and self._asking else None,
+                forcer=forcer,
             )
         except RecorderError:
             box.announce_no_room()
@@ -231,17 +235,20 @@ class TrialProcess:
             report["braking"] = said
         return report
 
-    def _copies(self) -> tuple[Prober | None, Brancher | None]:
-        settings, prober, brancher = self._settings, None, None
+    def _copies(self) -> tuple[Prober | None, Brancher | None, OnsetForcer | None]:
+        settings, prober, brancher, forcer = self._settings, None, None, None
         if settings.probe_s:
             budget = BUDGET_BESIDE if settings.branch else BUDGET
             prober = Prober(settings.probe_s, settings.crash_on, self._delay, budget, self._notices.append)
         if settings.branch:
             brancher = Brancher(settings.branch, settings.crash_on, self._delay, self._notices.append)
-        self._asking = tuple(
-            (asks, what) for asks, what in ((prober, "probes"), (brancher, "branches")) if asks is not None
-        )
-        return prober, brancher
+        if settings.force:
+            forcer = OnsetForcer(
+                settings.force, settings.crash_on, settings.timeout_s, self._delay, self._notices.append
+            )
+        every = ((prober, "probes"), (brancher, "branches"), (forcer, "rare"))
+        self._asking = tuple((asks, what) for asks, what in every if asks is not None)
+        return prober, brancher, forcer
 
     def _cannot_copy(self, why_not: str) -> None:
         for asks, what in self._asking:

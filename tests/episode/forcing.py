@@ -1,0 +1,88 @@
+"""Run by test_forced_onsets.py in a process that has one thread: roots with copies, and what becomes of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from branching import Place, Sleeps
+
+from crashhunt.agents import KeepLaneWithSpeed
+from crashhunt.base.processes import children_of
+from crashhunt.disturbances import disturber_of, first_forcing, parse_rates
+from crashhunt.episode import OnsetForcer, run_episode
+from crashhunt.oracles import Overlap, ReportedCollision
+from crashhunt.trial import CRASHES, Forcing, TrialSpec
+
+RATES = ("brake=0.05", "late_observation=0.05", "stop=0.05", "unseen=0.05")
+
+
+def run(place, forcer=None, agent=None, **more):
+    place.box.begin(pid=os.getpid(), trial=0, started=0.0)
+    spec = TrialSpec(0, place.seed, {}, place.given, place.steps, **more)
+    return run_episode(
+        spec, simulator=place.simulator, make_agent=lambda *_: agent or KeepLaneWithSpeed(place.speed), box=place.box,
+        oracles=[ReportedCollision(), Overlap()], forcer=forcer,
+    )  # fmt: skip
+
+
+def forcer_of(rates, waited=(), patience_s=30.0, tell=lambda _: None):
+    return OnsetForcer(rates, CRASHES, patience_s, list(waited).append, tell)
+
+
+def sampler_of(place, rates):
+    return disturber_of(parse_rates(rates), agents=("ego",), step_length_s=place.simulator.step_length_s)
+
+
+def roots(name, stage, speed, seed, steps, rates=RATES):
+    """What the copies of a root come to, and whether each that crashed does so from the start."""
+    place = Place(name, stage, speed, seed, steps)
+    sampler = sampler_of(place, rates)
+    first = first_forcing(sampler, steps)
+    early = tuple(one for one in sampler.draw(seed, 1) if one.step == 1)
+    plain, root = run(place, disturbances=early), run(place, forcer_of(rates), disturbances=early, forcing=first)
+    again = run(place, forcer_of(rates), disturbances=early, forcing=first)
+    starts = [run(place, disturbances=one.disturbances) for one in root.forced.copies if one.crash]
+    other = run(place, forcer_of(rates), forcing=replace(first, ratios={"stop=6.0": 4.0}))
+    return {
+        "same": plain.digest == root.digest,
+        "outcome": str(root.outcome),
+        "again": again.forced == root.forced,
+        "forced": root.forced.to_json(),
+        "starts": [[str(one.outcome), one.steps, one.disturbed] for one in starts],
+        "proposed": [[one.cell, one.weight] for one in other.forced.copies],
+        "spacing": first.spacing,
+        "other_steps": root.other_steps - (root.setup_steps or 0),
+        "left": len(children_of(os.getpid())),
+        "plain": run(place, forcer_of(rates)).forced,
+    }
+
+
+def lost(stage):
+    """What becomes of a root with copies that hang or die."""
+    place, found = Place("toy", stage, 9.5, 2, 60), {}
+    forcing = Forcing(0.1)
+    for name, how in {"hangs": lambda: time.sleep(600), "dies": lambda: os.kill(os.getpid(), 9)}.items():
+        result = run(place, forcer_of(RATES, patience_s=0.3), Sleeps(how), forcing=forcing)
+        found[name] = [
+            str(result.outcome), len(children_of(os.getpid())), result.is_fully_asked, result.is_to_be_run_again,
+            result.forced.to_json(),
+        ]  # fmt: skip
+    return found
+
+
+if __name__ == "__main__":
+    what, stage = sys.argv[1], Path(sys.argv[2])
+    asked = {
+        "lost": lambda: lost(stage),
+        "toy": lambda: roots("toy", stage, 9.5, 2, 120),
+        "loop": lambda: roots("loop", stage, 15.0, 7, 150),
+        "merge": lambda: roots("merge", stage, 15.0, 7, 150, ("cut_in=0.05", "late_merge=0.05", "speed=0.05")),
+    }
+    print(json.dumps(asked[what]()))
+    sys.stdout.flush()
+    os._exit(0)

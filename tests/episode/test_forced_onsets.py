@@ -1,0 +1,67 @@
+"""Copies with a forced first onset: that they crash from the start as they did, change nothing, and leave nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from crashhunt.executors import worker_environment
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux only")
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """Asks a process of one thread."""
+
+    def ask_it(what):
+        done = subprocess.run(
+            [sys.executable, Path(__file__).with_name("forcing.py"), what, tmp_path],
+            env={**os.environ, **worker_environment()}, capture_output=True, text=True, check=False, timeout=100,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    return ask_it
+
+
+NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in ("loop", "merge")]
+
+
+@pytest.mark.parametrize("scenario", ["toy", *NIGHTLY])
+def test_copies_of_a_root_crash_from_the_start_as_they_did_and_change_nothing(ask, scenario):
+    found = ask(scenario)
+    assert found["same"]
+    assert found["again"]
+    assert found["left"] == 0
+    assert found["plain"] is None  # a trial without a forcing is no root
+    forced = found["forced"]
+    assert forced["survival"] + math.fsum(forced["masses"].values()) == pytest.approx(1.0)
+    assert "unanswered" not in forced
+    crashes = [one for one in forced["copies"] if one["crash"]]
+    assert found["starts"] == [[one["crash"], one["step"], one["disturbed"]] for one in crashes]
+    steps = sum(one["step"] - one["branched"] for one in forced["copies"])
+    assert forced["steps"] == found["other_steps"] == steps
+    for one in forced["copies"]:
+        assert one["onset"] - one["branched"] == (2 if one["cell"].startswith("late_observation") else 1)
+        assert one["step"] == 150 - 30 * (scenario == "toy") or one["crash"]  # never to a horizon
+    if scenario != "merge":
+        assert crashes
+        weights = {weight for cell, weight in found["proposed"] if cell == "stop=6.0"}
+        assert weights == {found["spacing"] / 4}
+
+
+def test_root_with_a_copy_that_hangs_or_dies_is_incomplete(ask):
+    found = ask("lost")
+    outcome, left, asked, again, forced = found["hangs"]
+    assert (outcome, left, asked, again) == ("survived", 0, False, False)
+    assert (forced["why_unanswered"], forced["copies"]) == ("a copy took longer than 0.3 s", [])
+    outcome, left, asked, again, forced = found["dies"]
+    assert (outcome, left, asked, again) == ("survived", 0, False, True)  # a resumed hunt runs it again
+    assert forced["why_unanswered"] == "a copy was killed by SIGKILL"
