@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, ScenarioError, remedy
@@ -19,6 +19,7 @@ from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results
 from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
 from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.hunts._rare import Forcings, PrecisionRule, verify_rare
 from crashhunt.hunts._retention import keep_near_misses, prune_bundles
 from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
+    from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
 
 __all__ = ["Hunt", "HuntReport", "HuntStatus", "StoppedBecause"]
+
+T = TypeVar("T")
 
 _TICK_S = 0.1  # how late a stop, a heartbeat or the screen may be
 _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker waits for the hunt
@@ -142,7 +146,17 @@ class Hunt:
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
         again = self._unanswered.specs
-        trials = Trials(settings, sampler, ledger, finished, lag=lag, disturber=self._disturber, unanswered=again)
+        trials = Trials(
+            settings,
+            sampler,
+            ledger,
+            finished,
+            lag=lag,
+            disturber=self._disturber,
+            unanswered=again,
+            forcings=self._rare(ledger, Forcings),
+        )
+        self._precision = self._rare(ledger, PrecisionRule) if settings.run.until_error else None
         ledger.enter(
             "running",
             owner=ledger_owner(),
@@ -194,6 +208,7 @@ class Hunt:
             watch(self._status(progress, "auditing"))
             self._audits_left.finish(runs_again, progress)
         near, (probes, branches) = keep_near_misses(runs_again), verify_fork_results(copies)
+        rare = verify_rare(copies, differences=len(progress.audit.differences) if progress.audit else 0)
         watch(self._status(progress, "done"))
         self._restore_ledger(ledger, progress)
         invalid = progress.last_invalid if stopped == "no_valid_trial" else None
@@ -207,8 +222,14 @@ class Hunt:
             time.monotonic() - progress.began, tuple(crashes), reason, tuple(progress.notes), ledger.traffic_events(),
             progress.audit, progress.about_kinds()[0], near, probes,
             progress.kinds.at_fault if progress.kinds is not None else None, branches, progress.ended_by_copy,
-            unanswered,
+            unanswered, rare,
         )  # fmt: skip
+
+    def _rare(self, ledger: Ledger, make: Callable[[HuntSettings, Ledger, DisturbanceSampler], T]) -> T | None:
+        """Return a part of rare mode; None in any other hunt."""
+        if not self.settings.rare or self._disturber is None:
+            return None
+        return make(self.settings, ledger, self._disturber)
 
     def _hunt(
         self,
@@ -236,11 +257,14 @@ class Hunt:
         progress.until = time.monotonic() + run.duration_s
         try:
             while True:
-                stopping = progress.last_wanted is not None or progress.time_left_s <= 0
+                if self._precision is not None:
+                    self._precision.read(min(in_flight, default=trials.upcoming))
+                precise = self._precision is not None and self._precision.is_met
+                stopping = progress.last_wanted is not None or progress.time_left_s <= 0 or precise
                 for spec in [] if stopping else trials.take(_under_way(executor.capacity) - len(in_flight)):
                     executor.submit(spec)
                     in_flight.add(spec.number)
-                if not in_flight:
+                if not in_flight or precise:
                     break
                 with ledger.together():
                     for result in executor.completed(_TICK_S):
@@ -290,6 +314,8 @@ class Hunt:
             confirmation.close(progress)
         if self._stops:
             return "interrupted"
+        if self._precision is not None and self._precision.is_met:
+            return "precise"
         if sum(progress.outcomes.values()) == progress.outcomes[Outcome.INVALID] > 0:
             return "no_valid_trial"
         return "all_trials" if trials.exhausted else "time"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crashhunt.disturbances import FIRST_STEP
 from crashhunt.episode import WorkerSettings
 from crashhunt.ledger import Turn
 from crashhunt.plans import with_settings
@@ -20,11 +21,12 @@ if TYPE_CHECKING:
 
     from crashhunt.disturbances import DisturbanceSampler
     from crashhunt.hunts._progress import Progress
+    from crashhunt.hunts._rare import Forcings
     from crashhunt.ledger import Ledger
     from crashhunt.plans import HuntSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.snapshots import Snapshot
-    from crashhunt.trial import TrialResult, Value
+    from crashhunt.trial import Disturbance, Forcing, TrialResult, Value
 
 
 __all__ = ["LAG", "Trials", "Unanswered", "find_unanswered", "settings_again", "settings_of_workers", "spec_of"]
@@ -52,6 +54,7 @@ class Trials:
             resumed hunt proposes the same trials.
         lag: how many trials the hunt has under way at once; where it is deterministic, how many it may.
         disturber: what draws their disturbances; None where they have none.
+        forcings: the forcing of each trial, in rare mode; None in any other hunt.
 
     Raises:
         CrashhuntError: the sampler fails, or the ledger is damaged.
@@ -67,6 +70,7 @@ class Trials:
         lag: int,
         disturber: DisturbanceSampler | None = None,
         unanswered: Sequence[TrialSpec] = (),
+        forcings: Forcings | None = None,
     ) -> None:
         self._settings = settings
         self._sampler = sampler
@@ -76,6 +80,7 @@ class Trials:
         self._waiting = iter(number for number in range(settings.most_trials) if number not in finished)
         self._next = next(self._waiting, None)
         self._unanswered = deque(unanswered)
+        self._forcings = forcings
         self._running_again: set[int] = set()
         self._proposed: dict[int, TrialSpec] = {}  # by a run before this one, and not ended
         self._open: set[int] = set()
@@ -118,7 +123,12 @@ class Trials:
                 spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
                 turns.append(Turn(told, spec))
             elif spec is None:
-                spec = spec_of(self._next, self._settings, self._sampler, self._disturber)
+                forcing = None
+                if self._forcings is not None:
+                    if min(self._open, default=self._next) < self._forcings.needed(self._next):
+                        break
+                    forcing = self._forcings.of(self._next)
+                spec = spec_of(self._next, self._settings, self._sampler, self._disturber, forcing)
             found.append(spec)
             self._open.add(self._next)
             self._next = next(self._waiting, None)
@@ -170,12 +180,18 @@ class Trials:
 
 
 def spec_of(
-    number: int, settings: HuntSettings, sampler: NamedSampler, disturber: DisturbanceSampler | None = None
+    number: int,
+    settings: HuntSettings,
+    sampler: NamedSampler,
+    disturber: DisturbanceSampler | None = None,
+    forcing: Forcing | None = None,
 ) -> TrialSpec:
     """Return a trial as a sampler proposes it, with the disturbances that follow from its seed.
 
     Where the hunt has so many traffics and no more, trials have them in turns: the seed, and what an independent
     sampler draws for the scenario; what another one proposes for that stays.
+
+    With a forcing the trial is a root, in which nothing is drawn from the step on in which a first onset can be forced.
 
     Raises:
         CrashhuntError: the sampler fails.
@@ -204,8 +220,14 @@ def spec_of(
         max_steps=settings.max_steps,
         parent=proposal.parent,
         origin=proposal.origin,
-        disturbances=disturber.draw(seed, settings.max_steps) if disturber is not None else (),
+        disturbances=_drawn(disturber, seed, settings.max_steps, forcing) if disturber is not None else (),
+        forcing=forcing,
     )
+
+
+def _drawn(disturber: DisturbanceSampler, seed: int, steps: int, forcing: Forcing | None) -> tuple[Disturbance, ...]:
+    """Return the disturbances of a trial; of a root those of the steps before a first onset can be forced."""
+    return disturber.draw(seed, steps if forcing is None else min(steps, FIRST_STEP - 1))
 
 
 # What the workers of a hunt need to know.
@@ -225,6 +247,7 @@ def settings_of_workers(settings: HuntSettings, snapshot: Snapshot, scratch: Pat
         hunt_seed=settings.seed,
         probe_s=settings.probe_s,
         branch=tuple(settings.disturb) if settings.branch else (),
+        force=tuple(settings.disturb) if settings.rare else (),
     )
 
 

@@ -144,7 +144,7 @@ class Heard:
         """
         for note in executor.notes():
             what, left_out, why = note.partition(LEFT_OUT)
-            if left_out and what in ("probes", "branches") and not sum(self._outcomes.values()):
+            if left_out and what in ("probes", "branches", "rare") and not sum(self._outcomes.values()):
                 raise self._refusal(why)
             self._notes.append(note)
 
@@ -159,7 +159,11 @@ class Heard:
         return notes
 
     def _refusal(self, why: str) -> UsageError:
-        asked = (("--probe", self._settings.probe), ("--branch", self._settings.branch))
+        asked = (
+            ("--probe", self._settings.probe),
+            ("--branch", self._settings.branch),
+            ("--rare", self._settings.rare),
+        )
         flags = " and ".join(flag for flag, value in asked if value)
         agents = ", ".join(dict.fromkeys(chosen.agent for chosen in self._settings.agents.values()))
         fix = f"mend {agents}, or leave {flags} out"

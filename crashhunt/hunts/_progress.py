@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
     from crashhunt.hunts._fork_results import BranchReport, ProbeReport
+    from crashhunt.hunts._rare import RareReport
     from crashhunt.hunts._verification import AuditReport
     from crashhunt.ledger import Facts, KindData, Noted
     from crashhunt.plans import HuntSettings, RunSettings
@@ -445,7 +446,7 @@ class Progress:
 
 # What came of a hunt: what `Hunt.run` returns, and ``run --json`` prints.
 
-StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time"]
+StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time", "precise"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -473,6 +474,7 @@ class HuntReport:
         branches: what came of copies that went on with other disturbances; None where there were to be none.
         copied: what a copy found, where that ended the hunt: it came again from the start.
         unanswered: how many trials the same command runs again, as they or copies of them were killed from outside.
+        rare: what came of rare mode; None without it.
     """
 
     directory: Path
@@ -494,6 +496,7 @@ class HuntReport:
     branches: BranchReport | None = None
     copied: Bundle | None = None
     unanswered: int = 0
+    rare: RareReport | None = None
 
     def to_json(self) -> JsonObject:
         """Return the shape that ``run --json`` prints."""
@@ -514,6 +517,8 @@ class HuntReport:
         }
         if self.probes is not None:
             found["probes"] = self.probes.to_json()
+        if self.rare is not None:
+            found["rare"] = self.rare.to_json()
         if self.branches is not None:
             found["branches"] = self.branches.to_json()
         if self.kinds is not None:

@@ -56,7 +56,7 @@ __all__ = [
 
 # What has come of the copies of a hunt's trials so far, as its ledger sums it up.
 
-PROBES, BRANCHES = "probes", "branches"
+PROBES, BRANCHES, RARE = "probes", "branches", "rare"
 
 
 class ProbeSums(TypedDict):
@@ -117,7 +117,8 @@ class BranchSums(TypedDict):
 
 def copies_to_come(settings: HuntSettings) -> list[str] | None:
     """Return which copies a hunt has of its trials; None where it has none."""
-    return [name for name, wanted in ((PROBES, settings.probe), (BRANCHES, settings.branch)) if wanted] or None
+    every = ((PROBES, settings.probe), (BRANCHES, settings.branch), (RARE, settings.rare))
+    return [name for name, wanted in every if wanted] or None
 
 
 def sums_of_probes(ledger: Ledger, facts: Facts) -> ProbeSums | None:
@@ -174,7 +175,7 @@ HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "interrupted": "interrupted", "time": "finished", "error": "error", "queued": "queued",
+    "interrupted": "interrupted", "time": "finished", "precise": "finished", "error": "error", "queued": "queued",
 }  # fmt: skip
 
 

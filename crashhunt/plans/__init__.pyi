@@ -1,4 +1,4 @@
-from ._declaration import Given as Given, HuntOption as HuntOption, seconds_of as seconds_of
+from ._declaration import Given as Given, HuntOption as HuntOption, seconds_of as seconds_of, share_of as share_of
 from ._options import (
     Driver as Driver,
     HuntOptions as HuntOptions,

@@ -23,10 +23,12 @@ __all__ = [
     "at_least",
     "check_duration",
     "check_probe",
+    "check_share",
     "declared",
     "declared_options",
     "option",
     "seconds_of",
+    "share_of",
     "within",
 ]
 
@@ -235,6 +237,30 @@ def check_duration(text: str) -> str:
         seconds_of(text)
     except ValueError:
         return "give a time above 0, such as 90s, 30m, 2h or 1h30m"
+    return ""
+
+
+def share_of(text: str) -> float:
+    """Return the share that ``30%`` or ``0.3`` is.
+
+    >>> share_of("30%")
+    0.3
+
+    Raises:
+        ValueError: it is no share above 0 and up to 1.
+    """
+    found = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    if not 0 < found <= 1:
+        raise ValueError(f"{text!r} is no share")
+    return found
+
+
+def check_share(text: str) -> str:
+    """Return what to give instead of a text that is no share; empty where it is a share, or nothing."""
+    try:
+        share_of(text or "1")
+    except ValueError:
+        return "give a share above 0 and up to 1, such as 30% or 0.3"
     return ""
 
 

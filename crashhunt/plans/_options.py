@@ -23,6 +23,7 @@ from crashhunt.plans._declaration import (
     at_least,
     check_duration,
     check_probe,
+    check_share,
     declared,
     declared_options,
     option,
@@ -149,6 +150,12 @@ class TrialOptions(_Options):
         "some seconds before; needs --disturb",
         flag="--branch",
     )  # fmt: skip
+    rare: bool = option(
+        False, "whether to estimate how often rare crashes happen, by copies of trials with forced disturbances",
+        help="estimate how often rare crashes happen: trials run undisturbed, and copies of each begin with a first "
+        "disturbance, weighted by its probability; needs --disturb with rates and implies --keep-going",
+        flag="--rare",
+    )  # fmt: skip
     seeds: int = option(
         0, "how many traffics there are, each used for many arguments; 0: every trial has its own",
         help="draw so many traffics (a seed, and the scenario's arguments), and use each for many arguments of the "
@@ -186,6 +193,11 @@ class RunOptions(_Options):
         help="hunt for crashes that are the agent's own fault, as rules with names tell it; others, and those of which "
         "nobody can tell, are kept and do not end the hunt",
         flag="--only-at-fault",
+    )  # fmt: skip
+    until_error: str = option(
+        "", "with ``rare``, end once half of the width of the interval is at most this share of the estimate: ``0.3``",
+        help="with --rare: end once half of the width of the interval is at most this share of the estimate, such as "
+        "0.3", unset="all trials", flag="--until-error", metavar="SHARE", check=check_share,
     )  # fmt: skip
     deterministic: bool = option(
         False, "at a crash, let running trials of lower numbers finish: the same seed gives the same crash",

@@ -306,9 +306,11 @@ def _planned(request: Request, scenario: Scenario) -> tuple[Scenario, HuntSettin
     with _said_by(request, scenario):
         disturber(scenario, settings.disturb, tuple(settings.agents))  # it refuses what cannot be meant
     _check_branch(settings)
+    _check_rare(settings, scenario)
     sampler_of(settings)  # it refuses what it cannot sample
     # Last, as looking for the executor imports what runs trials: what is refused is refused sooner.
-    return scenario, replace(settings, run=sized(settings.run))
+    run = replace(settings.run, keep_going=True) if settings.rare else settings.run
+    return scenario, replace(settings, run=sized(run))
 
 
 def _noted(scenario: Scenario, run: RunSettings) -> Scenario:
@@ -431,6 +433,43 @@ def _check_branch(settings: HuntSettings) -> None:
         raise UsageError("--branch has copies of trials go on with other disturbances, and there are none", fix=fix)
     if settings.branch and sys.platform != "linux":
         raise UsageError("--branch: processes are copied on Linux only", fix="leave it out")
+
+
+_MAX_RARE_CHANCE = 0.2  # per step: above that a first onset is no rare event, and plain trials are cheaper
+
+
+def _check_rare(settings: HuntSettings, scenario: Scenario) -> None:
+    """Refuse what `--rare` has no law for."""
+    run = settings.run
+    if not settings.rare:
+        if run.until_error:
+            raise UsageError(f"--until-error {run.until_error} is for --rare", fix="add --rare")
+        return
+    if not parse_rates(settings.disturb):
+        fix = "say how often what happens, such as --disturb brake=0.02,cut_in=0.02"
+        raise UsageError("--rare needs disturbances with rates, and there are none", fix=fix)
+    agents = tuple(settings.agents)
+    if fixed := parse_fixed(settings.disturb, agents):
+        message = f"--rare: --disturb {word_of(fixed[0], agents)} begins in every trial"
+        raise UsageError(message, fix="give rates only")
+    if not sampler_of(settings).independent:
+        message = f"--rare: the sampler {settings.sampler} does not draw trials independently"
+        raise UsageError(message, fix="use --sampler random")
+    excluded = {
+        "--seeds": settings.seeds, "--probe": settings.probe, "--branch": settings.branch, "--distinct": run.distinct,
+        "--only-at-fault": run.only_at_fault,
+    }  # fmt: skip
+    if given := next((flag for flag, value in excluded.items() if value), None):
+        raise UsageError(f"--rare and {given} exclude each other", fix=f"omit {given}")
+    sampler = disturber(scenario, settings.disturb, agents)
+    assert sampler is not None
+    for name, rate in sampler.rates.items():
+        if sampler.chance(name) > _MAX_RARE_CHANCE:
+            most = _MAX_RARE_CHANCE / sampler.step_length_s
+            message = f"--rare: --disturb {name}={rate:g} has a chance of {sampler.chance(name):.2g} per step"
+            raise UsageError(message, fix=f"give at most {most:g} a second, or omit --rare")
+    if sys.platform != "linux":
+        raise UsageError("--rare: processes are copied on Linux only", fix="omit it")
 
 
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:

@@ -119,6 +119,7 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     lines += _describe_events(report)
     lines += describe_probes(report)
     lines += describe_branches(report)
+    lines += report.rare.lines if report.rare is not None else []
     lines += describe_disturbances(report.crashes)
     if report.at_fault is not None and report.crashes:
         all_of_them = len(report.crashes)
