@@ -23,7 +23,7 @@ Cost: one pass over the roots.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -207,7 +207,7 @@ def root_of(result: TrialResult, crash_on: Sequence[Outcome], hazard: float) -> 
     crashed = result.outcome in crash_on
     own = forced.survival if crashed else 0.0
     undisturbed, disturbed = (0.0, own) if result.disturbed else (own, 0.0)
-    by: Counter[str] = Counter()
+    by: defaultdict[str, float] = defaultdict(float)
     for copy in forced.copies:
         if copy.crash and copy.disturbed:
             disturbed += copy.weight
@@ -275,7 +275,7 @@ def rare_estimate(
     """
     values = [root.value for root in roots]
     count = len(roots)
-    parts: Counter[str] = Counter()
+    parts: defaultdict[str, float] = defaultdict(float)
     for root in roots:
         for cell, weight in root.by.items():
             parts[cell] += weight / count
