@@ -153,6 +153,7 @@ def make_parser() -> argparse.ArgumentParser:
         "crashhunt", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"crashhunt {__version__}")
+    parser.set_defaults(parser=parser)  # `guide` describes all of it
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add in (
         add_run, add_replay, add_show, add_report, add_export, add_suite, add_status, add_logs, add_rerun, add_trials,

@@ -93,7 +93,7 @@ def bisect(
     }
     tried: dict[str, Got] = {}
     token = f"crashhunt-{this_process().token}"  # git gives the name of the work tree to what it writes about it
-    known = Path(top, _git(top, "rev-parse", "--git-common-dir"), "worktrees", token)
+    known = Path(actor=top, first=_git(top, "rev-parse", "--git-common-dir"), states="worktrees", lanes=token)
     with temporary_folder("bisect") as scratch, temporary_beside(known, name=token):
         tree, case = scratch.resolve() / token, add_case(bundle, scratch / "corpus").case.path.resolve()
         _git(top, "worktree", "add", "--detach", "--quiet", str(tree), ends[1])
@@ -117,8 +117,18 @@ def bisect(
                 told.add(head)
                 said = _git(tree, "bisect", _WORDS[tried[head] if head in tried else run()], skipped=True)
             if found is not None:
-                return Bisected(found[1], _git(tree, "log", "-1", "--format=%s", found[1]), (), tried)
-            return Bisected("", "", tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)), tried)
+                return Bisected(
+                    commit=found[1],
+                    subject=_git(tree, "log", "-1", "--format=%s", found[1]),
+                    candidates=(),
+                    tried=tried,
+                )
+            return Bisected(
+                commit="",
+                subject="",
+                candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
+                tried=tried,
+            )
         finally:
             _git(top, "worktree", "remove", "--force", str(tree), skipped=True)
 

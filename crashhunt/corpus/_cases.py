@@ -142,7 +142,7 @@ def read_case(path: Path) -> Case:
     except OSError as error:
         raise BundleError(f"cannot be read: {error.strerror}", fix="see to the file", where=str(file)) from None
     said = validate(_File, known_part(_File, data)[0], where=str(file), error=BundleError)
-    return Case(path, said.expect, said.note, said.crash, said.signature)
+    return Case(path=path, expect=said.expect, note=said.note, crash=said.crash, signature=said.signature)
 
 
 def find_cases(places: list[Path]) -> list[Path]:
@@ -211,7 +211,13 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
         corpus.mkdir(parents=True, exist_ok=True)
         remove_ended(corpus)
         if not final.exists():
-            case = Case(final, expect or "still", note or "", bundle.result.summary, dict(_signature(bundle)))
+            case = Case(
+                path=final,
+                expect=expect or "still",
+                note=note or "",
+                crash=bundle.result.summary,
+                signature=dict(_signature(bundle)),
+            )
             with temporary_beside(final) as building:
                 _build(bundle, case, building)
                 try:

@@ -208,10 +208,26 @@ class _Running:
             result = next(iter(self._executor.completed(_LOOK_EVERY_S)), None)
             return None if result is None else self._report(result, keep)
         except BundleError as error:  # a process that died before it had recorded anything
-            return CaseReport(case.path, case.expect, "cannot_run", case.crash, str(error), case.note, self._warnings)
+            return CaseReport(
+                path=case.path,
+                expected=case.expect,
+                got="cannot_run",
+                was=case.crash,
+                now=str(error),
+                note=case.note,
+                warnings=self._warnings,
+            )
         except CrashhuntError as error:
             why = f"{error.message} ({error.fix})" if error.fix else error.message
-            return CaseReport(case.path, case.expect, "cannot_run", case.crash, why, case.note, self._warnings)
+            return CaseReport(
+                path=case.path,
+                expected=case.expect,
+                got="cannot_run",
+                was=case.crash,
+                now=why,
+                note=case.note,
+                warnings=self._warnings,
+            )
 
     def close(self) -> None:
         """End it, and leave nothing behind; may be called twice."""
@@ -228,7 +244,15 @@ class _Running:
             )
             now = signature_of(kept).to_json()
             got = "still" if all(now.get(name, value) == value for name, value in case.signature.items()) else "changed"
-        found = CaseReport(case.path, case.expect, got, case.crash, result.summary, case.note, self._warnings)
+        found = CaseReport(
+            path=case.path,
+            expected=case.expect,
+            got=got,
+            was=case.crash,
+            now=result.summary,
+            note=case.note,
+            warnings=self._warnings,
+        )
         return replace(found, kept=kept.path if kept is not None and keep is not None else None)
 
     def _keep(self, result: TrialResult, directory: Path, *, whole: bool) -> Bundle:
@@ -257,7 +281,7 @@ def _begin(path: Path, stack: ExitStack) -> _Running | CaseReport:
         snapshot = _whole(Snapshot(path / layout.SNAPSHOTS / bundle.snapshot))
         running = _Running(case, bundle, read_settings(path / layout.HUNT), snapshot)
     except CrashhuntError as error:
-        return CaseReport(path, expected, "cannot_run", was, str(error), note)
+        return CaseReport(path=path, expected=expected, got="cannot_run", was=was, now=str(error), note=note)
     stack.callback(running.close)
     return running
 

@@ -21,8 +21,8 @@ from crashhunt.base.files import whole_file
 from crashhunt.base.integrity import FILES, parse_object, typed
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.base.watching import watched
-from crashhunt.crashes._bundle import ArchiveIndex
-from crashhunt.crashes._trust import is_bundle_made_here, is_made_here, signature
+from crashhunt.crashes._bundle import ArchiveIndex, is_bundle_made_here
+from crashhunt.crashes._trust import is_made_here, signature
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -124,10 +124,10 @@ def open_archive(path: Path) -> Iterator[Archive]:
             name = "" if isinstance(error, zipfile.BadZipFile) else f"{type(error).__name__}: "
             raise _refusal(path, f"not an undamaged zip file: {name}{' '.join(str(error).split())}") from None
         yield Archive(
-            directory,
-            str(index.get("made_by", "?")),
-            str(index.get("made_at", "?")),
-            is_made_here(index),
+            directory=directory,
+            made_by=str(index.get("made_by", "?")),
+            made_at=str(index.get("made_at", "?")),
+            made_here=is_made_here(index),
         )
 
 

@@ -10,15 +10,23 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
-from crashhunt.base.errors import BundleError
+from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
-from crashhunt.base.integrity import FILES, changed_file, describe_files, digest_of_data, read_object, typed
+from crashhunt.base.integrity import (
+    FILES,
+    authentication_code,
+    changed_file,
+    describe_files,
+    digest_of_data,
+    is_authentic,
+    read_object,
+    typed,
+)
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.base.text import listed, near_path, one_of
 from crashhunt.base.tolerance import known_part, merged, typed_where_there
-from crashhunt.crashes._trust import authenticate_bundle
 from crashhunt.recording import Recording, read_black_box
-from crashhunt.snapshots import versions
+from crashhunt.snapshots import Snapshot, versions
 from crashhunt.trial import (
     Collision,
     Disturbance,
@@ -50,16 +58,19 @@ __all__ = [
     "CrashData",
     "CrashSummary",
     "Protected",
+    "authenticate_bundle",
     "collect_output",
     "crash_folders",
     "files_beside",
     "files_of",
     "find_bundle",
+    "is_bundle_made_here",
     "list_bundles",
     "list_near_misses",
     "read_bundle",
     "read_params",
     "refuse_damaged",
+    "snapshot_of",
     "write_bundle",
     "write_trial",
 ]
@@ -450,10 +461,10 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     if not re.fullmatch(r"\w+", data["snapshot"]):
         raise ValueError(f"snapshot {data['snapshot']!r} is no name of one")
     spec = TrialSpec(
-        data["trial"],
-        data["seed"],
-        data.get("arguments", {}),
-        data.get("scenario_arguments", {}),
+        number=data["trial"],
+        seed=data["seed"],
+        arguments=data.get("arguments", {}),
+        scenario_arguments=data.get("scenario_arguments", {}),
         max_steps=data["max_steps"],
         disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
         only=tuple(only) if (only := data.get("only")) is not None else None,
@@ -478,13 +489,13 @@ def _bundle(path: Path, data: CrashData) -> Bundle:
     )
     files = data.get("files", {}) if data["schema"] >= _PROTECTED else {}
     return Bundle(
-        path,
-        result,
-        data.get("hunt_seed", 0),
-        data["snapshot"],
-        data.get("confirmed"),
-        data.get("divergence"),
-        files,
+        path=path,
+        result=result,
+        hunt_seed=data.get("hunt_seed", 0),
+        snapshot=data["snapshot"],
+        confirmed=data.get("confirmed"),
+        divergence=data.get("divergence"),
+        files=files,
         added=_added(data),
         why_unconfirmed=data.get("why_unconfirmed", ""),
         authentication_code=data.get("authentication_code", ""),
@@ -499,6 +510,54 @@ def _added(data: CrashData) -> dict[str, object]:
         if rest:
             added[name] = rest
     return added
+
+
+# Who made a bundle: an authentication code shows that this user made it on this machine.
+
+_PURPOSE = "crash bundle"
+
+
+def snapshot_of(bundle: Bundle) -> Snapshot:
+    """Return the snapshot of the code that a bundle ran."""
+    return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
+
+
+def authenticate_bundle(bundle: Bundle) -> str:
+    """Return the authentication code of a bundle that this process makes; empty where its code is not of this user.
+
+    Without that condition, a crash that was minimized or confirmed in a stranger's hunt would pass for one made here.
+    """
+    try:
+        made_here = snapshot_of(bundle).is_made_here
+    except CrashhuntError:  # there is none, as of a candidate of a minimization
+        return ""
+    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
+
+
+def is_bundle_made_here(bundle: Bundle) -> bool:
+    """Return whether this user made a bundle and its snapshot on this machine; files of the snapshot are not read.
+
+    Raises:
+        BundleError: the manifest of the snapshot is missing or damaged.
+    """
+    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
+
+
+def _statement(bundle: Bundle) -> dict[str, object]:
+    """Everything of a bundle that determines what runs, and the digest of what was recorded."""
+    spec = bundle.result.spec.to_json()
+    return {
+        "number": spec["number"],
+        "seed": spec["seed"],
+        "max_steps": spec["max_steps"],
+        "arguments": spec["arguments"],
+        "scenario_arguments": spec["scenario_arguments"],
+        "disturbances": spec.get("disturbances") or [],
+        "only": spec.get("only"),
+        "script": spec.get("script"),
+        "digest": bundle.result.digest,
+        "snapshot": bundle.snapshot,
+    }
 
 
 def write_bundle(
@@ -541,7 +600,14 @@ def write_bundle(
         write_log(building / layout.LOG, recording, lanes=lanes, metadata=metadata, crash=crash)
         (building / layout.FOXGLOVE_LAYOUT).write_text(view, encoding="utf-8")
         collect_output(result, scratch, building)
-        bundle = Bundle(final, result, hunt_seed, snapshot, confirmed, files=files_beside(building))
+        bundle = Bundle(
+            path=final,
+            result=result,
+            hunt_seed=hunt_seed,
+            snapshot=snapshot,
+            confirmed=confirmed,
+            files=files_beside(building),
+        )
         if authenticate:
             bundle = replace(bundle, authentication_code=authenticate_bundle(bundle))
         bundle.write(into=building)

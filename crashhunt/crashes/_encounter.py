@@ -376,14 +376,14 @@ def danger_course(recording: Recording, agent: str) -> DangerCourse | None:
     known[there] = True
     unsure = np.arange(len(steps)) > there[-1] - _UNKNOWN_S / dt
     return DangerCourse(
-        agent,
-        steps,
-        np.where(known & ((own > 0) | ~unsure), own, np.nan),
-        np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
-        greatest._replace(step=steps[greatest.step]),
-        greatest_behind._replace(step=steps[greatest_behind.step]),
-        meter.danger or 0.0,
-        behind_total,
+        agent=agent,
+        steps=steps,
+        own=np.where(known & ((own > 0) | ~unsure), own, np.nan),
+        behind=np.where(known & ((behind > 0) | ~unsure), behind, np.nan),
+        greatest=greatest._replace(step=steps[greatest.step]),
+        greatest_behind=greatest_behind._replace(step=steps[greatest_behind.step]),
+        own_total=meter.danger or 0.0,
+        behind_total=behind_total,
     )
 
 

@@ -62,7 +62,7 @@ def find_escape(
     hit = result.collision
     if result.outcome is not Outcome.COLLISION or hit is None or hit.role != "collider":
         return None
-    search = _Search(result, recording, braking, run)
+    search = _Search(result=result, recording=recording, braking=braking, run=run)
     found = search.last()
     if found is None:
         return None

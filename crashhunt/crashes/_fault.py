@@ -96,14 +96,21 @@ def _red_light(case: Case) -> Finding | None:
     if not ran:
         return None
     blames = "both" if len(ran) == 2 else _who(case, *ran)
-    return Finding("red light", blames, ", and ".join(ran.values()), "Vienna, article 23; StVO § 37")
+    return Finding(
+        rule="red light", blames=blames, words=", and ".join(ran.values()), source="Vienna, article 23; StVO § 37"
+    )
 
 
 def _wrong_way(case: Case) -> Finding | None:
     """Who drove against the direction of its lane."""
     for time_s, event in reversed(case.events):
         if event.kind == "wrong_way" and event.agent in (case.agent, case.other) and case.time_s - time_s <= _RED_S:
-            return Finding("wrong way", _who(case, event.agent), event.what, "Vienna, article 10; StVO § 2")
+            return Finding(
+                rule="wrong way",
+                blames=_who(case, event.agent),
+                words=event.what,
+                source="Vienna, article 10; StVO § 2",
+            )
     return None
 
 
@@ -119,7 +126,7 @@ def _lane_change(case: Case) -> Finding | None:
         at_once = abs(times[0] - times[1]) <= _TOGETHER_S
         if case.follower or not at_once or not all(case.meets_sideways(actor) for actor in changers):
             return None  # the one may have been there when the other came
-        return Finding("lane change", "both", "both moved sideways into each other", source)
+        return Finding(rule="lane change", blames="both", words="both moved sideways into each other", source=source)
     if len(changers) != 1:
         return None
     changer = changers[0]
@@ -131,14 +138,14 @@ def _lane_change(case: Case) -> Finding | None:
         if not case.meets_sideways(changer):
             return None
         words = f"{changer} moved sideways into {other}, which was beside it and stayed in its lane"
-        return Finding("lane change", _who(case, changer), words, source)
+        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     if case.follower == changer:
         if case.hardest_braking(other) > _IMPOSSIBLE or case.way(other).speeds[-1] < -_STANDS:
             return None
         if case.turn >= _MERGES or not case.was_beside(changer, int(np.argmin(np.abs(case.times - before)))):
             return None  # it turned off, or was behind all the time: that leaves a lane sideways, too
         words = f"{changer} changed lanes {before:.1f} s before, to behind {other}, and drove into it"
-        return Finding("lane change", _who(case, changer), words, source)
+        return Finding(rule="lane change", blames=_who(case, changer), words=words, source=source)
     return _cut_in(case, changer, before, source)
 
 
@@ -155,7 +162,12 @@ def _cut_in(case: Case, changer: str, before: float, source: str) -> Finding | N
         return None
     if before > _AT_ONCE_S and case.slowed(other, before - _RESPONSE_S) < _BRAKES:
         return None  # who drove behind had the time, and did not use it
-    return Finding("lane change", _who(case, changer), f"{words}; {safe:.1f} m would have been safe (RSS)", source)
+    return Finding(
+        rule="lane change",
+        blames=_who(case, changer),
+        words=f"{words}; {safe:.1f} m would have been safe (RSS)",
+        source=source,
+    )
 
 
 def _rear_end(case: Case) -> Finding | None:
@@ -174,7 +186,12 @@ def _rear_end(case: Case) -> Finding | None:
     gap, safe = max(0.0, case.gap_m(leader, back)), safe_gap_m(float(follow.speeds[back]), float(lead.speeds[back]))
     words = f"{follower} drove into the back of {leader}, which had been ahead of it for at least {_FOLLOWS_S:g} s"
     words += f"; {case.times[back]:.1f} s before, the gap was {gap:.1f} m, and {safe:.1f} m is safe (RSS)"
-    return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1")
+    return Finding(
+        rule="rear end",
+        blames=_who(case, follower),
+        words=words,
+        source="Vienna, article 13 (5); StVO § 4 (1); RSS, definition 1",
+    )
 
 
 def _turns_off(case: Case) -> Finding | None:
@@ -193,7 +210,9 @@ def _turns_off(case: Case) -> Finding | None:
             continue
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {left_s:.1f} s before"
         words += " and was turning off"
-        return Finding("rear end", _who(case, follower), words, "Vienna, article 13 (5); StVO § 4 (1)")
+        return Finding(
+            rule="rear end", blames=_who(case, follower), words=words, source="Vienna, article 13 (5); StVO § 4 (1)"
+        )
     return None
 
 
@@ -213,7 +232,9 @@ def _steps_out(case: Case) -> Finding | None:
         return None
     words = f"{person} came onto the road {case.times[inside]:.1f} s before, {max(0.0, gap):.1f} m ahead of {driver}"
     words += f", which needs {stops:.1f} m to stop"
-    return Finding("steps out", _who(case, person), words, "Vienna, article 20 (6); StVO § 25 (3)")
+    return Finding(
+        rule="steps out", blames=_who(case, person), words=words, source="Vienna, article 20 (6); StVO § 25 (3)"
+    )
 
 
 def _standing(case: Case) -> Finding | None:
@@ -226,7 +247,9 @@ def _standing(case: Case) -> Finding | None:
         stood = case.times[0] if bool((own.speeds < _STANDS).all()) else 0.0
         if stood >= needs and bool((its.speeds > _STANDS).all()) and not is_person(mover):
             words = f"{mover} drove into {actor}, which had stood for at least {stood:.1f} s"
-            return Finding("standing", _who(case, mover), words, "Vienna, article 13 (1); StVO § 3 (1)")
+            return Finding(
+                rule="standing", blames=_who(case, mover), words=words, source="Vienna, article 13 (1); StVO § 3 (1)"
+            )
     return None
 
 
@@ -253,7 +276,12 @@ def _right_of_way(case: Case) -> Finding | None:
     if case.was_in_junction(yields, _CLEARS_S) and case.speed_mps(goes, _CLEARS_S) < _WALKS:
         return None  # who starts off while somebody is in the junction has to let it out
     words = f"{yields} had to give way to {goes} at the junction {links[0].junction}"
-    return Finding("right of way", _who(case, yields), words, "the map of the scenario; Vienna, article 18; StVO § 8")
+    return Finding(
+        rule="right of way",
+        blames=_who(case, yields),
+        words=words,
+        source="the map of the scenario; Vienna, article 18; StVO § 8",
+    )
 
 
 RULES: tuple[Callable[[Case], Finding | None], ...] = (
@@ -311,10 +339,15 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
     hit = result.collision
     if result.outcome is Outcome.AGENT_ERROR:
         words = "the code of the agent failed"
-        return Fault("ego", (Finding("agent error", "ego", words, "whoever drives answers for it"),))
+        return Fault(
+            "ego", (Finding(rule="agent error", blames="ego", words=words, source="whoever drives answers for it"),)
+        )
     if result.outcome is Outcome.OFF_ROAD and hit is not None and not hit.other:
         words = "it left the road, and nobody touched it"
-        return Fault("ego", (Finding("off the road", "ego", words, "Vienna, article 13 (1); StVO § 3 (1)"),))
+        return Fault(
+            "ego",
+            (Finding(rule="off the road", blames="ego", words=words, source="Vienna, article 13 (1); StVO § 3 (1)"),),
+        )
     if result.outcome is not Outcome.COLLISION or hit is None or not hit.other:
         return Fault("nobody can tell")
     from crashhunt.recording import read_lanes  # MCAP takes longer than a list of software faults

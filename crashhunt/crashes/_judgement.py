@@ -141,12 +141,12 @@ def why_from(data: Any) -> Why | None:
         return None
     factors = [
         Factor(
-            str(each["kind"]), str(each["name"]), str(each["what"]), each["step"], each["was"],
-            tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
+            kind=str(each["kind"]), name=str(each["name"]), what=str(each["what"]), step=each["step"], was=each["was"],
+            runs=tuple(LeftOut(run["given"], run["ending"], str(run["into"])) for run in each["runs"]),
         )
         for each in data["factors"]
     ]  # fmt: skip
-    return Why(tuple(factors), int(data["steps"]), int(data["left"]), str(data["why_not"]))
+    return Why(factors=tuple(factors), steps=int(data["steps"]), left=int(data["left"]), why_not=str(data["why_not"]))
 
 
 def wilson(found: int, of: int) -> tuple[float, float]:
@@ -307,10 +307,22 @@ def judgement_of(bundle: Bundle) -> Judgement | None:
         for each in data["attempts"]:
             typed(each, {"manoeuvre": str, "endings": dict[str, str], "deceleration": float | None})
             endings: dict[int, Ending] = {int(step): ending for step, ending in each["endings"].items()}
-            attempts.append(Attempt(each["manoeuvre"], bundle.result.steps, endings, each["deceleration"]))
+            attempts.append(
+                Attempt(
+                    manoeuvre=each["manoeuvre"],
+                    end=bundle.result.steps,
+                    endings=endings,
+                    deceleration=each["deceleration"],
+                )
+            )
         visible = data.get("visible_step")
         seen = int(visible) if visible is not None else None
-        return Judgement(tuple(attempts), str(data.get("why_not", "")), why_from(data.get("why")), seen)
+        return Judgement(
+            attempts=tuple(attempts),
+            why_not=str(data.get("why_not", "")),
+            why=why_from(data.get("why")),
+            visible_step=seen,
+        )
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 

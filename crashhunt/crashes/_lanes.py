@@ -121,12 +121,12 @@ class Case:
         scene, row = rows[-1]
         known = scene.roster.actors[row]
         return Way(
-            actor,
-            np.array([scene.points[row] for scene, row in rows]),
-            np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
-            np.array([scene.speeds[row] for scene, row in rows]),
-            known.length,
-            known.width,
+            id=actor,
+            points=np.array([scene.points[row] for scene, row in rows]),
+            headings=np.unwrap(np.array([scene.headings[row] for scene, row in rows])),
+            speeds=np.array([scene.speeds[row] for scene, row in rows]),
+            length=known.length,
+            width=known.width,
         )
 
     def partner(self, actor: str) -> str:
@@ -361,7 +361,12 @@ class _Lane:
         aside = float(dx * offset[nearest, 1] - dy * offset[nearest, 0])
         driven = float(self._starts[nearest] + along[nearest])
         inside = _END_M < driven < self._starts[-1] - _END_M
-        return _Place(math.copysign(float(away[nearest]), aside), driven, math.atan2(dy, dx), inside)
+        return _Place(
+            aside_m=math.copysign(float(away[nearest]), aside),
+            along_m=driven,
+            heading=math.atan2(dy, dx),
+            inside=inside,
+        )
 
 
 class LaneMap:

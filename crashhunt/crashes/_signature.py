@@ -164,7 +164,7 @@ def _of_a_collision(
             lanes.reaches_over(scenes, actor) or lanes.reaches_over(late, actor) for actor in (hit.agent, hit.other)
         ]
     lane_change = "both" if all(changes) else "agent" if changes[0] else "other" if changes[1] else ""
-    return Signature(outcome, hit.role, manner, lane_change, place)
+    return Signature(outcome=outcome, role=hit.role, manner=manner, lane_change=lane_change, place=place)
 
 
 def _manner(recording: Recording, hit: Collision) -> str:

@@ -90,7 +90,14 @@ class Episodes:
         given = {**self._arguments, **arguments}
         disturbances = self._disturber.draw(seed, self._max_steps) if self._disturber is not None else ()
         # Whoever steps the environment decides how long an episode is.
-        spec = TrialSpec(0, seed, {}, given, max_steps=sys.maxsize, disturbances=disturbances)
+        spec = TrialSpec(
+            number=0,
+            seed=seed,
+            arguments={},
+            scenario_arguments=given,
+            max_steps=sys.maxsize,
+            disturbances=disturbances,
+        )
         self._episode = Episode(spec, simulator=self._simulator, make_agent=_make_agent, observers=(self._trail,))
         self._episode.start()
         _raise_error(self._episode)

@@ -314,7 +314,13 @@ class Brancher(Observer):
             return None
         there = cast("list[JsonObject]", answer["there"])
         likely = cast("float | None", answer["log_likelihood"])
-        return _Crashed(tuple(map(Disturbance.from_json, there)), sleeper.step, outcome, step, likely)
+        return _Crashed(
+            took_place=tuple(map(Disturbance.from_json, there)),
+            branched=sleeper.step,
+            outcome=outcome,
+            step=step,
+            log_likelihood=likely,
+        )
 
     def _usable(self, episode: Episode, sleeper: _Sleeper) -> SuspendedFork:
         """Return the copy of a step that is asleep; one that was killed is replaced while the trial is at that step."""
@@ -330,7 +336,13 @@ class Brancher(Observer):
         """Take a crash in, as a specification from the start."""
         begun = [one for one in episode.spec.disturbances if one.step <= found.branched + _BEGINS - 1]
         planned = in_turn([*begun, *found.took_place])
-        branch = Branch(planned, found.branched, found.outcome, found.step, found.log_likelihood)
+        branch = Branch(
+            disturbances=planned,
+            branched=found.branched,
+            outcome=found.outcome,
+            step=found.step,
+            log_likelihood=found.log_likelihood,
+        )
         self._branches = replace(self._branches, crashes=(*self._branches.crashes, branch))
 
     def _go_on(self, copy: Episode, job: Plain) -> Plain:

@@ -168,7 +168,7 @@ class DisturbanceInjector:
         if errs is None:
             self._tell(replace(planned, vehicle=""))
             return
-        self._going.append(_Going(last, vehicle, planned.what, errs))
+        self._going.append(_Going(last=last, vehicle=vehicle, what=planned.what, errs=errs))
         self._tell(planned.took_place(vehicle, errs.how_strong, self._dt))
 
     def _whom(self, planned: Disturbance) -> str:

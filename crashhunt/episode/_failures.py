@@ -74,7 +74,12 @@ def failure_of(error: BaseException, agent: str, *, cause: str = "") -> Failure:
         message = f"{message} ({limit})" if message else limit
     if not cause and is_emptied():
         cause = "somebody has emptied sys.modules"
-    return Failure(kind, f"{cause}, upon which this fails: {message}" if cause else message, text, agent)
+    return Failure(
+        kind=kind,
+        message=f"{cause}, upon which this fails: {message}" if cause else message,
+        traceback=text,
+        agent=agent,
+    )
 
 
 @contextmanager
@@ -177,7 +182,15 @@ def record_originals() -> None:
             if isinstance(value, type) and value.__module__ == name and value not in classes:
                 classes[value] = {key: one for key, one in vars(value).items() if callable(one)}
     limits = {name: resource.getrlimit(number)[0] for name, number in _LIMITS.items()}
-    _originals[:] = [_Originals(packages, functions, classes, sys.getrecursionlimit(), limits)]
+    _originals[:] = [
+        _Originals(
+            packages=packages,
+            functions=functions,
+            classes=classes,
+            recursion_limit=sys.getrecursionlimit(),
+            limits=limits,
+        )
+    ]
 
 
 def _packages_of_simulators() -> frozenset[str]:

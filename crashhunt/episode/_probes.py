@@ -88,24 +88,24 @@ class Probed:
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
         long = share * self.how_long if self.grade == "length" else self.how_long
         strong, long = round(strong, _DIGITS), round(long, _DIGITS)  # of 3 steps of 0.1 s, 0.3 s
-        return Disturbance(step, who, self.what, strong, long, agent)
+        return Disturbance(step=step, who=who, what=self.what, how_strong=strong, how_long=long, agent=agent)
 
 
 _ANY_SIDE = ("left ahead", "right ahead", "left", "right")
 
 PROBED: Final = (
-    Probed("brake", ("ahead",), 6.0, 3.0),
-    Probed("stop", ("ahead",), 6.0, 8.0),
-    Probed("late_action", ("itself",), 1.0, 3.0),
-    Probed("late_observation", ("itself",), 1.0, 3.0),
-    Probed("noisy_observation", ("itself",), 0.2, 3.0),
-    Probed("cut_in", _ANY_SIDE, 0.0, 4.0, grade="whether"),
-    Probed("unseen", ("ahead", *_ANY_SIDE), 1.0, 4.0, grade="length"),
-    Probed("ignore_priority", _ANY_SIDE, 1.0, 5.0, grade="length"),
-    Probed("late_merge", _ANY_SIDE, 5.0, 10.0, least=50.0),
-    Probed("step_out", ("right ahead", "left ahead"), 1.4, 6.0, grade="whether"),
-    Probed("dawdle", ("ahead",), 0.5, 10.0),
-    Probed("speed", ("behind",), 0.5, 10.0),
+    Probed(what="brake", who=("ahead",), most=6.0, how_long=3.0),
+    Probed(what="stop", who=("ahead",), most=6.0, how_long=8.0),
+    Probed(what="late_action", who=("itself",), most=1.0, how_long=3.0),
+    Probed(what="late_observation", who=("itself",), most=1.0, how_long=3.0),
+    Probed(what="noisy_observation", who=("itself",), most=0.2, how_long=3.0),
+    Probed(what="cut_in", who=_ANY_SIDE, most=0.0, how_long=4.0, grade="whether"),
+    Probed(what="unseen", who=("ahead", *_ANY_SIDE), most=1.0, how_long=4.0, grade="length"),
+    Probed(what="ignore_priority", who=_ANY_SIDE, most=1.0, how_long=5.0, grade="length"),
+    Probed(what="late_merge", who=_ANY_SIDE, most=5.0, how_long=10.0, least=50.0),
+    Probed(what="step_out", who=("right ahead", "left ahead"), most=1.4, how_long=6.0, grade="whether"),
+    Probed(what="dawdle", who=("ahead",), most=0.5, how_long=10.0),
+    Probed(what="speed", who=("behind",), most=0.5, how_long=10.0),
 )
 """All that come with crashhunt, as strong and as long as the models draw them at most."""
 

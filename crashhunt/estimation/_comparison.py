@@ -219,19 +219,19 @@ def _figures(hunt: HuntResults, table: NDArray[np.void]) -> HuntFigures:
         found = binomtest(crashes, len(valid)).proportion_ci(_CONFIDENCE, "exact")
         interval = (float(found.low), float(found.high))
     return HuntFigures(
-        str(hunt.directory),
-        hunt.state.state,
-        {agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
-        len(valid),
-        crashes,
-        crashes / len(valid) if len(valid) else float("nan"),
-        interval,
-        why_not if len(valid) else "there is no valid trial",
-        float(np.median(crashed["steps"])) if crashes else float("nan"),
-        float(np.median(fine["ttc"])) if len(fine) else float("nan"),
-        hunt.state.outcomes,
-        hunt.plain_origin,
-        _disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
+        dir=str(hunt.directory),
+        state=hunt.state.state,
+        agents={agent: chosen.agent for agent, chosen in hunt.settings.agents.items()},
+        trials=len(valid),
+        crashes=crashes,
+        crash_rate=crashes / len(valid) if len(valid) else float("nan"),
+        interval=interval,
+        why_not=why_not if len(valid) else "there is no valid trial",
+        median_steps_to_crash=float(np.median(crashed["steps"])) if crashes else float("nan"),
+        median_time_to_collision_s=float(np.median(fine["ttc"])) if len(fine) else float("nan"),
+        outcomes=hunt.state.outcomes,
+        counted=hunt.plain_origin,
+        disturbed=_disturbed(hunt, set(crashed["number"].tolist())) if hunt.settings.disturb else None,
     )
 
 
@@ -274,17 +274,17 @@ def _pair(first: HuntResults, left: NDArray[np.void], second: HuntResults, right
 
         p_value = float(binomtest(only_first, only_first + only_second).pvalue)
     return Pair(
-        str(first.directory),
-        str(second.directory),
-        int(same.sum()),
-        only_first,
-        only_second,
-        int((a & b).sum()),
-        p_value,
-        _caution(first, second),
-        test,
-        why_not,
-        totals,
+        first=str(first.directory),
+        second=str(second.directory),
+        trials=int(same.sum()),
+        only_first=only_first,
+        only_second=only_second,
+        both=int((a & b).sum()),
+        p_value=p_value,
+        caution=_caution(first, second),
+        test=test,
+        why_unpaired=why_not,
+        counts=totals,
     )
 
 

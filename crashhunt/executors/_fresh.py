@@ -134,7 +134,7 @@ class FreshProcessExecutor:
                     stdout=subprocess.DEVNULL,
                     stderr=log,
                 )
-            self._running[number] = _Running(attempt, kept, answer, time.monotonic())
+            self._running[number] = _Running(attempt=attempt, kept=kept, answer=answer, began=time.monotonic())
 
     def _look(self, number: int) -> TrialResult | None:
         running = self._running[number]

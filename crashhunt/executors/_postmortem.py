@@ -220,7 +220,7 @@ def _result(
             agent = agent_in_stack(stack, agents or {})
             whose = f"{agent}'s code" if agent else "the simulator"
             message = f"{message} in {whose} at step {steps + 1}"
-    failure = Failure(kind, message, stack, agent, exit_code, output)
+    failure = Failure(kind=kind, message=message, traceback=stack, agent=agent, exit_code=exit_code, last_output=output)
     wall_s = time.monotonic() - header.started if header is not None else 0.0
     result = TrialResult(
         spec,

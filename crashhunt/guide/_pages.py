@@ -70,7 +70,9 @@ def list_pages() -> list[Page]:
     found = []
     for section in SECTIONS:
         files = [file for file in (pages_folder() / section).glob("*.md") if file.stem != "index"]
-        found += [Page(file.stem, section, _title(file), file) for file in sorted(files, key=_place)]
+        found += [
+            Page(topic=file.stem, section=section, title=_title(file), file=file) for file in sorted(files, key=_place)
+        ]
     return found
 
 

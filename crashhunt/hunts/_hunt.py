@@ -18,7 +18,8 @@ from crashhunt.executors import SharedExecutors, make_executor, read_map
 from crashhunt.hunts._fork_results import CopiedCrashes, verify_fork_results
 from crashhunt.hunts._next_trials import LAG, Trials, Unanswered, settings_of_workers
 from crashhunt.hunts._preflight import Heard, Preflight, is_hopeless, why_invalid
-from crashhunt.hunts._progress import HuntReport, HuntStatus, Progress, StoppedBecause
+from crashhunt.hunts._progress import HuntStatus, Progress
+from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._retention import keep_near_misses, prune_bundles
 from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
@@ -161,10 +162,16 @@ class Hunt:
             lag=lag if sampler.learns and settings.run.deterministic else None,
         )
         runs_again = TrialReruns(
-            self._place, ledger, settings, self._parallel_here, progress.notes, progress.failed, self._stops,
-            SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
+            place=self._place,
+            ledger=ledger,
+            settings=settings,
+            parallel=self._parallel_here,
+            notes=progress.notes,
+            failed=progress.failed,
+            stops=self._stops,
+            executors=SharedExecutors(self._place.scratch / "confirmations", parallel=self._parallel_here),
             taken=snapshot.digest,
-        )  # fmt: skip
+        )
         try:
             return self._run_with(runs_again, ledger, trials, snapshot, progress, finished, watch)
         finally:
@@ -203,12 +210,26 @@ class Hunt:
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
         unanswered = 0 if stopped in ("crash", "distinct") else len(self._unanswered)
         return HuntReport(
-            self.directory, settings, stopped, ledger.outcomes(), ledger.trial_steps(), ledger.steps_total(),
-            time.monotonic() - progress.began, tuple(crashes), reason, tuple(progress.notes), ledger.traffic_events(),
-            progress.audit, progress.about_kinds()[0], near, probes,
-            progress.kinds.at_fault if progress.kinds is not None else None, branches, progress.ended_by_copy,
-            unanswered,
-        )  # fmt: skip
+            directory=self.directory,
+            settings=settings,
+            stopped_because=stopped,
+            outcomes=ledger.outcomes(),
+            trial_steps=ledger.trial_steps(),
+            steps_total=ledger.steps_total(),
+            wall_s=time.monotonic() - progress.began,
+            crashes=tuple(crashes),
+            reason=reason,
+            notes=tuple(progress.notes),
+            events=ledger.traffic_events(),
+            audit=progress.audit,
+            kinds=progress.about_kinds()[0],
+            near_misses=near,
+            probes=probes,
+            at_fault=progress.kinds.at_fault if progress.kinds is not None else None,
+            branches=branches,
+            copied=progress.ended_by_copy,
+            unanswered=unanswered,
+        )
 
     def _hunt(
         self,
@@ -379,24 +400,27 @@ class Hunt:
         self, progress: Progress, phase: str, workers: Mapping[int, BlackBoxHeader] | None = None
     ) -> HuntStatus:
         elapsed = time.monotonic() - progress.began
+        kinds, newest_s, newest_trials = progress.about_kinds()
         return HuntStatus(
-            phase,
-            self.settings.trials,
-            sum(progress.outcomes.values()),
-            dict(progress.outcomes),
-            progress.ended_here / elapsed if elapsed > 0 else 0.0,
-            elapsed,
-            progress.nearest,
-            dict(workers or {}),
-            len(progress.crashes) + (progress.unsaved is not None),
-            progress.nodes,
-            *progress.about_kinds(),
-            progress.time_left_s,
-            progress.disturbed if self._disturber is not None else None,
-            progress.stressed,
-            progress.branched,
-            progress.not_fully_asked,
-            progress.searching.status(),
+            phase=phase,
+            planned=self.settings.trials,
+            done=sum(progress.outcomes.values()),
+            outcomes=dict(progress.outcomes),
+            rate_per_s=progress.ended_here / elapsed if elapsed > 0 else 0.0,
+            elapsed_s=elapsed,
+            nearest=progress.nearest,
+            workers=dict(workers or {}),
+            crashes=len(progress.crashes) + (progress.unsaved is not None),
+            nodes=progress.nodes,
+            kinds=kinds,
+            newest_kind_s=newest_s,
+            newest_kind_trials=newest_trials,
+            time_left_s=progress.time_left_s,
+            disturbed=progress.disturbed if self._disturber is not None else None,
+            stressed=progress.stressed,
+            branched=progress.branched,
+            not_fully_asked=progress.not_fully_asked,
+            search=progress.searching.status(),
         )
 
 

@@ -197,10 +197,10 @@ def spec_of(
     if proposal.seed is not None:
         seed = proposal.seed
     return TrialSpec(
-        number,
-        seed,
-        arguments,
-        scenario_arguments,
+        number=number,
+        seed=seed,
+        arguments=arguments,
+        scenario_arguments=scenario_arguments,
         max_steps=settings.max_steps,
         parent=proposal.parent,
         origin=proposal.origin,

@@ -6,52 +6,37 @@ import math
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from crashhunt.base.capabilities import supports
 from crashhunt.base.errors import BundleError
 from crashhunt.crashes import Group, fault_of, groups_of, signature_of
 from crashhunt.executors import HasNodes
+from crashhunt.hunts._reports import kind_data
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
-    from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._fork_results import BranchReport, ProbeReport
-    from crashhunt.hunts._verification import AuditReport
-    from crashhunt.ledger import Facts, KindData, Noted
-    from crashhunt.plans import HuntSettings, RunSettings
+    from crashhunt.hunts._reports import AuditReport
+    from crashhunt.ledger import Facts, Noted
+    from crashhunt.plans import RunSettings
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 
 
 __all__ = [
-    "HuntReport",
     "HuntStatus",
     "Kinds",
     "Progress",
     "SearchStatus",
     "Searching",
-    "StoppedBecause",
     "StrategyStatus",
-    "kind_data",
 ]
 
 
 # Which kinds of crashes a hunt has found, while it runs.
-
-
-def kind_data(group: Group) -> KindData:
-    """Return a group in few words, with the ids of its crashes."""
-    return {
-        "words": str(group.signature),
-        "count": group.count,
-        "first": group.first.id,
-        "shortest": group.shortest.id,
-    }
 
 
 class Kinds:
@@ -242,11 +227,11 @@ class Searching:
         """Return how it is going."""
         strategies = [
             StrategyStatus(
-                name,
-                tally.trials,
-                tally.trials / self.ended,
-                tally.danger / tally.measured if tally.measured else None,
-                tally.crashes,
+                name=name,
+                trials=tally.trials,
+                share=tally.trials / self.ended,
+                danger=tally.danger / tally.measured if tally.measured else None,
+                crashes=tally.crashes,
             )
             for name, tally in sorted(self._tallies.items(), key=lambda entry: (-entry[1].trials, entry[0]))
         ]
@@ -441,87 +426,3 @@ class Progress:
         newest, trial = self.kinds.newest, self.kinds.newest_trial
         since = None if newest is None else max(0.0, time.time() - newest)
         return self.kinds.groups(), since, None if trial is None else self.ended_here - trial
-
-
-# What came of a hunt: what `Hunt.run` returns, and ``run --json`` prints.
-
-StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time"]
-
-
-@dataclass(frozen=True, slots=True)
-class HuntReport:
-    """What came of a hunt.
-
-    Args:
-        directory: of the hunt.
-        settings: what was asked.
-        stopped_because: why it ended.
-        outcomes: how the trials ended.
-        trial_steps: how many steps trials have taken.
-        steps_total: how many were simulated in all: theirs, those before their first, such as of traffic that warms up,
-            those of their copies, and those of runs that were to confirm something and ended otherwise.
-        wall_s: wall time of this run.
-        crashes: what was found, the one with the fewest steps first.
-        reason: in words, where not one trial was valid.
-        notes: what people should know about how it went, such as trials that were run again.
-        events: traffic events of all trials: kind to how many, and in how many trials.
-        audit: what came of running trials without a crash again; None where nobody asked for it.
-        kinds: of crashes, the most frequent first; None where the first crash ended the hunt.
-        near_misses: that were kept, the most dangerous first.
-        probes: what came of asking copies of trials; None where nobody did.
-        at_fault: the trials whose crashes are the agent's own fault; None where that was not asked.
-        branches: what came of copies that went on with other disturbances; None where there were to be none.
-        copied: what a copy found, where that ended the hunt: it came again from the start.
-        unanswered: how many trials the same command runs again, as they or copies of them were killed from outside.
-    """
-
-    directory: Path
-    settings: HuntSettings
-    stopped_because: StoppedBecause
-    outcomes: dict[str, int]
-    trial_steps: int
-    steps_total: int
-    wall_s: float
-    crashes: tuple[Bundle, ...]
-    reason: str = ""
-    notes: tuple[str, ...] = ()
-    events: dict[str, tuple[int, int]] = field(default_factory=dict)
-    audit: AuditReport | None = None
-    kinds: tuple[Group, ...] | None = None
-    near_misses: tuple[Bundle, ...] = ()
-    probes: ProbeReport | None = None
-    at_fault: tuple[int, ...] | None = None
-    branches: BranchReport | None = None
-    copied: Bundle | None = None
-    unanswered: int = 0
-
-    def to_json(self) -> JsonObject:
-        """Return the shape that ``run --json`` prints."""
-        found: JsonObject = {
-            "dir": str(self.directory),
-            "hunt_seed": self.settings.seed,
-            "trials_planned": self.settings.trials,
-            "trials_run": sum(self.outcomes.values()),
-            "outcomes": self.outcomes,
-            "stopped_because": self.stopped_because,
-            "wall_s": round(self.wall_s, 3),
-            "steps_total": self.steps_total,
-            "events": {kind: {"count": count, "trials": trials} for kind, (count, trials) in self.events.items()},
-            "crashes": [bundle.summary() for bundle in self.crashes],
-            "notes": list(self.notes),
-            "audit": self.audit.to_json() if self.audit is not None else None,
-            "unanswered": self.unanswered,
-        }
-        if self.probes is not None:
-            found["probes"] = self.probes.to_json()
-        if self.branches is not None:
-            found["branches"] = self.branches.to_json()
-        if self.kinds is not None:
-            found["kinds"] = list(map(kind_data, self.kinds))
-        if self.settings.run.near_misses:
-            found["near_misses"] = [bundle.summary() for bundle in self.near_misses]
-        if self.at_fault is not None:
-            found["at_fault"] = list(self.at_fault)
-        if self.copied is not None:
-            found["copied"] = str(self.copied.path)
-        return found

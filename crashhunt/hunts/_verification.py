@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
-from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor, SharedExecutors, read_map, snapshot_executor
 from crashhunt.hunts._next_trials import settings_again
+from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
 from crashhunt.replays import confirm
 from crashhunt.snapshots import Snapshot
@@ -39,10 +39,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Again",
     "Audit",
-    "AuditReport",
     "AuditsLeft",
     "Confirmation",
-    "Difference",
     "Found",
     "TrialReruns",
     "VerificationRuns",
@@ -173,7 +171,7 @@ class TrialReruns:
                     while waiting and not len(self.stops):
                         for result in executor.completed(_LOOK_EVERY_S):
                             waiting -= 1
-                            yield Again(result, self, digest, scratch, folder)
+                            yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
             finally:
                 remove_scratch(scratch)
 
@@ -354,52 +352,6 @@ class VerificationRuns:
 # worker, on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
 
 
-@dataclass(frozen=True, slots=True)
-class Difference(Serializable):
-    """Where a trial went another way in a fresh process.
-
-    Args:
-        trial: its number.
-        step: the first that differs; None where there was no recording to compare, and only the digest differs.
-        agent: the agent or actor; empty where it is about neither.
-        field: what of it.
-        recorded: what it was in the hunt.
-        replayed: what it was in the fresh process.
-    """
-
-    trial: int
-    step: int | None
-    agent: str
-    field: str
-    recorded: object
-    replayed: object
-
-    def __str__(self) -> str:
-        whose = f" of {self.agent}" if self.agent else ""
-        where = "" if self.step is None else f"at step {self.step}, "
-        return (
-            f"trial {self.trial} is another one in a fresh process: {where}{self.field}{whose} was "
-            f"{self.recorded} and is {self.replayed}"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class AuditReport(Serializable):
-    """What came of an audit.
-
-    Args:
-        trials: how many trials were run again.
-        differences: of those that were not the same.
-        not_finished: how many more were to be run again, and were not run to the end.
-    """
-
-    trials: int = 0
-    differences: tuple[Difference, ...] = ()
-    not_finished: int = 0
-
-    json_keys = ("trials", "not_finished", "differences")
-
-
 class Audit:
     """Runs the sample again while the hunt goes on, one trial at a time.
 
@@ -493,9 +445,23 @@ class Audit:
         finally:
             self._clean_up(number)
         if found is not None:
-            return Difference(number, found.step, found.agent, found.field, found.recorded, found.replayed)
+            return Difference(
+                trial=number,
+                step=found.step,
+                agent=found.agent,
+                field=found.field,
+                recorded=found.recorded,
+                replayed=found.replayed,
+            )
         if (was.outcome, was.digest) != (now.outcome, now.digest):
-            return Difference(number, now.steps, "", "the outcome", str(was.outcome), str(now.outcome))
+            return Difference(
+                trial=number,
+                step=now.steps,
+                agent="",
+                field="the outcome",
+                recorded=str(was.outcome),
+                replayed=str(now.outcome),
+            )
         return None
 
     def _folders(self, number: int) -> tuple[Path, Path]:
@@ -567,7 +533,14 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
                 continue
             left.discard(now.spec.number)
             if (was.outcome, was.digest) != (now.outcome, now.digest):
-                difference = Difference(now.spec.number, None, "", "the digest", was.digest, now.digest)
+                difference = Difference(
+                    trial=now.spec.number,
+                    step=None,
+                    agent="",
+                    field="the digest",
+                    recorded=was.digest,
+                    replayed=now.digest,
+                )
                 ledger.remark(f"audit: {difference}")
                 differences.append(difference)
                 again.failed.append(now)

@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.files import whole_file
@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.ledger._reader import Row
 
 
-__all__ = ["checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
+__all__ = ["Row", "checked", "damaged", "explained", "opened", "plain_trial", "removed", "rewrite"]
 
+
+Row: TypeAlias = tuple[Any, ...]
+"""A row as SQLite returns it. The caller's query names its columns."""
 
 _CHECK = "crashhunt check {} says what can be saved"
 

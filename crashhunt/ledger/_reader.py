@@ -7,10 +7,10 @@ import json
 import re
 import sqlite3
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NotRequired, TypeAlias, TypedDict, cast
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.ledger._file import checked, damaged, explained, plain_trial
+from crashhunt.ledger._file import Row, checked, damaged, explained, plain_trial
 from crashhunt.ledger._schema import OWN_FACTS, SEAL, WITH_EVENTS
 from crashhunt.trial import TrialResult, TrialSpec
 
@@ -23,13 +23,10 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import Shape
 
 
-__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Row", "Seal", "Turn"]
+__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn"]
 
 
 # The shapes of what a ledger says besides trials.
-
-Row: TypeAlias = tuple[Any, ...]
-"""As SQLite returns one; whoever asks for it knows which columns there are."""
 
 
 class KindData(TypedDict):

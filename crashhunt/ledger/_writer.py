@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from crashhunt.ledger._reader import Facts, Noted, Row
+    from crashhunt.ledger._file import Row
+    from crashhunt.ledger._reader import Facts, Noted
     from crashhunt.trial import TrialResult
 
 

@@ -183,7 +183,7 @@ def declared_options(kind: type) -> tuple[HuntOption, ...]:
     """Return the options that a dataclass declares, in its order."""
     hints = get_type_hints(kind)
     return tuple(
-        HuntOption(item.name, _form(hints[item.name]), _default(item), item.metadata[_ABOUT])
+        HuntOption(name=item.name, form=_form(hints[item.name]), default=_default(item), about=item.metadata[_ABOUT])
         for item in fields(kind)
         if _ABOUT in item.metadata
     )

@@ -428,7 +428,16 @@ def decode_header(data: bytes) -> BlackBoxHeader | None:
     _, pid, setup_steps, trial, started, committed, step, phase, agent = HEADER.unpack(data)
     if not Phase.SETUP <= phase <= Phase.DONE:
         return None
-    return BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent, setup_steps)
+    return BlackBoxHeader(
+        pid=pid,
+        trial=trial,
+        started=started,
+        committed=committed,
+        step=step,
+        phase=Phase(phase),
+        agent=agent,
+        setup_steps=setup_steps,
+    )
 
 
 def read_black_box(path: Path) -> Iterator[Record]:

@@ -8,8 +8,8 @@ from crashhunt.recording._divergence import Divergence
 from crashhunt.recording.records import RECORD_TYPES
 
 if TYPE_CHECKING:
+    from crashhunt.recording._reading import AgentChannel
     from crashhunt.recording._recording import Recording
-    from crashhunt.recording.records._agents import AgentChannel
     from crashhunt.recording.records._type import Difference
 
 __all__ = ["first_divergence", "values_around"]
@@ -21,7 +21,13 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
     Within a step, observations come before actions and actions before the scene, as in the episode.
     """
     if recorded.prologue != replayed.prologue:
-        return Divergence(0, "", "setup", recorded.prologue.encode().decode(), replayed.prologue.encode().decode())
+        return Divergence(
+            step=0,
+            agent="",
+            field="setup",
+            recorded=recorded.prologue.encode().decode(),
+            replayed=replayed.prologue.encode().decode(),
+        )
     differences = _differences(recorded.prologue.agents)
     for left, right in zip(recorded.all_steps, replayed.all_steps, strict=False):
         for difference, agent in differences:
@@ -30,10 +36,18 @@ def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | N
                 return found
     if len(recorded.all_steps) != len(replayed.all_steps):
         step = min(len(recorded.all_steps), len(replayed.all_steps))
-        return Divergence(step, "", "length", len(recorded.all_steps) - 1, len(replayed.all_steps) - 1)
+        return Divergence(
+            step=step,
+            agent="",
+            field="length",
+            recorded=len(recorded.all_steps) - 1,
+            replayed=len(replayed.all_steps) - 1,
+        )
     if recorded.digest != replayed.digest:
         # Every value of every step agrees, so only the way it was written can differ.
-        return Divergence(recorded.steps, "", "digest", recorded.digest, replayed.digest)
+        return Divergence(
+            step=recorded.steps, agent="", field="digest", recorded=recorded.digest, replayed=replayed.digest
+        )
     return None
 
 

@@ -120,10 +120,10 @@ class Search:
         """Return what has been found so far."""
         attempts = [
             Attempt(
-                tried.manoeuvre,
-                self._end,
-                dict(tried.endings),
-                max((value for value in tried.decelerations if value > _STANDS), default=None),
+                manoeuvre=tried.manoeuvre,
+                end=self._end,
+                endings=dict(tried.endings),
+                deceleration=max((value for value in tried.decelerations if value > _STANDS), default=None),
             )
             for tried in self._tries
             if tried.endings
@@ -240,7 +240,7 @@ def judge(
             if watch is not None:
                 watch(done, runs + why)
 
-        trials = _Trials(result, rerun.recorded, reruns, tell)
+        trials = _Trials(result=result, recorded=rerun.recorded, reruns=reruns, tell=tell)
         search = Search(result.steps, _start(rerun) if of_two else 0, trials.run, runs=runs, parallel=parallel)
         found = None
         try:

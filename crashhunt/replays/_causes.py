@@ -116,10 +116,14 @@ def maneuvers_of(recording: Recording, actor: str, lanes: LaneMap, end: int) -> 
     for what, limit in (("braked", _BRAKES), ("sped up", _SPEEDS_UP)):
         place = _onset(np.diff(speeds) / dt, limit, max(1, round(_PAUSE_S / dt)), dt)
         if place is not None:
-            found.append(Doing(actor, what, steps[place], float(speeds[place])))
+            found.append(Doing(actor=actor, what=what, step=steps[place], speed=float(speeds[place])))
     place = _change(recording, scenes, actor, lanes)
     if place is not None:
-        found.append(Doing(actor, "changed lanes", steps[place], float(speeds[min(place, len(speeds) - 1)])))
+        found.append(
+            Doing(
+                actor=actor, what="changed lanes", step=steps[place], speed=float(speeds[min(place, len(speeds) - 1)])
+            )
+        )
     return found
 
 
@@ -220,7 +224,9 @@ def find_why(rerun: Rerun, runs: Reruns, *, most: int, tell: Callable[[int], Non
                 why_not = error.message
     except StoppedError:
         why_not = INTERRUPTED
-    return Why(tuple(one.answered for one in asked if one.endings), search.steps, left, why_not)
+    return Why(
+        factors=tuple(one.answered for one in asked if one.endings), steps=search.steps, left=left, why_not=why_not
+    )
 
 
 class _Search:
@@ -323,7 +329,11 @@ class _Search:
             if who := told.get((one.step, one.agent, one.what)):
                 spec = replace(self._spec, disturbances=tuple(each for each in planned if each is not one))
                 longer = replace(spec, max_steps=self._inside.max_steps)
-                yield _Asked(Factor("disturbance", who, one.what, one.step), [(one.step - 1, longer)], inside=True)
+                yield _Asked(
+                    Factor(kind="disturbance", name=who, what=one.what, step=one.step),
+                    [(one.step - 1, longer)],
+                    inside=True,
+                )
 
     def _agents(self) -> Iterator[_Asked]:
         """What the agent decided; and the other one, where that is one too."""
@@ -333,7 +343,11 @@ class _Search:
                 (step, replace(self._inside, overruled=Overruled(doing.actor, step, keeps=_KEEPS[doing.what])))
                 for step in self._earlier(doing.step, _EARLIER_S)
             ]
-            yield _Asked(Factor("agent", doing.actor, doing.what, doing.step, doing.speed), runs, inside=True)
+            yield _Asked(
+                Factor(kind="agent", name=doing.actor, what=doing.what, step=doing.step, was=doing.speed),
+                runs,
+                inside=True,
+            )
 
     def _others(self, name: str) -> list[_Asked]:
         """What somebody else did, and that it was there."""
@@ -342,10 +356,17 @@ class _Search:
             what = _HOLDS[doing.what]
             held = name if what == "keep_speed" else ""
             runs = [(step, self._held(name, what, step)) for step in self._earlier(doing.step, _EARLIER_S)]
-            found.append(_Asked(Factor("other", name, doing.what, doing.step, doing.speed), runs, True, held))
+            found.append(
+                _Asked(
+                    factor=Factor(kind="other", name=name, what=doing.what, step=doing.step, was=doing.speed),
+                    runs=runs,
+                    inside=True,
+                    held=held,
+                )
+            )
         steps = [step for step in self._earlier(self._end, _GONE_S) if self._is_there(name, step)]
         runs = [(step, self._held(name, "gone", step)) for step in steps]
-        found.append(_Asked(Factor("other", name, "there", self._end), runs, True))
+        found.append(_Asked(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
         return found
 
     def _doings(self, actor: str) -> list[Doing]:
@@ -360,7 +381,9 @@ class _Search:
     def _held(self, name: str, what: str, step: int) -> TrialSpec:
         """The trial with somebody kept from something after a step."""
         how_long = (self._inside.max_steps - step) * self._dt
-        held = Disturbance(step + 1, "itself", what, 0.0, how_long, self._agent, name)
+        held = Disturbance(
+            step=step + 1, who="itself", what=what, how_strong=0.0, how_long=how_long, agent=self._agent, vehicle=name
+        )
         return replace(self._inside, disturbances=(*self._inside.disturbances, held))
 
     def _arguments(self) -> Iterator[_Asked]:

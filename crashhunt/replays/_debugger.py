@@ -13,7 +13,7 @@ import stat
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypedDict, cast, final
 
@@ -45,12 +45,12 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.base.json_types import ErrorData
     from crashhunt.episode import Episode
-    from crashhunt.replays._prepare import Rerun
+    from crashhunt.replays._prepare import Look, Rerun
     from crashhunt.simulators import Simulator
     from crashhunt.world import Scene
 
 
-__all__ = ["Backwards", "Look", "OneLine", "debug", "main"]
+__all__ = ["Backwards", "OneLine", "debug", "main"]
 
 
 # Backwards in the debugger: before each of the last steps, a copy of the process waits for somebody to come back.
@@ -159,25 +159,6 @@ _MAX_ATTEMPTS = 3  # of a replay that is killed from outside
 
 class _ReplayKilledError(CrashhuntError):
     """Another process, or the kernel, ended the process of a replay."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
-    """What to look at in a replay.
-
-    Args:
-        until: how many steps to run.
-        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
-        to_stderr: whether what is printed goes there.
-        panels: the step from which on to draw the agents' panels, and the folder for them.
-        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
-    """
-
-    until: int
-    stop_at: int = 0
-    to_stderr: bool = False
-    panels: tuple[int, Path] | None = None
-    window: float | None = None
 
 
 def debug(rerun: Rerun, look: Look) -> tuple[TrialResult, Recording]:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.executors import Executor
     from crashhunt.plans import HuntSettings
-    from crashhunt.replays._debugger import Look
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialResult, TrialSpec, Value
 
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Code",
     "Ended",
+    "Look",
     "NotUnderstoodError",
     "ReplayOptions",
     "Rerun",
@@ -51,6 +51,25 @@ __all__ = [
 
 
 Code = Literal["snapshot", "current", "log"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """What to look at in a replay.
+
+    Args:
+        until: how many steps to run.
+        stop_at: the step in which to drop into the ``act`` of the agent that crashed; 0 for none.
+        to_stderr: whether what is printed goes there.
+        panels: the step from which on to draw the agents' panels, and the folder for them.
+        window: open the simulator's own, with so many s of wall time between two steps; it pauses before the crash.
+    """
+
+    until: int
+    stop_at: int = 0
+    to_stderr: bool = False
+    panels: tuple[int, Path] | None = None
+    window: float | None = None
 
 
 @clear_constructor
@@ -194,14 +213,14 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
         sealed=None if code != "log" or trusted else (str(bundle.path.resolve()),),
     )
     return Rerun(
-        bundle,
-        recorded,
-        spec,
-        worker,
-        code,
-        snapshot,
-        edits.all,
-        tuple(warnings),
+        bundle=bundle,
+        recorded=recorded,
+        spec=spec,
+        worker=worker,
+        code=code,
+        snapshot=snapshot,
+        edits=edits.all,
+        warnings=tuple(warnings),
         other_traffic=edits.others,
         elsewhere=bool(options.scenario),
     )
@@ -353,7 +372,7 @@ class Reruns:
             with suppress(OSError, ValueError):
                 entered = json.loads((folder / layout.ENTERED).read_text(encoding="utf-8"))
         shutil.rmtree(folder, ignore_errors=True)
-        return Ended(place, result, recording, tuple(entered))
+        return Ended(place=place, result=result, recording=recording, entered=tuple(entered))
 
 
 def _see_that_it_was_run(asked: TrialSpec, run: TrialSpec) -> None:

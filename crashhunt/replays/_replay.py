@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.executors import SharedExecutors
     from crashhunt.recording import AgentChannel, DivergenceData, Prologue
-    from crashhunt.replays._debugger import Look
-    from crashhunt.replays._prepare import Code, Rerun
+    from crashhunt.replays._prepare import Code, Look, Rerun
     from crashhunt.trial import TrialResult
 
 
@@ -132,14 +131,24 @@ def judged(
     """
     if rerun.elsewhere:
         if result.outcome in rerun.worker.crash_on:
-            return ReplayReport(rerun, "changed", result, replayed)
-        return ReplayReport(rerun, "not_comparable", result, replayed, reason=_no_fix(rerun))
+            return ReplayReport(rerun=rerun, verdict="changed", replayed=result, recording=replayed)
+        return ReplayReport(
+            rerun=rerun, verdict="not_comparable", replayed=result, recording=replayed, reason=_no_fix(rerun)
+        )
     divergence = first_divergence(recorded, replayed)
     if divergence is None and whole:
         divergence = _end_divergence(rerun.bundle.result, result, rerun.code)
     verdict, reason = _judge(rerun, replayed, result, divergence, whole=whole)
     around = tuple(values_around(recorded, replayed, divergence, reach=_AROUND)) if divergence is not None else ()
-    return ReplayReport(rerun, verdict, result, replayed, divergence, around, reason)
+    return ReplayReport(
+        rerun=rerun,
+        verdict=verdict,
+        replayed=result,
+        recording=replayed,
+        divergence=divergence,
+        around=around,
+        reason=reason,
+    )
 
 
 def _judge(
@@ -195,16 +204,22 @@ def _end_divergence(was: TrialResult, now: TrialResult, code: Code) -> Divergenc
     if code == "log" and was.collision is None:  # the record of an agent's fault does not fail
         return None
     if was.outcome is not now.outcome:
-        return Divergence(now.steps, "", "outcome", str(was.outcome), str(now.outcome))
+        return Divergence(
+            step=now.steps, agent="", field="outcome", recorded=str(was.outcome), replayed=str(now.outcome)
+        )
     if was.steps != now.steps:
-        return Divergence(now.steps, "", "steps", was.steps, now.steps)
+        return Divergence(step=now.steps, agent="", field="steps", recorded=was.steps, replayed=now.steps)
     left, right = (dict(hit.to_json()) if hit else {} for hit in (was.collision, now.collision))
     # Another crashhunt may know more about the same collision, or measure it in another way, but not who hit whom.
     for name in {**left, **right}:
         always = name in ("agent", "role", "collider", "victim")
         if (code == "snapshot" or always) and left.get(name) != right.get(name):
             return Divergence(
-                now.steps, str(left.get("agent", "")), f"collision.{name}", left.get(name), right.get(name)
+                step=now.steps,
+                agent=str(left.get("agent", "")),
+                field=f"collision.{name}",
+                recorded=left.get(name),
+                replayed=right.get(name),
             )
     return None
 

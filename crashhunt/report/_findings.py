@@ -79,10 +79,16 @@ def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None =
         message = f"{example.result.summary}.{fault} {count}; look at it: crashhunt show {example.path}"
         found.append(
             Finding(
-                group.signature.outcome, one_line(str(group.signature)), one_line(message), file, line,
-                _fingerprint(group.signature), (known or {}).get(group.signature, ""), group,
+                rule=group.signature.outcome,
+                title=one_line(str(group.signature)),
+                message=one_line(message),
+                file=file,
+                line=line,
+                fingerprint=_fingerprint(group.signature),
+                known=(known or {}).get(group.signature, ""),
+                group=group,
             )
-        )  # fmt: skip
+        )
     return found
 
 

@@ -453,7 +453,7 @@ def describe_probes(report: HuntReport) -> list[str]:
     if found is None or not (found.margins or found.not_fully_asked):
         return []
     steps = f"{found.steps} steps beside {report.trial_steps} of trials"
-    enough = f"; {found.left_out} questions were left out, as that was enough" if found.left_out else ""
+    enough = f"; {found.skipped} probes were skipped because the copies had used up their steps"
     lines = ["Stress margin: no trial was fully asked."]
     if found.margins:
         safe = sum(margin == 1.0 for margin in found.margins)
@@ -462,7 +462,7 @@ def describe_probes(report: HuntReport) -> list[str]:
         many = _many(len(found.margins), "trial")
         lines = [f"Stress margin of {many}: least {least:.2f}, median {median:.2f}; {said}."]
     lines += _not_fully_asked(found.not_fully_asked, found.why_unasked)
-    lines.append(f"  copies were asked {_many(found.probes, 'time')}, with {steps}{enough}")
+    lines.append(f"  copies were asked {_many(found.probes, 'time')}, with {steps}{enough if found.skipped else ''}")
     if found.run_again:
         lines.append(
             f"  of the {found.run_again} mildest disturbances with which a trial crashed, {len(found.crashes)} made it "
@@ -478,7 +478,7 @@ def describe_branches(report: HuntReport) -> list[str]:
     found = report.branches
     if found is None or not found.trials:
         return []
-    enough = f"; {found.left_out} were left out, as that was enough" if found.left_out else ""
+    enough = f"; {found.skipped} were skipped because the copies had used up their steps" if found.skipped else ""
     moments = f"{_many(found.moments, 'moment')} of {_many(found.trials, 'trial')}"
     crashed = f"{found.crashed} crashed, of {_many(found.crashed_trials, 'trial')}"
     lines = [

@@ -170,20 +170,44 @@ def shrink(
     if not search.reproduced:
         verdict: Verdict = "not_reproduced" if ended == "done" else "unchanged"
         return Shrunk(
-            bundle, verdict, ended, None, why, search.actors(None), runs.count, runs.steps,
+            bundle=bundle,
+            verdict=verdict,
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            trials=runs.count,
+            steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
-        )  # fmt: skip
+        )
     if small is None:
         return Shrunk(
-            bundle, "unchanged", ended, None, why, search.actors(None), runs.count, runs.steps,
+            bundle=bundle,
+            verdict="unchanged",
+            ended=ended,
+            small=None,
+            why=why,
+            actors=search.actors(None),
+            trials=runs.count,
+            steps=runs.steps,
             notes=(*rerun.warnings, *search.notes),
-        )  # fmt: skip
+        )
     if ended == "done":
         memory.unlink(missing_ok=True)
     return Shrunk(
-        bundle, "shrunk", ended, small, why, search.actors(small.recording()), runs.count, runs.steps,
-        search.removed(), search.changed(), search.steps_cut, (*rerun.warnings, *search.notes),
-    )  # fmt: skip
+        bundle=bundle,
+        verdict="shrunk",
+        ended=ended,
+        small=small,
+        why=why,
+        actors=search.actors(small.recording()),
+        trials=runs.count,
+        steps=runs.steps,
+        removed=search.removed(),
+        changed=search.changed(),
+        steps_cut=search.steps_cut,
+        notes=(*rerun.warnings, *search.notes),
+    )
 
 
 def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | None:

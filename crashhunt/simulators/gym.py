@@ -173,7 +173,16 @@ class GymSimulator:
         contacts: tuple[Contact, ...] = ()
         if what and not self._crashed:
             self._crashed = True
-            contacts = (Contact(self._agent, "", what, "", float("nan"), float("nan")),)
+            contacts = (
+                Contact(
+                    collider=self._agent,
+                    victim="",
+                    kind=what,
+                    lane="",
+                    collider_speed=float("nan"),
+                    victim_speed=float("nan"),
+                ),
+            )
         self._scene = Scene(self._steps * self.step_length_s, _NOBODY, [], [], [], contacts)
 
 

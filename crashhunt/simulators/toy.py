@@ -193,11 +193,22 @@ class ToySimulator:
             )
             if ahead is not None and agent not in self._touched and self._x[agent] > self._x[ahead] - _LENGTH_M:
                 self._touched.add(agent)
-                found.append(Contact(agent, ahead, "collision", "road_0", self._v[agent], self._v[ahead]))
+                found.append(
+                    Contact(
+                        collider=agent,
+                        victim=ahead,
+                        kind="collision",
+                        lane="road_0",
+                        collider_speed=self._v[agent],
+                        victim_speed=self._v[ahead],
+                    )
+                )
         return tuple(found)
 
     def _enlist(self) -> None:
-        self._roster = Roster(tuple(Actor(name, "passenger", _LENGTH_M, _WIDTH_M) for name in sorted(self._x)))
+        self._roster = Roster(
+            tuple(Actor(id=name, kind="passenger", length=_LENGTH_M, width=_WIDTH_M) for name in sorted(self._x))
+        )
 
     def _look(self, contacts: tuple[Contact, ...]) -> None:
         names = sorted(self._x)

@@ -215,7 +215,7 @@ class Snapshot:
             wrong = changed_file(self.path / name, entry)
             if wrong:
                 found.append(f"{name} {wrong}")
-        digest = digest_of_described(manifest["files"], says=[manifest["paths"], manifest["argument_files"]])
+        digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
         if digest != self.digest:
             found.append(f"its manifest is that of the snapshot {digest}")
         self.discard_compiled()
@@ -311,7 +311,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
         for name, entry in snapshot.manifest["files"].items()
         if name.startswith(f"{layout.SCENARIO_FILES}/")
     }
-    digest = digest_of_described(kept, says=[[], {}])
+    digest = digest_of_described(kept, plain_data=[[], {}])
     final = snapshots / digest
     (final / layout.SCENARIO_FILES).mkdir(parents=True)
     for name, entry in kept.items():

@@ -358,7 +358,7 @@ def _build(
         "left_out": found.left_out,
         "files": stored,
     }
-    digest = digest_of_described(stored, says=[found.paths, argument_files])
+    digest = digest_of_described(stored, plain_data=[found.paths, argument_files])
     final = building.with_name(digest)
     # The digest is too short to prove that two snapshots are the same, so use only a snapshot of this user.
     if final.exists() and not _is_damaged(Snapshot(final)) and Snapshot(final).is_made_here:

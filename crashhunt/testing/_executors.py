@@ -56,7 +56,9 @@ class ExecutorContract:
         made.close()
 
     def _spec(self, number: int, **arguments: Value) -> TrialSpec:
-        return TrialSpec(number, number, {"ego": {"speed": 5.0}}, arguments, max_steps=30)
+        return TrialSpec(
+            number=number, seed=number, arguments={"ego": {"speed": 5.0}}, scenario_arguments=arguments, max_steps=30
+        )
 
     def _collect(self, executor: Executor, count: int) -> dict[int, TrialResult]:
         found: dict[int, TrialResult] = {}

@@ -80,7 +80,7 @@ def drive() -> Iterator[Scene]:
 
     ``ego`` drives into ``other``, passes ``near`` closely, runs a red light and leaves the road; ``second`` stands.
     """
-    actors = [Actor(name, "car", 4.5, 1.8) for name in ("ego", "second", "other", "near")]
+    actors = [Actor(id=name, kind="car", length=4.5, width=1.8) for name in ("ego", "second", "other", "near")]
     roster, previous = Roster(tuple(actors)), None
     for step in range(60):
         x = 1.5 * step
@@ -92,7 +92,18 @@ def drive() -> Iterator[Scene]:
             points,
             [0.0] * 4,
             [15.0, 0.0, 5.0, 0.0],
-            contacts=(Contact("ego", "other", "collision", "road_0", 15.0, 5.0),) if touching else (),
+            contacts=(
+                Contact(
+                    collider="ego",
+                    victim="other",
+                    kind="collision",
+                    lane="road_0",
+                    collider_speed=15.0,
+                    victim_speed=5.0,
+                ),
+            )
+            if touching
+            else (),
             off_road=("ego",) if step > 55 else (),
             lanes=("road_0", "road_0", "road_0", "road_1"),
             swept=step > 0,

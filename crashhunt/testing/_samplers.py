@@ -137,7 +137,15 @@ def _result(number: int, proposal: Proposal) -> TrialResult:
         arguments.setdefault(agent, {})[name] = value
     scenario = arguments.pop("", {})
     seed = number if proposal.seed is None else proposal.seed
-    spec = TrialSpec(number, seed, arguments, scenario, max_steps=50, parent=proposal.parent, origin=proposal.origin)
+    spec = TrialSpec(
+        number=number,
+        seed=seed,
+        arguments=arguments,
+        scenario_arguments=scenario,
+        max_steps=50,
+        parent=proposal.parent,
+        origin=proposal.origin,
+    )
     near = ClosestApproach(((7 * number) % 10) / 2, 1.0 + number, 3.0) if number % 4 else ClosestApproach()
     outcome = _OUTCOMES[number % len(_OUTCOMES)]
     danger = {Outcome.INVALID: None, Outcome.COLLISION: 1.0}.get(outcome, ((7 * number) % 10) / 10)

@@ -272,7 +272,9 @@ class SimulatorContract:
         erring = {}
         for number, kind in enumerate(simulator.disturbing_kinds):
             for cell in CELLS:
-                planned = Disturbance(number + 1, cell, kind, 0.5, 1.0, agents[0])
+                planned = Disturbance(
+                    step=number + 1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0]
+                )
                 vehicle = simulator.resolve_target(planned)
                 assert vehicle == "" or vehicle in simulator.scene().roster.index
                 assert vehicle not in agents

@@ -152,11 +152,11 @@ def _run_one(options: HuntOptions, example: Example, max_steps: int) -> TrialRes
     scenario, settings = plan(request_of(options, trials=1, max_steps=max_steps).checked())
     only = example.get("only")
     spec = TrialSpec(
-        0,
-        example.get("seed", 0),
-        example.get("arguments", {}),
-        example.get("scenario_arguments", {}),
-        max_steps,
+        number=0,
+        seed=example.get("seed", 0),
+        arguments=example.get("arguments", {}),
+        scenario_arguments=example.get("scenario_arguments", {}),
+        max_steps=max_steps,
         only=None if only is None else tuple(only),
         disturbances=tuple(map(Disturbance.from_json, example.get("disturbances", ()))),
     )

@@ -470,4 +470,11 @@ def _argument(parameter: inspect.Parameter, hint: object) -> Argument:
     kind = _KINDS.get(hint) or (kind_of(default) if default is not None else None)
     if declared is None:
         return Argument(parameter.name, kind, default)
-    return Argument(parameter.name, kind, default, declared.distribution, declared.unit, declared.help)
+    return Argument(
+        name=parameter.name,
+        kind=kind,
+        default=default,
+        distribution=declared.distribution,
+        unit=declared.unit,
+        help=declared.help,
+    )

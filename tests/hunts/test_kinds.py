@@ -9,7 +9,8 @@ import pytest
 
 from crashhunt.base.errors import UsageError
 from crashhunt.hunts import _progress
-from crashhunt.hunts._progress import Kinds, kind_data
+from crashhunt.hunts._progress import Kinds
+from crashhunt.hunts._reports import kind_data
 from crashhunt.plans import RunSettings
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 

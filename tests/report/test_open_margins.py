@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from types import SimpleNamespace
 
-from crashhunt.hunts._fork_results import BranchReport, ProbeReport
+from crashhunt.hunts._reports import BranchReport, ProbeReport
 from crashhunt.ledger import Ledger
 from crashhunt.report._page import _trials
 from crashhunt.report._words import describe_branches, describe_probes

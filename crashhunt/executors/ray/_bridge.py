@@ -295,8 +295,9 @@ class Bridge:
         while not self._closing:
             self.turn()
         with self._lock:
-            ready = [node for node in self._roster.nodes.values() if node.ready]
-            self._cluster.close([node.actor for node in self._roster.nodes.values()], ready, _CLOSE_S)
+            nodes = list(self._roster.nodes.values())
+            ready = [node.actor for node in nodes if node.ready]
+            self._cluster.close([node.actor for node in nodes], ready, _CLOSE_S)
 
     def turn(self, wait_s: float = _WAIT_S) -> None:
         """See who is there, have them work, and hear what they answer, waiting so long for a first one."""
@@ -376,7 +377,14 @@ class Bridge:
         wanted = max(0, self._job["parallel"] - taken) if self._job["parallel"] else None
         for machine, slots in shares(free, wanted).items():
             name, now = f"{machine}-{next(self._parts)}", time.monotonic()
-            node = Node(name, machine, able[machine].name, slots, self._cluster.stand(machine, slots), now)
+            node = Node(
+                id=name,
+                machine=machine,
+                name=able[machine].name,
+                slots=slots,
+                actor=self._cluster.stand(machine, slots),
+                stood=now,
+            )
             self._roster.nodes[name] = node
             self._ask(node, "differs", self._job["versions"], self._job["code"])
         if self._roster.nodes:

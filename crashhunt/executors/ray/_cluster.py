@@ -24,8 +24,6 @@ from crashhunt.executors.ray import _node_actor
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from crashhunt.executors.ray._bridge import Node
-
 
 __all__ = [
     "OLDEST",
@@ -303,7 +301,7 @@ class Cluster:
             name, host = node["NodeID"], node["NodeManagerHostname"]
             shown = host if hosts[host] == 1 else f"{host}-{name[:6]}"
             cpus = int(node["Resources"].get("CPU", 0))
-            found[name] = Found(name, shown, cpus, min(cpus, int(free.get(name, {}).get("CPU", 0))))
+            found[name] = Found(id=name, name=shown, cpus=cpus, free=min(cpus, int(free.get(name, {}).get("CPU", 0))))
         return found
 
     def stand(self, node: str, slots: int) -> Any:
@@ -379,10 +377,16 @@ class Cluster:
         with suppress(Exception):
             self._ray.kill(actor, no_restart=True)
 
-    def close(self, actors: Sequence[Any], ready: Sequence[Node], wait_s: float) -> None:
-        """Have nodes end what they do, and leave."""
+    def close(self, actors: Sequence[Any], ready: Sequence[Any], wait_s: float) -> None:
+        """Have the ready actors end their work, then end all actors.
+
+        Args:
+            actors: all that were started.
+            ready: those that run trials.
+            wait_s: for the ready ones to end their work, in s.
+        """
         with suppress(Exception):
-            closed = [self.order(node.actor, "close") for node in ready]
+            closed = [self.order(actor, "close") for actor in ready]
             self._ray.wait(closed, num_returns=len(closed), timeout=wait_s)
         for actor in actors:
             self.kill(actor)

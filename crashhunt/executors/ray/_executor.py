@@ -249,7 +249,15 @@ class RayExecutor:
             self._nodes = message["nodes"]
         if "where" in message:
             self._where[message["node"]] = {
-                int(number): BlackBoxHeader(pid, trial, started, committed, step, Phase(phase), agent)
+                int(number): BlackBoxHeader(
+                    pid=pid,
+                    trial=trial,
+                    started=started,
+                    committed=committed,
+                    step=step,
+                    phase=Phase(phase),
+                    agent=agent,
+                )
                 for number, (pid, trial, started, committed, step, phase, agent) in message["where"].items()
             }
 

@@ -10,8 +10,7 @@ from crashhunt.recording._divergence import Divergence
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from crashhunt.recording._reading import Reading, StepRecord
-    from crashhunt.recording.records._agents import AgentChannel, Prologue
+    from crashhunt.recording._reading import AgentChannel, Prologue, Reading, StepRecord
 
     Difference = Callable[[StepRecord, StepRecord, AgentChannel | None], Divergence | None]
 
@@ -123,7 +122,7 @@ def scene_texts(*fields: str) -> Difference:
             # As text, in which a speed that nobody knows, NaN, equals itself.
             was, now = str(getattr(left.scene, field)), str(getattr(right.scene, field))
             if was != now:
-                return Divergence(left.step, "", f"scene.{field}", was, now)
+                return Divergence(step=left.step, agent="", field=f"scene.{field}", recorded=was, replayed=now)
         return None
 
     return difference

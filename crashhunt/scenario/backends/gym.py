@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._backend import Backend
+from crashhunt.scenario._scenario import Backend
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -7,8 +7,7 @@ from importlib import metadata
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import ScenarioError
-from crashhunt.scenario._backend import Accelerator, Backend
-from crashhunt.scenario._scenario import STEP_LENGTH_S
+from crashhunt.scenario._scenario import STEP_LENGTH_S, Accelerator, Backend
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

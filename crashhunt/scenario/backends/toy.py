@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from crashhunt.scenario._backend import Backend
+from crashhunt.scenario._scenario import Backend
 
 __all__ = ["BACKEND"]
 

@@ -68,13 +68,27 @@ def contact_of(
     others = [other for other in things if other is not vehicle and (other.crashed or isinstance(other, Obstacle))]
     hit = min(others, key=lambda other: gap(vehicle, other), default=None)
     if hit is None:
-        return Contact(agent, "", "crashed", lane, float(vehicle.speed), math.nan)
+        return Contact(
+            collider=agent,
+            victim="",
+            kind="crashed",
+            lane=lane,
+            collider_speed=float(vehicle.speed),
+            victim_speed=math.nan,
+        )
     x, y = (hit.position - vehicle.position).tolist()
     first, second = (agent, vehicle), (actor_of(hit).id, hit)
     ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
     if not ahead and not isinstance(hit, Obstacle):
         first, second = second, first
-    return Contact(first[0], second[0], "crashed", lane, float(first[1].speed), float(second[1].speed))
+    return Contact(
+        collider=first[0],
+        victim=second[0],
+        kind="crashed",
+        lane=lane,
+        collider_speed=float(first[1].speed),
+        victim_speed=float(second[1].speed),
+    )
 
 
 # Vehicles and obstacles that do not take part in an episode, though the environment has them.

@@ -166,8 +166,8 @@ def _rest(route: Sequence[Any] | None, lane: Sequence[Any]) -> list[Any] | None:
 def _between(state: State, after: State, share: float) -> State:
     turn = math.remainder(after.heading - state.heading, math.tau)
     return State(
-        state.x + share * (after.x - state.x),
-        state.y + share * (after.y - state.y),
-        state.heading + share * turn,
-        state.speed + share * (after.speed - state.speed),
+        x=state.x + share * (after.x - state.x),
+        y=state.y + share * (after.y - state.y),
+        heading=state.heading + share * turn,
+        speed=state.speed + share * (after.speed - state.speed),
     )

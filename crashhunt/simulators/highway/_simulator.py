@@ -354,7 +354,10 @@ class HighwaySimulator:
                 self._counts[what] += 1
                 name = f"{what}.{self._counts[what]}"
             # Together with the object itself, so that no later one can have its identity.
-            found = thing, Actor(name, type(thing).__name__, float(thing.LENGTH), float(thing.WIDTH))
+            found = (
+                thing,
+                Actor(id=name, kind=type(thing).__name__, length=float(thing.LENGTH), width=float(thing.WIDTH)),
+            )
             self._known[id(thing)] = found
         return found[1]
 

@@ -436,12 +436,12 @@ class Sight:
                 self._touched.add(pair)
                 found.append(
                     Contact(
-                        collision.collider,
-                        victim,
-                        collision.type,
-                        collision.lane,
-                        collision.colliderSpeed,
-                        collision.victimSpeed,
+                        collider=collision.collider,
+                        victim=victim,
+                        kind=collision.type,
+                        lane=collision.lane,
+                        collider_speed=collision.colliderSpeed,
+                        victim_speed=collision.victimSpeed,
                     )
                 )
         return tuple(found)

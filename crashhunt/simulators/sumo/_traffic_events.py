@@ -259,9 +259,18 @@ class SumoEvents:
     def _of(self, scene: Scene, agent: str, kind: str, what: str, others: tuple[str, ...] = ()) -> Event:
         row = scene.roster.index.get(agent)
         if row is None:
-            return Event(kind, agent, what, others)
+            return Event(kind=kind, agent=agent, what=what, others=others)
         x, y = scene.points[row]
-        return Event(kind, agent, what, others, self._lanes.get(agent, ""), x, y, scene.speeds[row])
+        return Event(
+            kind=kind,
+            agent=agent,
+            what=what,
+            others=others,
+            lane=self._lanes.get(agent, ""),
+            x=x,
+            y=y,
+            speed=scene.speeds[row],
+        )
 
     def _entered(self, agent: str, before: str, lane: str, scene: Scene, found: list[Event]) -> None:
         """A controlled vehicle is on another lane than a step before."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from crashhunt.scenario._backend import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
+from crashhunt.scenario._scenario import Backend, CompiledCore, Configuration, LoadOrder, TrafficSurvey
 from crashhunt.scenario.backends.sumo._options import INPUTS, SumoSetup, canonical, writes
 from crashhunt.world import EVENT_WORDS
 
