@@ -25,7 +25,7 @@ from highway_env.envs.common.observation import MultiAgentObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.vehicle.objects import Obstacle, RoadObject
 
-from crashhunt.accelerator import Onlooker, Unasked, switch_off, switch_on
+from crashhunt.accelerator import Onlooker, SkippedObservation, switch_off, switch_on
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import argument_values
 from crashhunt.scenario.backends.highway import BACKEND, HighwaySetup
@@ -253,7 +253,7 @@ class HighwaySimulator:
     def _adopt(self, env: AbstractEnv) -> None:
         """Read the vehicles, spaces and action forms of a new environment."""
         self._env = env
-        self._skipping = Unasked(env) if self._kinematics is not None else nullcontext()
+        self._skipping = SkippedObservation(env) if self._kinematics is not None else nullcontext()
         rate = env.config["simulation_frequency"]
         self.step_length_s = int(rate // env.config["policy_frequency"]) / rate  # highway-env rounds sub-steps down
         chosen = self._setup.off_road
