@@ -141,7 +141,7 @@ def test_what_is_damaged_or_no_case_is_told_and_does_not_keep_the_others(kept):
     (next(first.glob("snapshots/*")) / "scenario" / "scenario.toml").write_text("schema = 1")
     (report, other) = run_cases([first, second], parallel=2)
     assert (report.got, other.got) == ("cannot_run", "still")
-    assert "has changed; get the case back from the repository" in report.now  # there is no --force, as of a replay
+    assert "has changed; restore the case from the repository" in report.now  # there is no --force, as of a replay
     case = second / "crashhunt-case.toml"
     for text, said in (("expect = 'maybe'", "maybe"), ("expect = [", "not valid TOML"), ("", "expect")):
         case.write_text(text)
