@@ -58,9 +58,9 @@ class Manifest(TypedDict):
 class Environment(TypedDict):
     """The content of ``environment.json``: everything besides code on which a result depends.
 
-    ``git`` has the revision of each work tree. ``core`` says whether the simulator's compiled core was used, which does
-    not change results. ``load_order`` is ``fixed`` or ``not fixed: REASON`` if results depend on an order at load.
-    Snapshots of earlier versions lack it.
+    The entry ``git`` has the revision of each work tree. The entry ``core`` says whether the simulator's compiled core
+    was used, which does not change results. If results depend on an order at load, ``load_order`` is ``fixed`` or
+    ``not fixed: REASON``. Snapshots of earlier versions lack it.
     """
 
     schema: int
