@@ -169,7 +169,7 @@ def test_a_strangers_crash_is_added_only_with_trust(kept):
 
 
 def test_a_large_log_is_left_out_and_the_case_still_runs(kept, monkeypatch):
-    monkeypatch.setattr("crashhunt.corpus._cases._MOST", 1000)
+    monkeypatch.setattr("crashhunt.corpus._cases._MAX_BYTES_WITH_LOG", 1000)
     added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
     assert not list(added.case.path.rglob("log.mcap"))
     (report,) = run_cases([added.case.path])
