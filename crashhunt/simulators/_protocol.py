@@ -195,7 +195,7 @@ class TellsEvents(Protocol):
     """A simulator that detects traffic events, such as running a red light, and puts them into its scenes."""
 
     @property
-    def told_events(self) -> Sequence[str]:
+    def reported_events(self) -> Sequence[str]:
         """The types of events that the simulator detects; results count events of these types."""
 
 

@@ -51,7 +51,7 @@ BACKEND = Backend(
     notes=lambda scenario: [f"the road is {scenario.table(RoadSetup).road}"],
     versions=("mysim-engine",),
     variables=("MYSIM_HOME",),
-    told_events=(),
+    reported_events=(),
     configurations=(Configuration(endings=(".road",), load=load),),
 )
 '''

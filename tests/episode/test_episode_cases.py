@@ -246,7 +246,7 @@ def test_everything_of_a_scene_is_recorded(run):
         2: {"scene": {"off_road": ("other",)}, "events": (event,)},
     }
     simulator = Scripted(script)
-    simulator.told_events = ("teleport", "red_light")
+    simulator.reported_events = ("teleport", "red_light")
     result = run(simulator)
     _, first, second, third = run.recording().scenes()
     assert (first.contacts, first.heights, first.grades, first.spines) == (
@@ -260,7 +260,7 @@ def test_everything_of_a_scene_is_recorded(run):
     assert (result.outcome, result.events) == (Outcome.SURVIVED, {"teleport": 1})
     assert run(Scripted()).events is None
     silent = Scripted()
-    silent.told_events = ("teleport",)
+    silent.reported_events = ("teleport",)
     assert run(silent).events == {}
 
 

@@ -89,7 +89,7 @@ class HighwaySimulator:
         except InvalidEpisodeError as error:
             raise ScenarioError(str(error), fix="check [highway] and the arguments", where=scenario.origin) from error
 
-    told_events = BACKEND.told_events
+    reported_events = BACKEND.reported_events
     disturbing_kinds = BACKEND.disturbances or ()
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:

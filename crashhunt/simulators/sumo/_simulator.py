@@ -100,7 +100,7 @@ class SumoSimulator:
         self._scene: Scene
         self.at_once: UsualSteps | None = None
 
-    told_events = BACKEND.told_events
+    reported_events = BACKEND.reported_events
     disturbing_kinds = BACKEND.disturbances or ()
 
     def ready_process(self) -> None:
