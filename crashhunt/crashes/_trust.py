@@ -178,7 +178,7 @@ def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) ->
         settings = read_settings(bundle.hunt / layout.HUNT)
         if snapshot.faults() if faults is None else faults:
             return False
-        # The settings beside the crash say what is imported, and only those in the snapshot are authenticated.
+        # The hunt's settings name the imports, but only the settings in the snapshot are authenticated.
         if not _unknown_names(settings, snapshot):
             if is_bundle_made_here(bundle):
                 return True
@@ -374,7 +374,7 @@ def signature(index: ArchiveIndex) -> str:
 
 
 def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapping[str, Any]) -> None:
-    """Refuse a scenario that does anything but simulate, as far as is known; what nobody knows is refused.
+    """Refuse a scenario with known side effects, and a scenario whose side effects are unknown.
 
     Args:
         scenario: of the crash.
@@ -393,7 +393,7 @@ def refuse_side_effects(scenario: Scenario, settings: HuntSettings, values: Mapp
         raise _refusal(f"it would import {module!r}")
     backend = backend_of(scenario.simulator)
     if backend is None or backend.side_effect is None:
-        raise _refusal(f"nobody knows what the simulator {scenario.simulator!r} does besides simulating")
+        raise _refusal(f"the side effects of the simulator {scenario.simulator!r} are unknown")
     asked = [spec.spec for spec in settings.scenario_arguments.values() if spec.kind == "str"]
     effect = backend.side_effect(scenario, values, asked)
     if effect:

@@ -1,4 +1,4 @@
-"""What is behind the Gymnasium environment: SUMO, the reward, the end of an episode, the picture."""
+"""The episodes of the Gymnasium environment on SUMO: observation, reward, termination and rendered picture."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
 
 __all__ = ["Episodes"]
 
-_SIZE = (960, 540)  # of the picture, in pixels
-_TRAIL_S = 4.0  # of where the agent has been
+_SIZE = (960, 540)  # width and height of the picture, in pixels
+_TRAIL_S = 4.0  # how long the picture shows the agent's past path, in s
 _OTHERS_SPEED = 10.0  # m/s
 
 
 class Episodes:
-    """Episodes of one controlled vehicle; those of others keep their lane.
+    """Episodes of one controlled vehicle. The scenario's other agents keep lane and speed.
 
     Args:
-        scenario: a shipped name, or a path.
-        agent: the controlled vehicle; the scenario's first where empty.
+        scenario: Name of a shipped scenario, or a path.
+        agent: The controlled vehicle; if empty, the first agent of the scenario.
         action: ``continuous``, ``meta``, or empty for the scenario's own choice.
-        disturb: how often what happens, as ``brake=0.02``.
-        max_steps: how long an episode is at most; 0 for no bound, and then nothing may disturb.
+        disturb: Rates of disturbances, such as ``brake=0.02``.
+        max_steps: The longest episode in steps; 0 for no limit. Disturbances need a limit.
 
     Attributes:
-        observation_space: of the vehicle.
-        action_space: of the vehicle.
-        step_length_s: simulation time of a step, in s.
-        agent: the controlled vehicle.
+        observation_space: The observation space of the vehicle.
+        action_space: The action space of the vehicle.
+        step_length_s: Simulation time of a step, in s.
+        agent: The controlled vehicle.
 
     Raises:
-        CrashhuntError: the scenario, the agent or a disturbance does not exist, or a bound is missing that is needed.
+        CrashhuntError: The scenario, the agent or a disturbance does not exist, or disturbances lack a limit.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Episodes:
             self._episode.close()
         given = {**self._arguments, **arguments}
         disturbances = self._disturber.draw(seed, self._max_steps) if self._disturber is not None else ()
-        # Whoever steps the environment decides how long an episode is.
+        # The caller of the environment decides when an episode ends.
         spec = TrialSpec(
             number=0,
             seed=seed,
@@ -104,12 +104,12 @@ class Episodes:
         self._crash_step, self._borders = -1, None
         info: dict[str, object] = {"sim_time_s": self._trail.scenes[-1].time_s}
         if self._trail.disturbances:
-            info["disturbances"] = [one.words for one in self._trail.disturbances]
+            info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances]
         return self._episode.observations[self.agent], info
 
     def step(self, action: object) -> tuple[NDArray[np.generic], float, bool, dict[str, object]]:
         """Advance one control step; return observation, reward, whether it has ended, and the info."""
-        encoded = self._form.encode(action)  # here, where it is an error of the caller's, and the episode goes on
+        encoded = self._form.encode(action)  # a wrong action is an error of the caller, so it does not end the episode
         episode = self._episode
         if episode is None:
             raise SimulatorError("no episode has begun", fix="call reset")
@@ -128,7 +128,7 @@ class Episodes:
         if scene.events:
             info["events"] = [f"{event.kind}: {event.what}" for event in scene.events]
         if len(self._trail.disturbances) > before:
-            info["disturbances"] = [one.words for one in self._trail.disturbances[before:]]
+            info["disturbances"] = [disturbance.words for disturbance in self._trail.disturbances[before:]]
         if terminated:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
@@ -147,7 +147,7 @@ class Episodes:
             actors=scenes[-1].roster.actors,
             prologue=SimpleNamespace(step_length_s=self.step_length_s),
             disturbances=tuple(self._trail.disturbances),
-            # A trail that is longer than what is remembered ends there.
+            # Steps before the first remembered scene show that scene.
             scene=lambda step: scenes[max(0, step - first)],
         )
         view: Any = SceneView
@@ -166,10 +166,10 @@ class Episodes:
 
 
 class _Trail(Observer):
-    """Remembers the last scenes, for the picture, and what has disturbed the episode.
+    """Remembers the last scenes for the picture, and the disturbances of the episode.
 
     Args:
-        length: how many.
+        length: Number of scenes.
     """
 
     def __init__(self, length: int) -> None:
@@ -180,7 +180,7 @@ class _Trail(Observer):
         self.disturbances.clear()
 
     def disturbance(self, disturbance: Disturbance) -> None:
-        if disturbance.vehicle:  # somebody was there
+        if disturbance.vehicle:  # empty if no vehicle was at the place
             self.disturbances.append(disturbance)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
@@ -192,12 +192,12 @@ class _Trail(Observer):
 def _disturber(scenario: Scenario, agent: str, disturb: Sequence[str], max_steps: int) -> DisturbanceSampler | None:
     made = disturber(scenario, disturb, (agent,))
     if made is not None and max_steps < 1:
-        raise UsageError("disturb needs to know how long an episode is", fix="give max_steps")
+        raise UsageError("disturb needs a limit of the episode's length", fix="give max_steps")
     return made
 
 
 def _make_agent(agent: str, simulator: Simulator, _arguments: Mapping[str, Value]) -> KeepLaneWithSpeed:
-    """Who drives where nobody else does; that of the environment's own vehicle is never asked."""
+    """Return the agent for the scenario's other controlled vehicles; the caller drives the environment's vehicle."""
     return KeepLaneWithSpeed(_OTHERS_SPEED, simulator.actions[agent].space)
 
 

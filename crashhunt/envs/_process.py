@@ -1,4 +1,4 @@
-"""Episodes in a process of their own: libsumo has one simulation per process."""
+"""Runs episodes in a process of their own, because libsumo has one simulation per process."""
 
 from __future__ import annotations
 
@@ -25,29 +25,30 @@ if TYPE_CHECKING:
 __all__ = ["RemoteEpisodes"]
 
 Ours: TypeAlias = "Connection[Any, Any]"
-"""A pipe between the two processes, which send each other what the methods of `Episodes` take and return."""
+"""A pipe between the two processes, which carries the arguments and results of the methods of `Episodes`."""
 
-_LOOK_EVERY_S = 1.0  # whether whoever asks is still there
-_GOOD_BYE_S = 5.0  # for SUMO to close; then it is killed
+_LOOK_EVERY_S = 1.0  # time between two checks whether the parent process still exists
+_GOOD_BYE_S = 5.0  # time for SUMO to close before the process is killed
 
 
 class RemoteEpisodes:
-    """The same as `Episodes`, in a process that ends with this object, and with this process.
+    """`Episodes` in a child process, which ends with this object and with this process.
 
-    What it raises comes through. The arguments are those of `Episodes`.
+    The arguments are those of `Episodes`. Exceptions of the child process are raised here.
     """
 
     def __init__(
         self, scenario: str | Path, agent: str, action: str, disturb: Sequence[str] = (), max_steps: int = 0
     ) -> None:
         here, there = Pipe()
-        # A program of its own rather than a child of multiprocessing's: those of an AsyncVectorEnv may not have one.
+        # Use a program of its own, because the daemonic workers of an AsyncVectorEnv may not have children of
+        # multiprocessing.
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "crashhunt.envs._process", str(there.fileno()), str(os.getpid())],
             pass_fds=(there.fileno(),),
             stdin=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            start_new_session=True,  # Ctrl-C is for whoever asks
+            start_new_session=True,  # Ctrl-C must reach the parent process only
         )
         there.close()
         self._pipe = here
@@ -79,7 +80,7 @@ class RemoteEpisodes:
 
     def _ask(self, name: str, *words: object) -> Any:
         if self._pipe.closed:
-            raise SimulatorError("the environment has been closed", fix="make a new one")
+            raise SimulatorError("the environment has been closed", fix="make a new environment")
         try:
             self._pipe.send((name, words))
             fine, answer = self._pipe.recv()
@@ -87,14 +88,14 @@ class RemoteEpisodes:
             self._end()
             code = self._process.returncode
             how = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
-            raise SimulatorError(f"the process of the environment ended {how}", fix="make a new one") from error
+            raise SimulatorError(f"the process of the environment ended {how}", fix="make a new environment") from error
         if not fine:
             raise answer
         return answer
 
 
 def _end(process: subprocess.Popen[bytes], pipe: Ours, owner: int) -> None:
-    """Have a process end; a copy of its owner, made by forking, has no say in that."""
+    """End the child process; in a fork of the owner, only close the pipe."""
     pipe.close()
     if os.getpid() != owner:
         return
@@ -106,7 +107,7 @@ def _end(process: subprocess.Popen[bytes], pipe: Ours, owner: int) -> None:
 
 
 def main() -> None:
-    """Answer until whoever asks is gone."""
+    """Answer requests until the parent process has ended."""
     from crashhunt.envs._episodes import Episodes
 
     pipe: Ours = Connection(int(sys.argv[1]))
@@ -114,7 +115,7 @@ def main() -> None:
     episodes: Episodes | None = None
     with suppress(EOFError, ConnectionError):
         while True:
-            # Copies of the parent hold the other end open as well, so that its end is no sign of the parent's.
+            # Forks of the parent hold the pipe open as well, so an open pipe does not prove that the parent exists.
             while not pipe.poll(_LOOK_EVERY_S):
                 if os.getppid() != parent:
                     return
@@ -138,7 +139,7 @@ def main() -> None:
 def _fail(pipe: Ours, error: Exception) -> None:
     try:
         pipe.send((False, error))
-    except Exception:  # it cannot be pickled
+    except Exception:  # the error cannot be pickled
         pipe.send((False, SimulatorError(f"{type(error).__name__}: {error}")))
 
 

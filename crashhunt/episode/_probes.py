@@ -1,7 +1,7 @@
-"""Probes: every so often, copies of a running episode are asked how little it would take for it to crash.
+"""Robustness probes: at intervals, forks of a running episode search the minimal disturbance that causes a crash.
 
-Each copy goes on with a disturbance, and is over after some seconds. Only what is milder than the mildest that has made
-the trial crash so far is asked for, so that most questions need one copy.
+Each fork continues with one disturbance and ends after some seconds. Only disturbances milder than the mildest known
+crash are tried, so most questions need one fork.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Probed:
         Args:
             share: how much of it, from 0 to 1.
             who: which of the places.
-            agent: around whom.
+            agent: The agent at the centre of the grid.
             step: in which it begins.
         """
         strong = self.least + share * (self.most - self.least) if self.grade == "strength" else self.most
@@ -175,7 +175,7 @@ class Prober:
             return
         try:
             asked = self._questions_at(episode)
-            turn = self._moment % max(1, len(asked))  # where the budget does not last, others are left out each time
+            turn = self._moment % max(1, len(asked))  # if the budget is too small, each moment skips other questions
             self._moment += 1
             for question in asked[turn:] + asked[:turn]:
                 if self._questions.is_over:
@@ -198,7 +198,7 @@ class Prober:
         return self._stress.steps >= self._budget * episode.steps
 
     def _questions_at(self, episode: Episode) -> list[_Question]:
-        """What there is to ask: where somebody is who might err. That is looked up in a copy, too."""
+        """Return the questions with a target vehicle, which is looked up in a fork as well."""
         simulator = episode.simulator
         kinds = simulator.disturbing_kinds if supports(simulator, SupportsDisturbances) else ()
         every = [
@@ -240,7 +240,7 @@ class Prober:
                 may_be_asked_again=may_be_answered,
             )
         elif not stress.probes:
-            return result  # nobody was asked, which says nothing
+            return result  # no probe could run, so there is no result
         return replace(result, stress=stress)
 
     def _mildest(self, episode: Episode, question: _Question) -> bool:
@@ -282,7 +282,7 @@ class Prober:
             while copy.result is None and copy.steps < began + horizon:
                 copy.step()
                 if disturbance is not None and copy.steps == disturbance.step and not copy.takes_place(disturbance):
-                    break  # nobody was there
+                    break  # no vehicle was at the place
             outcome = str(copy.result.outcome) if copy.result is not None else ""
             return {"steps": copy.steps - began, "step": copy.steps, "outcome": outcome}
 

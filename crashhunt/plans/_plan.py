@@ -436,7 +436,7 @@ def _check_branch(settings: HuntSettings) -> None:
 def _with_untold(scenario: Scenario, crash_on: Sequence[Outcome]) -> Scenario:
     """Tell whoever hunts for what this simulator never tells; where that is all, refuse."""
     backend = backend_of(scenario.simulator)
-    told = backend.told_events if backend is not None else None
+    told = backend.reported_events if backend is not None else None
     never = [kind for kind in crash_on if kind in EVENTS and told is not None and kind not in told]
     if not never:
         return scenario

@@ -266,7 +266,7 @@ def _kind_it_cannot_do(scenario: Scenario, spec: TrialSpec) -> str:
 
 
 def is_todays(rerun: Rerun) -> bool:
-    """Whether the crashhunt that runs is this one, so that it is told of trials as this one tells its own."""
+    """Whether the trials run with this crashhunt, and not with the crashhunt of the snapshot."""
     if not rerun.worker.code:
         return True
     files = rerun.snapshot.manifest["files"]
@@ -289,11 +289,11 @@ _WARM_COPIES = 2  # of each worker: most runs begin as the crash did
 
 
 class StoppedError(Exception):
-    """Somebody has asked to give up."""
+    """The caller has asked to stop."""
 
 
 class NotUnderstoodError(CrashhuntError):
-    """What ran the trial has left out what it does not know of it, and so has run another one."""
+    """The crashhunt of the snapshot has ignored unknown parts of a specification, and so has run another trial."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +303,7 @@ class Ended:
     Args:
         place: among those that were asked for.
         result: of it.
-        recording: of it; None where nobody asked, or its process died before there was any.
+        recording: The recording; None if it was not requested, or if the process died before it had one.
         entered: the ids of all actors that entered, where the specification asked for them (`EVERYBODY`).
     """
 
@@ -320,7 +320,7 @@ class Reruns:
         rerun: the crash.
         scratch: a folder for the workers.
         parallel: trials at a time.
-        stopped: asked now and then whether to give up.
+        stopped: Returns whether to stop; called repeatedly.
     """
 
     def __init__(self, rerun: Rerun, scratch: Path, *, parallel: int, stopped: Callable[[], bool]) -> None:
@@ -331,14 +331,14 @@ class Reruns:
         self._numbers = itertools.count(1)  # folders of their own
 
     def run(self, specs: Sequence[TrialSpec], *, recorded: bool = True) -> Iterator[Ended]:
-        """Yield what comes of trials as they end; what has not ended when nobody asks any more is given up.
+        """Yield the results of trials as they end; trials that still run when the caller stops are cancelled.
 
         Args:
             specs: the trials.
             recorded: whether their recordings are wanted.
 
         Raises:
-            StoppedError: somebody has asked for it.
+            StoppedError: The caller has asked to stop.
             NotUnderstoodError: the crashhunt that runs them does not know what is asked.
             CrashhuntError: the trials could not be run.
         """
@@ -376,7 +376,7 @@ class Reruns:
 
 
 def _see_that_it_was_run(asked: TrialSpec, run: TrialSpec) -> None:
-    """See that what determines a trial came back as it was asked: early versions leave out what they do not know.
+    """Check that a trial ran with the requested specification, because early versions ignore unknown parts of it.
 
     Raises:
         NotUnderstoodError: something did not.

@@ -474,7 +474,7 @@ class Backend:
         variables: of the environment, on which it depends; written down with the versions.
         per_processor: whether it may round otherwise on another processor.
         step_length_s: the control step, in s, where it is not the scenario's own.
-        told_events: the types of traffic events that it reports; None if that is unknown.
+        reported_events: the types of traffic events that it reports; None if that is unknown.
         disturbances: the types of disturbances of the traffic that it supports; None if that is unknown.
         actions: the forms of action (``continuous``, ``meta``) that ``--action`` may choose.
         accelerator: where it has one.
@@ -509,7 +509,7 @@ class Backend:
     variables: tuple[str, ...] = ()
     per_processor: bool = False
     step_length_s: Callable[[Scenario], float] = _its_own
-    told_events: tuple[str, ...] | None = None
+    reported_events: tuple[str, ...] | None = None
     disturbances: tuple[str, ...] | None = None
     actions: tuple[str, ...] = ()
     accelerator: Accelerator | None = None

@@ -1,4 +1,4 @@
-"""Running candidates: on warm workers, several at a time, and what came of each is remembered."""
+"""Runs candidates on persistent workers, several at a time, and remembers the result of each."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _FIRST = 10**6  # the numbers of candidates; no hunt has a trial of such
 
 
 class StoppedError(Exception):
-    """It was given up: the budget is used up, or somebody has asked for it."""
+    """The search has stopped: the budget is used up, or the caller has asked for it."""
 
 
 class OutOfTimeError(StoppedError):
-    """It was given up: the time is over."""
+    """The search has stopped because its time is over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +62,11 @@ class Runs:
         rerun: the crash.
         signature: what must stay.
         scratch: a folder for the workers.
-        memory: a file with what came of candidates when it was interrupted; written as it goes on.
+        memory: A file with the results of candidates, for a search that resumes after an interruption.
         parallel: trials at a time.
         budget: how many may be run.
         time_s: how long they may take altogether, in s of wall-clock time; None for as long as it takes.
-        stopped: asked now and then whether to give up.
+        stopped: Returns whether to stop; called repeatedly.
         watch: called with how many have been run, and how many may be.
 
     Attributes:
@@ -110,7 +110,7 @@ class Runs:
             again: run even what is known not to do it.
 
         Raises:
-            StoppedError: it was given up before that was known.
+            StoppedError: The search stopped before the answer was known.
             CrashhuntError: no trial can be run at all.
         """
         found: dict[int, Ran] = {}
@@ -154,10 +154,10 @@ class Runs:
         return None
 
     def entered(self, spec: TrialSpec) -> tuple[str, ...]:
-        """Return who has entered in a candidate of which that was asked; nobody where the simulator does not know.
+        """Return the actors that entered in a trial; empty if the simulator cannot report them.
 
         Raises:
-            StoppedError: it was given up.
+            StoppedError: The search stopped.
         """
         number = self._next
         self._executor.submit(self._numbered(spec))
@@ -211,7 +211,7 @@ class Runs:
             )  # fmt: skip
         if same:
             same = is_same(self._signature_of(result, folder), self._signature, result.spec)
-        if result.kept and not keep:  # else it is the worker's, which goes on in it
+        if result.kept and not keep:  # otherwise the worker still uses the folder
             shutil.rmtree(folder, ignore_errors=True)
         return Ran(same, result.steps, result.digest)
 
@@ -237,7 +237,7 @@ class Runs:
         key = self._key(spec)
         self._memory[key] = ran
         line = json.dumps({"key": key, "same": ran.same, "steps": ran.steps, "digest": ran.digest})
-        with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # a full disk is told in the end
+        with suppress(OSError), self._memory_file.open("a", encoding="utf-8") as file:  # `shrink` reports a full disk
             file.write(f"{line}\n")
 
 

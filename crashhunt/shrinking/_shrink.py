@@ -112,22 +112,22 @@ def shrink(
     stopped: Callable[[], bool] = lambda: False,
     trusted: bool | None = None,
 ) -> Shrunk:
-    """Make a crash smaller while it stays the same kind of crash, and write what is left as a bundle beside it.
+    """Minimize a crash while its crash type stays the same, and write the minimized crash as a bundle next to it.
 
-    Others are left out, disturbances dropped, and arguments made plainer: towards their defaults, and rounder. Where it
-    takes more than a few others, these are moved along their recorded ways, of which any can be left out, and the
-    beginning is cut off. The result depends on the crash and the budget only, unless time runs out. Interrupted, it
-    leaves the best that it has, and the same call goes on from there.
+    The search removes other actors and disturbances, and simplifies arguments: towards their defaults, or rounder. If
+    the crash needs more than a few other actors, these follow their recorded paths. Then any path can be removed, and
+    the beginning can be cut off. The result depends on the crash and the budget only, unless time runs out. An
+    interrupted search leaves the best result, and the same call resumes from there.
 
     Args:
         bundle: the crash.
         budget: how many trials may be run.
         time_s: how long that may take, in s of wall-clock time; two runs that confirm what is left come on top.
-        form: ``traffic`` where the others are to go on driving, ``scripted`` where they are not; ``either`` where that
-            depends on how few are left.
+        form: ``traffic``: the other actors drive. ``scripted``: they follow recorded paths. ``either``: the form
+            depends on the number of remaining actors.
         parallel: how many at a time; 0 for one per core.
         watch: called with how many have been run, and how many may be.
-        stopped: asked now and then whether to give up.
+        stopped: Returns whether to stop; called repeatedly.
         trusted: whether its code may run; None to find out.
 
     Raises:
@@ -136,8 +136,8 @@ def shrink(
         CrashhuntError: no trial can be run, or the bundle cannot be written.
     """
     if bundle.id.endswith(layout.SMALL):
-        fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to begin anew"
-        raise UsageError(f"{bundle.id!r} has been made smaller already", fix=fix)
+        fix = f"give --crash {bundle.id.removesuffix(layout.SMALL)} to minimize the original crash again"
+        raise UsageError(f"{bundle.id!r} is already minimized", fix=fix)
     if bundle.result.outcome in (Outcome.SURVIVED, Outcome.FINISHED):
         raise UsageError(f"{bundle.id!r} is a near miss, and nothing crashes in it", fix="give a crash")
     if budget < 1:
@@ -221,10 +221,10 @@ def _written(rerun: Rerun, search: Search, signature: Signature) -> Bundle | Non
         search.best = spec
         small = _run_fresh(rerun, search.best)
         if is_same(signature_of(small), signature, spec):
-            told: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
+            shrunk: dict[str, object] = {"of": bundle.id, "removed": list(search.removed()), "changed": _plain(search)}
             if search.steps_cut:
-                told["steps_cut"] = search.steps_cut
-            return _kept(replace(small, added={**small.added, "shrunk": told}))
+                shrunk["steps_cut"] = search.steps_cut
+            return _kept(replace(small, added={**small.added, "shrunk": shrunk}))
         remove_at_once(small.path)
     return None
 
@@ -235,7 +235,7 @@ def _kept(small: Bundle) -> Bundle:
         small.write()
         small = confirm(small, trusted=True) or small  # it runs what the whole crash was trusted to run
         small.write()
-    except BaseException:  # else it would pass for a crash of the hunt, or for one that nobody has looked at
+    except BaseException:  # an unconfirmed bundle would look like a crash of the hunt
         remove_at_once(small.path)
         raise
     return small

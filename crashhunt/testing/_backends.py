@@ -146,7 +146,7 @@ class BackendContract:
             # As it spells itself: so it is written down, and looked up in what was.
             assert metadata.metadata(distribution)["Name"] == distribution
         assert 0 < backend.step_length_s(loaded) < float("inf")
-        assert set(backend.told_events or ()) <= EVENT_WORDS.keys()
+        assert set(backend.reported_events or ()) <= EVENT_WORDS.keys()
         assert all(note and "\n" not in note for note in backend.notes(loaded))
         assert all(module and ":" not in module for module in loaded.modules())
         assert all(ending.startswith(".") for found in backend.configurations for ending in found.endings)

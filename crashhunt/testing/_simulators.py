@@ -251,7 +251,7 @@ class SimulatorContract:
     def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
         """`TellsEvents`: its scenes have events of those kinds only, and none without it."""
         simulator = make()
-        kinds = tuple(simulator.told_events) if supports(simulator, TellsEvents) else ()
+        kinds = tuple(simulator.reported_events) if supports(simulator, TellsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
         simulator.close()

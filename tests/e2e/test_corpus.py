@@ -141,7 +141,7 @@ def test_what_is_damaged_or_no_case_is_told_and_does_not_keep_the_others(kept):
     (next(first.glob("snapshots/*")) / "scenario" / "scenario.toml").write_text("schema = 1")
     (report, other) = run_cases([first, second], parallel=2)
     assert (report.got, other.got) == ("cannot_run", "still")
-    assert "has changed; get the case back from the repository" in report.now  # there is no --force, as of a replay
+    assert "has changed; restore the case from the repository" in report.now  # there is no --force, as of a replay
     case = second / "crashhunt-case.toml"
     for text, said in (("expect = 'maybe'", "maybe"), ("expect = [", "not valid TOML"), ("", "expect")):
         case.write_text(text)
@@ -169,7 +169,7 @@ def test_a_strangers_crash_is_added_only_with_trust(kept):
 
 
 def test_a_large_log_is_left_out_and_the_case_still_runs(kept, monkeypatch):
-    monkeypatch.setattr("crashhunt.corpus._cases._MOST", 1000)
+    monkeypatch.setattr("crashhunt.corpus._cases._MAX_BYTES_WITH_LOG", 1000)
     added = add_case(find_bundle(kept.folder / "h", "0"), kept.folder / "small")
     assert not list(added.case.path.rglob("log.mcap"))
     (report,) = run_cases([added.case.path])

@@ -74,7 +74,7 @@ def test_every_end_has_its_state(toy):
         "fine": "finished", "crash": "crashed", "none": "error",
     }  # fmt: skip
     assert (found["crash"]["crashes"], found["none"]["errors"]) == (1, 5)
-    assert "told to fail" in found["none"]["detail"]
+    assert "fails as its scenario arguments demand" in found["none"]["detail"]
     (lost,) = (toy.folder / "crash/crashes").glob("*/crash.json")
     lost.unlink()
     (found,) = toy.crashhunt("status", "crash", "--json").json["hunts"]

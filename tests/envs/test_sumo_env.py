@@ -129,7 +129,7 @@ def test_what_disturbs_the_first_observation_is_told_with_it():
 
 
 def test_what_cannot_disturb_is_refused():
-    with pytest.raises(UsageError, match="disturb needs to know how long"):
+    with pytest.raises(UsageError, match="disturb needs a limit of the episode"):
         SumoEnv("loop", disturb="brake=1")
     with pytest.raises(UsageError, match="there is no disturbance 'brakes'"):
         SumoEnv("loop", process=True, disturb="brakes=1", max_steps=5)
@@ -154,7 +154,7 @@ def test_a_process_that_dies_is_told():
         SumoEnv.render(_with_mode(env))
     env.reset(seed=1)
     os.kill(env._episodes._process.pid, signal.SIGKILL)
-    with pytest.raises(SimulatorError, match="ended by signal 9; make a new one"):
+    with pytest.raises(SimulatorError, match="ended by signal 9; make a new environment"):
         env.step((8.0, 0))
     with pytest.raises(SimulatorError, match="has been closed"):
         env.step((8.0, 0))

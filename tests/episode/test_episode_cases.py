@@ -246,7 +246,7 @@ def test_everything_of_a_scene_is_recorded(run):
         2: {"scene": {"off_road": ("other",)}, "events": (event,)},
     }
     simulator = Scripted(script)
-    simulator.told_events = ("teleport", "red_light")
+    simulator.reported_events = ("teleport", "red_light")
     result = run(simulator)
     _, first, second, third = run.recording().scenes()
     assert (first.contacts, first.heights, first.grades, first.spines) == (
@@ -260,7 +260,7 @@ def test_everything_of_a_scene_is_recorded(run):
     assert (result.outcome, result.events) == (Outcome.SURVIVED, {"teleport": 1})
     assert run(Scripted()).events is None
     silent = Scripted()
-    silent.told_events = ("teleport",)
+    silent.reported_events = ("teleport",)
     assert run(silent).events == {}
 
 
@@ -500,7 +500,7 @@ def test_braking_begins_after_a_step():
     assert log == [("seed", 5), "seen", "seen", ("seed", 6), "seen", "closed"]
     Braking(SimpleNamespace(), Car(), "ego", 2).close()
     for simulator, agent in ((Car(), "second"), (Scripted(), "ego")):
-        with pytest.raises(InvalidEpisodeError, match=f"nobody knows how {agent} brakes"):
+        with pytest.raises(InvalidEpisodeError, match=f"{agent} cannot be made to brake fully"):
             Braking(Driver(), simulator, agent, 2)
 
 
@@ -526,5 +526,5 @@ def test_an_agent_is_kept_from_one_thing_after_a_step(keeps, form, decided, done
 
 def test_what_nobody_understands_keeps_nobody_from_anything():
     car = SimpleNamespace(actions={"ego": SimpleNamespace(names=(), space=spaces.Discrete(5))})
-    with pytest.raises(InvalidEpisodeError, match="nobody knows what the actions of ego say"):
+    with pytest.raises(InvalidEpisodeError, match="ego cannot be held: its actions"):
         overruled_agent(SimpleNamespace(), car, Overruled("ego", 2, keeps="lane"))

@@ -48,7 +48,7 @@ def box():
 
 @pytest.fixture
 def recorder(box):
-    return Recorder(box, SimpleNamespace(told_events=("teleport", "red_light")))
+    return Recorder(box, SimpleNamespace(reported_events=("teleport", "red_light")))
 
 
 def test_who_is_new_is_told_once_and_who_is_there_when_that_changes(box, recorder):

@@ -72,7 +72,7 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
         console = Console(width=100, height=height, force_terminal=True, color_system=None)
         with console.capture() as captured:
             console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
-        line = "least stress margin: 0.38, trial 123, whoever is ahead of ego brakes with 2.25 m/s² for 3 s"
+        line = "least stress margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
         assert (line in captured.get()) is shown
 
 

@@ -274,7 +274,7 @@ def test_a_vehicle_of_a_flow_is_waited_for(town, rate, depart_s):
     assert load_scenario(path, ego="a.b.9").agents["a.b.9"].depart_s == depart_s
 
 
-def test_files_beside_and_above_and_compressed(town):
+def test_describe_other_files_and_above_and_compressed(town):
     (town / "cfg").mkdir()
     with gzip.open(town / "r.rou.xml.gz", "wb") as file:
         file.write((town / "r.rou.xml").read_bytes())

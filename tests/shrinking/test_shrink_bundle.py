@@ -43,7 +43,9 @@ def test_what_is_small_or_no_crash_is_refused(crash):
         with pytest.raises(UsageError, match="is a near miss, and nothing crashes in it"):
             shrink(replace(crash, result=replace(crash.result, outcome=outcome)))
     small = replace(crash, path=crash.path.with_name(f"{crash.id}.small"))
-    with pytest.raises(UsageError, match="has been made smaller already; give --crash 000000-collision to begin anew"):
+    with pytest.raises(
+        UsageError, match="is already minimized; give --crash 000000-collision to minimize the original crash again"
+    ):
         shrink(small)
     with pytest.raises(UntrustedError):
         shrink(crash, trusted=False)
@@ -81,7 +83,7 @@ def test_what_is_left_is_written_beside_it_and_confirmed(crash):
     assert (told["signature_kept"], told["confirmed"], told["scripted"], told["steps_cut"]) == (True, True, None, 0)
     assert told["trials_run"] == found.trials > 3
     assert told["steps_run"] == found.steps > 52
-    assert any("can leave nobody out" in note for note in told["notes"])
+    assert any("cannot exclude actors" in note for note in told["notes"])
 
 
 class AskedError(Exception):

@@ -370,7 +370,7 @@ def test_it_says_whom_it_leaves_alone(caplog):
 
 def test_it_steps_aside_for_another_version(monkeypatch):
     monkeypatch.setattr(highway_env, "__version__", "9.9")
-    assert "highway-env 9.9 is not known" in switch_on()
+    assert "highway-env 9.9 is not supported" in switch_on()
     assert Road.act.__module__ == "highway_env.road.road"
 
 

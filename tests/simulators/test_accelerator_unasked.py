@@ -17,7 +17,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.objects import Landmark
 from test_highway import drive, simulator_of
 
-from crashhunt.accelerator import Unasked, switch_off, switch_on
+from crashhunt.accelerator import SkippedObservation, switch_off, switch_on
 from crashhunt.scenario import ObservationSetup
 
 assert HighwaySimulator
@@ -36,7 +36,7 @@ def made(kind=HighwayEnvFast, **config):
 
 
 def stepped(env):
-    with Unasked(env):
+    with SkippedObservation(env):
         return env.step(1)
 
 
@@ -124,7 +124,7 @@ def test_it_is_made_where_somebody_can_tell(make, config, change):
 def test_it_is_made_where_an_environment_looks_at_it():
     env = gymnasium.make("parking-v0", disable_env_checker=True).unwrapped
     env.reset(seed=1)
-    with Unasked(env):
+    with SkippedObservation(env):
         assert env.step(np.zeros(2))[0] is not None
 
 

@@ -306,7 +306,7 @@ MISTAKES = [
     ({"name": "highway-v9"}, "highway-v9"),
     ({"name": "CartPole-v1"}, 'simulator = "gym"'),
     ({"name": "highway-fast-v0", "config": {"vehicle_count": 3}}, "did you mean 'vehicles_count'"),
-    ({"name": "merge-v0", "agents": 2}, "one controlled vehicle, not 2"),
+    ({"name": "merge-v0", "agents": 2}, "one controlled vehicle; the scenario has 2 agents"),
     ({"name": "no.such.module:env-v0"}, "no.such"),
     ({"name": "highway-fast-v0", "config": {"policy_frequency": 6}}, "at most simulation_frequency, 5"),
 ]

@@ -26,5 +26,5 @@ def test_a_name_that_would_be_folders_elsewhere_is_left_out_and_told(tmp_path):
     found = find_sources([], roots=[tmp_path])
     assert f"code/@{tmp_path.name}/kept.txt" in found.files
     assert not [place for place in found.files if "\\" in place]
-    (said,) = found.left_out
+    (said,) = found.excluded
     assert said.endswith("unit-x2d\\x2d1.service: its name has a backslash, which elsewhere parts folders")

@@ -182,7 +182,7 @@ def test_who_changes_lanes_into_a_gap_that_is_too_short():
     assert verdict(drive(straight(25), cuts_in, lanes=Map([], (0.0, 0.0)))) == "nobody can tell"
 
 
-def test_who_moves_sideways_into_who_is_beside():
+def test_who_moves_sideways_into_who_is_in_parallel_lane():
     def moves(t):
         return 0.0 - 20 * t, 1.9 + min(2.1, 2 * t), -0.1, 20.0
 

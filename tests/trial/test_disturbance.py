@@ -68,12 +68,12 @@ def test_data_that_make_no_sense_are_refused(change, says):
     ("disturbance", "words"),
     [
         (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego", "main.35"), "main.35 brakes with 4 m/s² for 2 s"),
-        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego"), "whoever is ahead of ego brakes with 4 m/s² for 2 s"),
+        (Disturbance(1, "ahead", "brake", 4.0, 2.0, "ego"), "the actor ahead of ego brakes with 4 m/s² for 2 s"),
         (Disturbance(1, "left", "cut_in", 0.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s"),
         (Disturbance(1, "left", "cut_in", 2.0, 2.0, "ego", "b"), "b cuts in on ego within 2 s and brakes with 2 m/s²"),
         (Disturbance(1, "behind", "speed", 0.2, 9.0, "ego", "b"), "b wants to drive 20 % faster for 9 s"),
         (Disturbance(1, "itself", "late_action", 0.2, 1.0, "ego"), "what ego does takes effect 0.2 s late for 1 s"),
-        (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "whoever is above of {ego}: fly 2 for 1 s"),
+        (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "the actor above of {ego}: fly 2 for 1 s"),
     ],
 )
 def test_words(disturbance, words):

@@ -89,7 +89,7 @@ BACKEND = Backend(
     check=_check,
     modules=_modules,
     versions=("gymnasium",),
-    told_events=(),
+    reported_events=(),
     disturbances=(),
     side_effect=_side_effect,
 )

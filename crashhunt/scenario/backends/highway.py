@@ -90,7 +90,7 @@ BACKEND = Backend(
     versions=("highway-env", "numpy"),
     per_processor=True,
     step_length_s=_step_length,
-    told_events=("wrong_way", "not_moving"),
+    reported_events=("wrong_way", "not_moving"),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "ignore_priority", "unseen"),
     accelerator=Accelerator(switched_off=_as_it_is, note=_not_accelerated),
     side_effect=_side_effect,

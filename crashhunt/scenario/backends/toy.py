@@ -8,7 +8,7 @@ __all__ = ["BACKEND"]
 
 BACKEND = Backend(
     title="the toy",
-    told_events=(),
+    reported_events=(),
     disturbances=("brake", "stop", "unseen"),
     side_effect=lambda *_: "",
     forkable=True,

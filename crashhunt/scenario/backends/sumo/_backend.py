@@ -151,7 +151,7 @@ BACKEND = Backend(
     notes=_notes,
     versions=("libsumo",),
     variables=("SUMO_HOME",),
-    told_events=tuple(EVENT_WORDS),
+    reported_events=tuple(EVENT_WORDS),
     disturbances=("brake", "stop", "dawdle", "speed", "cut_in", "late_merge", "step_out", "ignore_priority", "unseen"),
     actions=("continuous", "meta"),
     configurations=(Configuration(endings=(".sumocfg", ".sumo.cfg"), load=_load, arguments=("scale", "vehicle")),),
