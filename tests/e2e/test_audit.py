@@ -24,7 +24,7 @@ def test_trials_that_are_the_same_are_said_to_be(toy):
     audit = done.json["audit"]
     assert audit["differences"] == []
     assert 0 < audit["trials"] < 6
-    assert f"Audit: {audit['trials']} run again in fresh processes, {audit['trials']} the same to the bit." in done.err
+    assert f"Audit: {audit['trials']} replayed in new processes, {audit['trials']} bit-identical." in done.err
     assert not (toy.folder / "h" / "trials").exists()
     again = toy.crashhunt(*WORDS, "--arg", "speed=5", "--audit", "0.5", "--overwrite").json["audit"]
     assert again == audit  # which are chosen depends on the seed only

@@ -86,7 +86,7 @@ def test_crashes_that_a_corpus_has_are_told_from_new_ones(kept):
     assert done.json["groups"][0]["known"] is None
     assert "::error file=driver.py,line=2,title=rear end" in done.err
     summary = (kept.folder / "s.md").read_text()
-    assert summary.count("### crashhunt: 2 crashes of 1 kind, ") == 2  # the second is added to the first
+    assert summary.count("### crashhunt: 2 crashes of 1 type, ") == 2  # the second is added to the first
     assert (kept.folder / "x.sarif").is_file()
     assert "known" not in kept.crashhunt("crashes", "h", "--json").json["groups"][0]
     assert "'nowhere' does not exist" in kept.crashhunt("crashes", "h", "--known", "nowhere", expect=2).err

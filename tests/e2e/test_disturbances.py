@@ -30,7 +30,7 @@ def test_crashes_with_disturbances_from_the_hunt_to_the_report(toy):
     assert all(one["vehicle"] == "leader" for data in saved for one in data["disturbances"])
     assert f"{len(disturbed)} with disturbances." in done.err
     likeliest = max(disturbed, key=lambda data: data["log_likelihood"])
-    assert f"The likeliest of those with disturbances: {likeliest['id']} (log-likelihood " in done.err
+    assert f"Likeliest crash with disturbances: {likeliest['id']} (log-likelihood " in done.err
     state = toy.crashhunt("status", "h", "--json").json["hunts"][0]
     assert (state["crashes"], state["disturbed"]) == (len(crashes), len(disturbed))
     assert f"{len(crashes)} ({len(disturbed)} disturbed, " in toy.crashhunt("status", "h").out

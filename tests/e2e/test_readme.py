@@ -22,7 +22,7 @@ VARIES = re.compile(
     r"(collision|finished|survived) \d+(, [a-z_]+ \d+)*|[\da-f]{16,}|/(tmp|dev/shm)/\S+|\d+(\.\d+)?|[─ ]+"
 )
 NOW_AND_THEN = re.compile(
-    r"hunting:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
+    r"running:|done:|saving:|confirming:|.*: (running|finished|crashed)$|\.+ +\[|(.* )?\d+ passed"
 )
 
 

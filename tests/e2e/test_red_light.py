@@ -63,6 +63,6 @@ def test_what_nobody_hunts_for_is_told_at_the_end_and_in_the_table(shell):
     words = ("--scenario", "signal", "--arg", "speed=10", "--seed", "1", "--no-snapshot")
     done = shell.crashhunt("run", "h", "1", "2", "300", *words)
     assert "No crash was found." in done.out
-    assert "Also: 2 red lights run in 2 trials; --crash-on red_light hunts for that." in done.out
+    assert "Traffic events: 2 red lights run in 2 trials. To hunt for them: --crash-on red_light" in done.out
     rows = json.loads(shell.crashhunt("trials", "h", "--format", "json").out)
     assert [(row["outcome"], row["red_light"], row["teleport"]) for row in rows] == [("finished", 1, 0)] * 2

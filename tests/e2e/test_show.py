@@ -60,7 +60,7 @@ def test_software_faults_are_told_too(shell, agent, says):
     shell.crashhunt("run", "h", "1", "1", "100", "--agent", agent, "--set", "vehicles=10")
     text = shell.crashhunt("show", "h").out
     assert says in text
-    assert "The last that it was shown" in text
+    assert "Its last observation, in step" in text
 
 
 def test_a_terminal_that_does_not_know_every_letter_is_shown_the_others(crash):

@@ -41,7 +41,7 @@ def test_arguments_become_plain_and_the_rest_stays(hunt):
     assert small.added["shrunk"]["changed"] == told["changed"] != {}
     assert any("can leave nobody out" in note for note in told["notes"])
     assert hunt.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-    assert f"{was.id} made smaller" in hunt.crashhunt("show", "h", "--crash", small.id).out
+    assert f"minimized from {was.id}: " in hunt.crashhunt("show", "h", "--crash", small.id).out
 
     # To the hunt, it is none of its crashes.
     assert small.id not in [bundle.id for bundle in list_bundles(hunt.folder / "h")]

@@ -201,7 +201,7 @@ def test_ctrl_c_stops_all_hunts_and_keeps_what_has_finished(toy):
     out, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     assert len(json.loads(out)["hunts"]) == 3
-    assert "the same command goes on from here" in err
+    assert "Run the same command to resume" in err
     found = states(toy)
     assert (found["a/0"], found["b/0"], found["c/0"]) == ("interrupted", "interrupted", "queued")
 

@@ -93,7 +93,7 @@ def test_the_place_of_a_collision_is_where_the_agent_is_defined(tmp_path, groups
 
 def test_the_summary_is_a_table_that_nothing_breaks(groups):
     summary = crashes_summary(findings_of(groups))
-    assert summary.startswith("### crashhunt: 6 crashes of 2 kinds\n")
+    assert summary.startswith("### crashhunt: 6 crashes of 2 types\n")
     assert "ego drove into a\\|b" in summary
     rows = [line for line in summary.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
