@@ -47,14 +47,14 @@ class BranchReport:
         moments: from how many copies went on.
         branches: how many there were.
         steps: how many steps they took.
-        left_out: how many were left out, because branches had taken enough steps.
+        left_out: how many were skipped, because branches had taken enough steps.
         crashed: how many crashed.
         crashed_trials: in how many trials.
         not_fully_asked: of how many of the trials a branch has no answer.
         why_unanswered: the reason for the first of them; empty where there is none.
         run_again: how many of these were run from the start: of each trial the likeliest.
         not_finished: how many of these could not be run to their end, as when they are killed from outside.
-        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+        crashes: those of them that crashed in the same way at the same step, and bit-identically once more.
     """
 
     trials: int
@@ -166,10 +166,10 @@ class ProbeReport:
         why_unasked: the reason for the first of them; empty where there is none.
         probes: how many copies were asked.
         steps: how many steps they took.
-        left_out: how many questions were left out, because copies had taken enough steps.
+        left_out: how many questions were skipped, because copies had taken enough steps.
         run_again: how many of the mildest were run from the start.
         not_finished: how many of these could not be run to their end, as when they are killed from outside.
-        crashes: those of them that crashed in the same way at the same step, and once more to the bit.
+        crashes: those of them that crashed in the same way at the same step, and bit-identically once more.
         by: what each of these was probed with, as it took place; others may have been drawn besides.
     """
 
@@ -208,7 +208,7 @@ def verify_probes(copies: VerificationRuns) -> ProbeReport | None:
         copies: runs from the start what they have found.
 
     Returns:
-        None where nobody has asked.
+        None where no copy was asked.
     """
     ledger = copies.again.ledger
     if not copies.again.settings.probe:

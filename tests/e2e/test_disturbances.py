@@ -82,7 +82,7 @@ def test_trials_in_which_nothing_is_drawn_are_those_of_an_undisturbed_hunt(toy):
     assert 'disturb = [\n    "stop=1e-06",\n]' in (toy.folder / "h" / "hunt.toml").read_text()
 
 
-def test_a_scenario_says_it_and_none_takes_it_back(toy):
+def test_a_scenario_states_it_and_none_takes_it_back(toy):
     file = toy.folder / "toy" / "scenario.toml"
     before = file.read_text()
     file.write_text(f"{before}\n[disturbances]\nbrake = 0.5\n")

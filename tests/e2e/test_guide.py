@@ -162,7 +162,7 @@ def test_a_topic_that_is_none_is_refused_from_python_too():
         find_page("x")
 
 
-def test_what_stands_for_the_reference_in_the_file_is_not_shown():
+def test_what_represents_the_reference_in_the_file_is_not_shown():
     for topic in ("commands", "api", "toml", "modules"):
         page = find_page(topic)
         assert "shows them" in page.file.read_text()

@@ -187,7 +187,7 @@ def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
     assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
 
 
-def test_a_hunt_of_ones_own_scenario_begins_anew(toy):
+def test_a_hunt_of_ones_own_scenario_begins_again(toy):
     toy.crashhunt("run", "h", "1", "4", "99", *KEEP)
     before = [row["digest"] for row in rows(toy, "h")]
     for number in range(2):  # the second time, the scenario is that of what was set aside the first time

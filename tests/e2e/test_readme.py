@@ -75,7 +75,7 @@ class Reader:
     ),
     ids=[*ROOTS, *(f"all of {root}" for root in WITH_MORE)],
 )
-def test_every_command_does_what_it_says(root, left_out, shell):
+def test_every_command_does_what_it_states(root, left_out, shell):
     pages = [page for page in tree(root) if page.topic not in left_out]
     assert {page.before for page in pages} <= {page.topic for page in pages} | {""}
     prepare(shell.folder, pages)
@@ -89,7 +89,7 @@ def test_every_command_does_what_it_says(root, left_out, shell):
 
 
 @pytest.mark.parametrize("topic", PAGES)
-def test_what_is_neither_run_nor_written_says_so(topic):
+def test_what_is_neither_run_nor_written_states_so(topic):
     assert not Page(topic).unclear
 
 

@@ -98,7 +98,7 @@ def test_every_hunt_stops_at_its_own_first_crash(toy):
     assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
 
 
-def test_what_cannot_run_leaves_the_others_untouched_and_is_told(toy):
+def test_what_cannot_run_leaves_the_others_untouched_and_is_reported(toy):
     written(toy, SUITE + BROKEN)
     (toy.folder / "explodes.py").write_text("raise OSError('no such luck')")
     done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", expect=1)

@@ -245,7 +245,7 @@ def by_hand(port, folder, **environment):
         process.wait()
 
 
-def test_a_head_that_dies_is_waited_for_and_the_hunt_goes_on_with_the_next_one(toy, started):
+def test_a_head_that_dies_is_waited_for_and_the_hunt_continues_with_the_next_one(toy, started):
     with tempfile.TemporaryDirectory(prefix="chf-", dir="/tmp") as short:
         port = free_port()
         words = ("--executor", f"ray:127.0.0.1:{port}")

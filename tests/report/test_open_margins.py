@@ -36,7 +36,7 @@ def test_nothing_plausible_made_them_crash_is_said_of_fully_asked_trials_only():
     assert probed(0.25, open_ones=2).probes.to_json()["trials"] == 1
 
 
-def test_what_could_not_be_run_from_the_start_is_told_apart_from_what_did_not_crash():
+def test_what_could_not_be_run_from_the_start_is_distinguished_from_what_did_not_crash():
     line = describe_probes(probed(0.25, run_again=3, not_finished=1))[-1]
     assert line == (
         "  of the 3 mildest disturbances that made a trial crash, 0 reproduce the crash from the start, "

@@ -117,7 +117,7 @@ def test_how_many_crashes_had_disturbances(crashes, disturbed, said):
         assert (said in told) if said else ("disturbances" not in told)
 
 
-def test_where_not_all_fit_it_says_how_many_more():
+def test_where_not_all_fit_it_states_how_many_more():
     lines = screen(40, 12, 64)
     assert len(lines) < 12
     assert "and 53 more" in lines[-1]

@@ -79,7 +79,7 @@ class Prologue:
 
     @classmethod
     def decode(cls, payload: bytes) -> Prologue:
-        """Rebuild what `encode` returned; what a later version has added is left out."""
+        """Rebuild what `encode` returned; additions of later versions are ignored."""
         data: _Said = json.loads(payload)
         agents = tuple(AgentChannel(**_columns_prologue(agent)) for agent in data["agents"])
         return cls(agents, data["step_length_s"])
