@@ -95,5 +95,5 @@ def test_long_sentence_of_a_docstring_is_found_at_its_line(tmp_path):
 
 def test_names_of_tests_are_checked_and_their_texts_are_not(tmp_path):
     module = tmp_path / "test_m.py"
-    module.write_text("def test_no_one_drives():\n    # told\n    pass\n")
-    assert [what for _, what, _ in words.findings_in(module)] == ["test_no_one_drives"]
+    module.write_text("def test_nobody_drives():\n    # told\n    pass\n")
+    assert [what for _, what, _ in words.findings_in(module)] == ["test_nobody_drives"]

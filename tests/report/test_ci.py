@@ -99,7 +99,7 @@ def test_the_summary_is_a_table_that_nothing_breaks(groups):
     assert len(rows) == 4
     assert {row.replace("\\|", "").count("|") for row in rows} == {6}
     compared = crashes_summary(findings_of(groups, {groups[0].signature: "kept/one"}), compared=True)
-    assert "2 kinds, 1 new" in compared
+    assert "2 types, 1 new" in compared
     assert "| `kept/one` |" in compared
     assert crashes_summary([]) == "### crashhunt: no crash was saved\n"
 
