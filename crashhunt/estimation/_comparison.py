@@ -46,8 +46,8 @@ class HuntFigures:
         median_time_to_collision_s: of the trials without a crash, the least of each; infinite where most never were
             on a collision course.
         outcomes: how many trials ended how, invalid ones too; of all trials.
-        counted: the origin of the trials that all other figures are of, where the hunt guided the rest of them: only
-            of these does it say something how often they crash. Empty where it is all trials.
+        counted: the origin of the trials that all other figures are of, if the hunt guided the rest of its trials. Only
+            unguided trials show a crash rate. Empty if all trials count.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
     """
 
@@ -77,7 +77,7 @@ class Pair:
         only_first: pairs in which only the first crashed.
         only_second: pairs in which only the second did.
         both: in which both did.
-        p_value: that neither crashes more often; 1 where nothing tells them apart.
+        p_value: that neither crashes more often; 1 where they do not differ.
         caution: why the answer may mean something else; empty for nothing.
         test: which test it is of: ``mcnemar``, the exact one over pairs; ``fisher``, the exact one over all trials of
             each; empty where there is none.

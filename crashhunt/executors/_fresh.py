@@ -90,7 +90,7 @@ class FreshProcessExecutor:
             time.sleep(_LOOK_EVERY_S)
 
     def cancel(self, *, above: int = -1) -> None:
-        """Give up all trials whose number is greater than ``above``, at once."""
+        """Cancel all trials whose number is greater than ``above``, at once."""
         self._waiting = deque(attempt for attempt in self._waiting if attempt.spec.number <= above)
         for number in [number for number in self._running if number > above]:
             self._running.pop(number).kept.end()
@@ -101,7 +101,7 @@ class FreshProcessExecutor:
         return {number: header for number, header in found.items() if header is not None}
 
     def notes(self) -> list[str]:
-        """Return what people should be told that has not been returned before."""
+        """Return new notices for the user."""
         return self._notes.fresh()
 
     def close(self) -> None:
@@ -272,7 +272,7 @@ _STOP_CHECK_INTERVAL_S = 0.1  # how late a request to stop may be
 def snapshot_executor(settings: WorkerSettings, *, parallel: int = 1) -> Executor:
     """Return an executor that runs trials with the code of a snapshot, crashhunt itself included.
 
-    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts Python anew.
+    Snapshots of crashhunt 0.1.0 and before have no fork server: with them, every trial starts a new Python process.
     """
     if has_fork_server(settings):
         return PoolExecutor(settings, parallel=parallel, snapshot=True)
@@ -340,8 +340,8 @@ class SharedExecutors:
 class _Shared:
     """An executor of which each thread waits for its own trial.
 
-    A trial that was stopped may still be running when the same one is asked for again, so that each run gets a number
-    of its own, by which its folder is called.
+    A cancelled trial may still run when the same trial is submitted again. Therefore each run has its own number,
+    which is the name of its folder.
     """
 
     def __init__(self, executor: Executor, scratch: Path) -> None:

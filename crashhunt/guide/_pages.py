@@ -16,13 +16,20 @@ if TYPE_CHECKING:
 
 __all__ = ["SECTIONS", "Page", "completed", "find_page", "for_terminal", "list_pages", "pages_folder"]
 
-SECTIONS = {"tutorials": "Tutorials", "howto": "How to", "reference": "Reference", "": "More"}
+SECTIONS = {
+    "tutorials": "Tutorials",
+    "howto": "How to",
+    "reference": "Reference",
+    "reference/evaluation": "Evaluation",
+    "": "More",
+}
 """The folders of the guide with their titles, in reading order."""
 
 _ORDER = [
     "first-hunt", "your-town", "highway-env", "gymnasium", "ci",
-    "agent", "scenario", "searching", "look-into-a-crash", "kinds-of-crashes", "judge", "fault", "film", "hand-over",
-    "suites", "cluster", "compare", "train",
+    "agent", "scenario", "searching", "disturbances", "probes", "branches", "look-into-a-crash", "kinds-of-crashes",
+    "fault", "judge", "causes", "what-if", "shrink", "film", "near-misses", "hand-over", "corpus", "suites", "warm-up",
+    "cluster", "compare", "train",
     "commands", "api", "toml", "outcomes", "files", "json", "determinism", "security",
     "troubleshooting", "glossary", "architecture", "modules", "contributing", "changelog",
 ]  # fmt: skip

@@ -189,7 +189,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                 note = "an earlier crashhunt wrote it, and its rows have no digests: not every change would be seen"
                 found.findings.append(Finding(str(path), note, damaged=False))
             elif not ledger.sealed and hunt_state(hunt).state != "running":
-                note = "whoever wrote it was killed; a trial that is missing would not be seen"
+                note = "its writer was killed; a missing trial would not be detected"
                 found.findings.append(Finding(str(path), note, damaged=False))
             try:
                 _read_everything(ledger)
@@ -210,7 +210,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
         return None
 
 
-_GO_ON = "crashhunt check --salvage TO copies what is whole, and the same hunt goes on there"
+_GO_ON = "crashhunt check --salvage TO copies the intact part, and the same hunt resumes there"
 
 
 def _read_everything(ledger: Ledger) -> None:
@@ -243,8 +243,8 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         bundle = _check_bundle(found, folder)
         if bundle is not None:
             bundles[folder.name] = bundle
-    beside = _check_beside(found, hunt)
-    needed = {bundle.snapshot: bundle.id for bundle in (*beside, *reversed(bundles.values()))}
+    other = _check_other_bundles(found, hunt)
+    needed = {bundle.snapshot: bundle.id for bundle in (*other, *reversed(bundles.values()))}
     there = {path.name for path in (hunt / layout.SNAPSHOTS).glob(layout.SHOWN)}
     for name in sorted(there | needed.keys()):
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
@@ -278,8 +278,8 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
     return bundle
 
 
-def _check_beside(found: Checked, hunt: Path) -> list[Bundle]:
-    """Near misses, and what probes and branches have found, where they are whole; the ledger has what makes them."""
+def _check_other_bundles(found: Checked, hunt: Path) -> list[Bundle]:
+    """Return the intact bundles of near misses, probes and branches; the ledger can make the damaged ones again."""
     whole = []
     options = {layout.NEAR_MISSES: "--near-misses", layout.PROBES: "--probe", layout.BRANCHES: "--branch"}
     for place, option in options.items():
@@ -319,7 +319,7 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
     try:
         faults = _snapshot_faults(snapshot)
         for name in snapshot.additions():
-            note = f"{name} was not there; no module, so that it is run by nobody"
+            note = f"{name} was added; it is no module, so it never runs"
             found.findings.append(Finding(str(path), note, damaged=False))
     except CrashhuntError as error:
         faults = [error.message]
@@ -348,7 +348,7 @@ def _compare(
             if number not in found.damaged_trials:
                 what = "the ledger has no crash of its trial"
                 found.findings.append(
-                    Finding(where=where, what=what, lost="", fix="run the same command again: the hunt goes on with it")
+                    Finding(where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it")
                 )
         elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
             found.findings.append(
@@ -377,7 +377,7 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
         if owner is not None and not has_ended(owner) and not path.name.startswith(_SCRATCH):
             continue  # shrink may be writing it, here or on another host
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
-        why = "shrink goes on from it" if remembers else "somebody was killed while writing it"
+        why = "shrink resumes from it" if remembers else "its writer was killed"
         what = f"{why}; it may be removed"
         found.findings.append(Finding(str(path), what, damaged=False))
 
@@ -386,9 +386,9 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
 
 
 def salvage(found: Checked, to: Path) -> dict[str, int]:
-    """Copy what is whole of a hunt, so that it goes on there; return how many trials and crashes that were.
+    """Copy the intact part of a hunt, so that it can resume there; return the number of trials and crashes.
 
-    A crash of which the bundle is damaged is left out with its row, and so its trial runs again.
+    A crash with a damaged bundle is skipped together with its row, so its trial runs again.
 
     Args:
         found: the hunt, as it was found.

@@ -47,14 +47,14 @@ _QUEUED_PER_WORKER = 1  # trials handed over ahead of time, so that no worker wa
 class Hunt:
     """One hunt in one directory.
 
-    The same hunt on the same directory goes on where it was; with settings that make other trials it refuses.
+    The same hunt on the same directory resumes. With settings that make other trials, it refuses.
 
     Args:
         directory: made where it does not exist.
         scenario: where the trials take place.
         settings: what was asked.
         command: the command line, as a comment in ``hunt.toml``.
-        overwrite: begin anew, whatever is there.
+        overwrite: begin again, and replace an existing hunt.
         seed_given: whether the seed was asked for; if not, a resumed hunt keeps its own.
         snapshot: what the snapshot of the code takes in.
     """
@@ -298,7 +298,7 @@ class Hunt:
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.last_wanted is not None:
                 return "distinct" if run.keep_going else "crash"
-        except CrashhuntError as error:  # of which file is for somebody who wants to mend it
+        except CrashhuntError as error:  # name the file that the user can correct
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
                 raise
@@ -322,7 +322,7 @@ class Hunt:
         return {number for number in in_flight if number <= above}
 
     def _lag(self, before: Facts) -> int:
-        """By how many trials a sampler that learns is told late."""
+        """Return by how many trials the results for a sampler that learns are delayed."""
         under_way = _under_way(self.settings.run.parallel or self._parallel_here)
         return int(before.get("lag") or max(LAG, under_way)) if self.settings.run.deterministic else under_way
 
@@ -340,7 +340,7 @@ class Hunt:
             self._audits_left.note(audit, progress)
 
     def _restore_ledger(self, ledger: Ledger, progress: Progress) -> None:
-        """Write the ledger anew where somebody has removed it; what was recorded is still at hand.
+        """Write the ledger again if its file was removed while the hunt ran.
 
         Raises:
             HuntDirectoryError: another file is in its place, or the directory is gone.

@@ -45,7 +45,7 @@ class Kinds:
     Args:
         wanted: how many kinds are enough; 0 for never.
         crashes: that were saved before.
-        newest: when the last new kind came, in s since the epoch; None where nobody knows.
+        newest: when the last new kind came, in s since the epoch; None where that is unknown.
         only_at_fault: whether only crashes that are the agent's own fault count towards what is wanted.
         dropped: of each kind, in words, the trials whose bundles were given up before.
     """
@@ -93,7 +93,7 @@ class Kinds:
         return self._groups
 
     def surplus(self, keep: int) -> list[Bundle]:
-        """Return the crashes of which there are so many of the same kind that are shorter, and give them up.
+        """Return the crashes beyond the `keep` shortest of each crash type, and forget them.
 
         They count on, and are no members any more.
         """
@@ -143,7 +143,7 @@ class Kinds:
             if self._only_at_fault and fault_of(bundle, recording).is_egos:
                 self._at_fault.add(number)
         except BundleError:
-            return False  # it is of no kind, and crashhunt check tells of it
+            return False  # it has no crash type, and crashhunt check reports it
         is_new = signature not in self._seen
         self._seen.add(signature)
         self._signed[number] = signature, bundle
@@ -257,12 +257,11 @@ class HuntStatus:
         crashes: found so far; all but the last are saved.
         nodes: the machines that take part now; None where there is this one only.
         kinds: of crashes, the most frequent first; None where the first crash ends the hunt.
-        newest_kind_s: how long ago the last new one came, in s; None where nobody knows.
+        newest_kind_s: how long ago the last new one came, in s; None where that is unknown.
         newest_kind_trials: how many trials have ended since; None where it came in an earlier run of the hunt.
-        time_left_s: until no more trials begin, in s of wall time; infinite where nobody has limited it.
+        time_left_s: until no more trials begin, in s of wall time; infinite without a limit.
         disturbed: how many of the crashes had disturbances; None where the hunt has none.
-        stressed: the trial of this run for whose crash it would have taken the least, as far as copies were asked;
-            None where no copy was asked, or nothing plausible made one crash.
+        stressed: the trial of this run with the least stress margin; None if no copy was asked, or if no copy crashed.
         branched: how many branches of trials of this run have crashed.
         not_fully_asked: of how many trials of this run a question to their copies has no answer.
         search: which strategies have had trials in this run, and when the greatest danger grew.
@@ -371,7 +370,7 @@ class Progress:
 
     @property
     def last_wanted(self) -> int | None:
-        """The number of the trial with which the hunt has found what it is after; None where it goes on."""
+        """The number of the trial with which the hunt has found what it is after; None where the hunt continues."""
         found = self.found.keys() | self.copied.keys()
         return min(found) if found else self.kinds.until if self.kinds is not None else None
 
@@ -401,7 +400,7 @@ class Progress:
 
     @property
     def time_left_s(self) -> float:
-        """Until no more trials begin; infinite where nobody has limited it."""
+        """Until no more trials begin; infinite without a limit."""
         return max(0.0, self.until - time.monotonic())
 
     def look_at(self, executor: Executor) -> None:

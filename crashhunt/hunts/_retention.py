@@ -1,6 +1,6 @@
 """``--keep N``: of each kind of crash the bundles of the shortest few stay, and of the others the rows of the ledger.
 
-The ledger is told first, for good, so that a bundle that is not there has either been given up or is missing.
+The deletion is written to the ledger first, so `check` can distinguish a deleted bundle from a missing one.
 """
 
 from __future__ import annotations

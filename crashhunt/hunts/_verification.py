@@ -1,4 +1,4 @@
-"""Confirmation while a hunt goes on: each crash that it saves is run again, on one of the hunt's own slots."""
+"""Confirmation during a hunt: each saved crash is run again, on one of the hunt's own slots."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ __all__ = [
 
 
 class Confirmation:
-    """Confirms crashes one at a time, beside the thread of the hunt. Meanwhile, the hunt has one slot less.
+    """Confirms crashes one at a time, in a thread of its own. Meanwhile, the hunt has one slot less.
 
-    Crashes that it has not come to when the hunt is over are confirmed then.
+    Crashes that are not confirmed at the end of the hunt are confirmed then.
 
     Args:
         again: runs them.
@@ -83,7 +83,7 @@ class Confirmation:
                 progress.replace([found if found.id == crash.id else crash for crash in progress.crashes])
 
     def close(self, progress: Progress) -> None:
-        """Give up what runs, so that no stop waits for it."""
+        """Cancel the running confirmation, so that no stop waits for it."""
         self._over.set()
         if self._thread is not None:
             self._asked.put(None)
@@ -123,7 +123,7 @@ class TrialReruns:
         parallel: how many run at a time.
         notes: gets a line for whatever went wrong.
         failed: gets what was to confirm something, and ended otherwise.
-        stops: has something in it as soon as somebody wants to stop.
+        stops: non-empty as soon as a stop is requested.
         executors: which run crashes again.
         taken: the digest of the snapshot that this process has taken; without it, each snapshot has to be trusted.
     """
@@ -139,7 +139,7 @@ class TrialReruns:
     taken: str = ""
 
     def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
-        """Yield each trial as it ends, until somebody wants to stop.
+        """Yield each trial as it ends, until a stop is requested.
 
         Args:
             specs: of different trials of the hunt; what else they say may have been changed.
@@ -185,7 +185,7 @@ class TrialReruns:
 
         Args:
             bundle: the crash.
-            stopped: asked now and then whether to give up.
+            stopped: called regularly; true to cancel.
         """
         is_settled = bundle.confirmed is not None and not bundle.result.why_no_escape
         if is_settled or len(self.stops) or stopped():
@@ -274,18 +274,18 @@ class VerificationRuns:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether somebody wants to stop: what was found may not have been run from the start then."""
+        """Whether a stop is requested: crashes of copies may then not have been run from the start."""
         return bool(len(self.again.stops))
 
     def crashes(self, found: Sequence[Found], folder: str) -> tuple[tuple[Bundle, ...], int]:
-        """Return those that crashed in the same way at the same step, and once more to the bit, in their order.
+        """Return those that reproduce at the same step, and once more bit-identically, in their order.
 
         The second value is how many could not be run to their end, so that nothing is known about them.
 
         Args:
             found: of different trials.
-            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. Where somebody wants
-                to stop, it stays.
+            folder: of the hunt, for the bundles; what it had before is gone, but for what is kept. If a stop is
+                requested, it stays.
         """
         if self.is_stopped:
             return (), 0
@@ -298,7 +298,7 @@ class VerificationRuns:
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
     def crash(self, found: Found, folder: str) -> Bundle | None:
-        """Return one that crashed in the same way at the same step, and once more to the bit; it is kept.
+        """Return the bundle of a crash that reproduces at the same step, and once more bit-identically; it is kept.
 
         Args:
             found: how a copy crashed.
@@ -346,14 +346,14 @@ class VerificationRuns:
         return found
 
 
-# The audit: a sample of trials that did not crash is run again, and has to be the same to the bit.
+# The audit: a sample of trials that did not crash is run again, and must be bit-identical.
 #
 # A crash is confirmed in a fresh process anyway. A trial without one that depends on the trials before it in its
 # worker, on a thread or on the clock would go unnoticed, and with it the crash that it did not have.
 
 
 class Audit:
-    """Runs the sample again while the hunt goes on, one trial at a time.
+    """Runs the sample again during the hunt, one trial at a time.
 
     Args:
         settings: of the hunt; they say which trials.
@@ -397,7 +397,7 @@ class Audit:
         self._executor.capacity = parallel
 
     def add(self, result: TrialResult) -> TrialResult:
-        """Take over the recording of a trial of the sample; return the trial as the hunt goes on with it."""
+        """Take over the recording of a trial of the sample; return the trial as the hunt continues with it."""
         if not self._settings.is_audited(result):
             return result
         number = result.spec.number
@@ -431,7 +431,7 @@ class Audit:
         return found
 
     def close(self) -> None:
-        """Give up what has not been run again."""
+        """Cancel the trials that have not been run again."""
         self._executor.close()
 
     def _compare(self, was: TrialResult, now: TrialResult) -> Difference | None:

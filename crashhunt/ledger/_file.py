@@ -109,7 +109,7 @@ def removed(path: Path, was: os.stat_result) -> bool:
         return True
     raise HuntDirectoryError(
         "another file was put in the place of the ledger while the hunt ran",
-        fix="run the hunt again, in a directory that nobody else writes to",
+        fix="run the hunt again, in a directory that no other process writes to",
         where=str(path),
     )
 
@@ -128,6 +128,6 @@ def rewrite(database: sqlite3.Connection, path: Path) -> None:
     except sqlite3.Error as error:
         raise explained(path, error) from error
     except OSError as error:
-        message = f"the ledger was removed while the hunt ran, and cannot be written anew: {error.strerror}"
-        fix = "run the hunt again, in a directory that nobody else writes to"
+        message = f"the ledger was removed while the hunt ran, and cannot be written again: {error.strerror}"
+        fix = "run the hunt again, in a directory that no other process writes to"
         raise HuntDirectoryError(message, fix=fix, where=str(path)) from error

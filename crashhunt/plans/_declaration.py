@@ -37,8 +37,7 @@ Form = Literal["flag", "integer", "number", "text", "list", "table"]
 Check = Callable[[Any], str]  # what to give instead; empty where the value is fine
 
 Given: TypeAlias = Mapping[str, Any]
-"""Options by name, as somebody gives them. Of which types they are the list says, and `HuntOption.checked` sees to it;
-a type checker would need the list a second time."""
+"""Options by name, as the user gives them. The list defines their types, and `HuntOption.checked` checks them."""
 
 _ABOUT = "crashhunt"  # the key of a field's metadata
 
@@ -50,7 +49,7 @@ class About:
     Args:
         meaning: of its value, in words.
         help: the same on the command line, where it has to be said otherwise.
-        unset: what holds where it is not given, in words; left out where that is the default itself.
+        unset: what holds where it is not given, in words; empty where that is the default itself.
         flag: on the command line; empty where it is not there.
         metavar: of its value, on the command line.
         group: of the help of ``crashhunt run``.
@@ -204,7 +203,7 @@ _FORM_OF: Mapping[object, Form] = {
 }  # fmt: skip
 
 
-# ``--for TIME`` and ``--probe TIME``: how long a hunt may go on, how often something is done.
+# ``--for TIME`` and ``--probe TIME``: time limits and intervals.
 
 _UNITS = (86400.0, 3600.0, 60.0, 1.0)  # days, hours, minutes, seconds
 _TIME = re.compile(r"(?:(\d+(?:\.\d+)?)d)?(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?")

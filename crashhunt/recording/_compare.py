@@ -16,7 +16,7 @@ __all__ = ["first_divergence", "values_around"]
 
 
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
-    """Return the first difference to the bit, or None where the two are equal.
+    """Return the first difference of bits, or None where the two are bit-identical.
 
     Within a step, observations come before actions and actions before the scene, as in the episode.
     """

@@ -56,7 +56,7 @@ def write_log(
     Args:
         path: of the file.
         recording: what happened.
-        lanes: of the map, for whoever looks at it.
+        lanes: of the map, for viewers.
         metadata: further facts.
         crash: how it ended, for the crash marker and the log line.
         views: whether other tools have something to see; without, it is half as large.

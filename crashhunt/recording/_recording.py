@@ -94,7 +94,7 @@ class Recording:
 
     @property
     def disturbances(self) -> tuple[Disturbance, ...]:
-        """Those that began, as they took place; of one for which nobody was there, the vehicle is empty."""
+        """Those that began, as they took place; without a target, the vehicle is empty."""
         return tuple(one for step in self.all_steps for one in step.more.get("disturbance", ()))
 
     def _channel(self, agent: str) -> AgentChannel:

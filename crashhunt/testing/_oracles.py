@@ -32,7 +32,7 @@ class OracleContract:
         """Return what makes an oracle."""
         raise NotImplementedError("give the suite a fixture named make")
 
-    def test_it_has_a_name_and_says_which_outcomes_it_brings(self, make: Make) -> None:
+    def test_it_has_a_name_and_states_which_outcomes_it_brings(self, make: Make) -> None:
         """As names and categories that reports can print."""
         oracle = make()
         assert isinstance(oracle.name, str)
@@ -66,7 +66,7 @@ class OracleContract:
             assert (scene.data.tolist(), scene.contacts, scene.off_road, scene.events, scene.lanes) == before
 
     def test_it_bears_agents_that_are_not_there_and_empty_roads(self, make: Make) -> None:
-        """Somebody who has arrived is in no scene any more."""
+        """A vehicle that has arrived is in no scene any more."""
         oracle = make()
         _show_map(oracle, lanes=())
         assert oracle.check(Scene(0.0, Roster(()), [], [], []), _AGENTS) == []
@@ -117,7 +117,7 @@ def drive() -> Iterator[Scene]:
 
 def _watch(oracle: Oracle, seed: int = 0) -> Iterator[list[Finding]]:
     _show_map(oracle)
-    random.seed(seed)  # whoever draws from a global generator is found out by another seed
+    random.seed(seed)  # another seed detects draws from a global generator
     np.random.seed(seed)  # noqa: NPY002
     for scene in drive():
         yield oracle.check(scene, _AGENTS)

@@ -139,7 +139,7 @@ class SimulatorContract:
         two.close()
 
     def test_what_is_handed_out_stays_as_it_is(self, make: Make) -> None:
-        """Neither observations nor scenes change when the episode goes on."""
+        """Neither observations nor scenes change when the episode continues."""
         simulator = make()
         observations, _ = simulator.reset(seed=1)
         scene = simulator.scene()
@@ -286,7 +286,7 @@ class SimulatorContract:
                 if errs is not None:
                     assert np.isfinite(errs.how_strong)
                     errs.keep()
-        for errs in list(erring.values())[::2]:  # the others still go on at the end
+        for errs in list(erring.values())[::2]:  # the others continue to the end
             if errs is not None:
                 errs.end()
         assert self._drive(simulator, 1) == before

@@ -108,7 +108,7 @@ def test_what_was_made_here_is_trusted_wherever_it_is_now(place):
 
 
 @pytest.mark.parametrize("code", ["snapshot", "current"])
-def test_what_another_user_made_is_refused_and_says_what_would_run(place, code):
+def test_what_another_user_made_is_refused_and_states_what_would_run(place, code):
     bundle = crash_of(place / "theirs")
     assert not is_bundle_trusted(bundle)
     assert not is_hunt_trusted(place / "theirs", latest_snapshot(place / "theirs"))

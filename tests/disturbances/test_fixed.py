@@ -112,7 +112,7 @@ def test_where_it_is_fixed_whether_it_is_drawn_as_well_makes_no_difference():
     assert math.isclose(always.log_likelihood(drawn, 5), expected)
 
 
-def test_a_branch_keeps_what_is_fixed_after_it_and_what_has_begun_is_not_told_again():
+def test_a_branch_keeps_what_is_fixed_after_it_and_what_has_begun_is_not_reported_again():
     draws = disturber([STOP], brake=0.5)
     for number in range(20):
         assert STOP in draws.draw_another(3, number, 10, 5, 40)

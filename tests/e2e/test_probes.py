@@ -25,7 +25,7 @@ default = 15.0
 
 
 @pytest.mark.long
-def test_a_hunt_tells_how_little_it_would_take_and_confirms_it_from_the_start(shell):
+def test_a_hunt_reports_how_little_it_would_take_and_confirms_it_from_the_start(shell):
     (shell.folder / "toy.toml").write_text(TOY)
     words = ("run", "h", "1", "3", "60", "--scenario", "toy.toml", "--seed", "4", "--arg", "speed=9", "--keep-going")
     besides = "--disturb", "noisy_observation@52=itself:0.01:0.1"  # after the probe, and before the crash

@@ -148,7 +148,7 @@ def test_its_table_files_and_versions_are_those_of_the_hunt_and_its_crash_is_rep
     assert "the side effects of the simulator 'mysim' are unknown; give --trust" in refused.err
 
 
-def test_mistakes_are_told_in_one_line(mysim):
+def test_mistakes_are_reported_in_one_line(mysim):
     file = mysim.folder / "town" / "scenario.toml"
     for said, instead, says in (
         ("road =", "rod =", "unknown key 'mysim.rod'; did you mean 'road'?"),

@@ -119,7 +119,7 @@ def test_others_err_where_it_is_asked_for():
     assert not np.array_equal(first[-1], undisturbed[-1][0])
 
 
-def test_what_disturbs_the_first_observation_is_told_with_it():
+def test_what_disturbs_the_first_observation_is_reported_with_it():
     env = SumoEnv("loop", disturb="late_observation@1=itself:0.2:1,late_action@2=itself:0.2:1", max_steps=5)
     _, told = env.reset(seed=4)
     *_, then = env.step((8.0, 0))
@@ -148,7 +148,7 @@ def ended(pid):
     return False
 
 
-def test_a_process_that_dies_is_told():
+def test_a_process_that_dies_is_reported():
     env = SumoEnv(process=True)
     with pytest.raises(UsageError, match="nothing to render"):
         SumoEnv.render(_with_mode(env))

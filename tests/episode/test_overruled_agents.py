@@ -72,7 +72,7 @@ def test_it_changes_lanes_in_its_first_decision(side, change):
     assert said(meta, 3) == ["drive", WORDS.index(f"LANE_{side.upper()}"), "full"]
 
 
-def test_whom_nobody_knows_how_to_overrule_is_refused():
+def test_which_no_one_knows_how_to_overrule_is_refused():
     unknown = action_form(spaces.Box(-1.0, 1.0, (2,)))
     for simulator, overruled, what in (
         (Lanes(brakes=""), Overruled("ego", 1), "ego cannot be made to brake"),

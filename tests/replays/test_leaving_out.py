@@ -48,7 +48,7 @@ def told(step, what, vehicle):
         ([], "unclear"),
     ],
 )
-def test_somebody_who_was_not_held_says_nothing(disturbances, ending):
+def test_an_actor_who_was_not_held_states_nothing(disturbances, ending):
     held = Disturbance(5, "itself", "gone", 0.0, 1.0, "ego", "x")
     spec = TrialSpec(7, 1, {"ego": {}}, {}, 99, disturbances=(held,))
     asked = _Asked(Factor("other", "x", "there", 8), [(4, spec)], inside=True)

@@ -23,7 +23,7 @@ SPEC = TrialSpec(1, 2, {"ego": {"speed": 3.0}}, {}, 9)
         {"only": ()},
     ],
 )
-def test_another_trial_than_was_asked_for_says_nothing(asked):
+def test_another_trial_than_was_asked_for_states_nothing(asked):
     spec = replace(SPEC, **asked)
     _see_that_it_was_run(spec, TrialSpec.from_json(spec.to_json()))
     with pytest.raises(NotUnderstoodError, match="too old"):

@@ -39,7 +39,7 @@ class Refuses:
         raise self.error(f"trial {self.spec.number} has only, which crashhunt 0.1.0 does not know")
 
 
-def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_nobody_left_out(tmp_path, monkeypatch):
+def test_an_older_crashhunt_that_refuses_to_leave_others_out_has_no_one_excluded(tmp_path, monkeypatch):
     monkeypatch.setattr(_runs, "PoolExecutor", Refuses)
     rerun = SimpleNamespace(worker=Worker(), bundle=SimpleNamespace(result=SimpleNamespace(steps_begun=9)))
     words = {"parallel": 1, "budget": 9, "time_s": None, "stopped": lambda: False, "watch": None}

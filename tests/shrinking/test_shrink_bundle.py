@@ -52,7 +52,7 @@ def test_what_is_small_or_no_crash_is_refused(crash):
 
 
 @pytest.mark.long
-def test_what_is_left_is_written_beside_it_and_confirmed(crash):
+def test_what_is_left_is_written_next_to_it_and_confirmed(crash):
     with_budget = shrink(crash, budget=1, parallel=1, trusted=True)
     assert (with_budget.verdict, with_budget.ended, with_budget.small) == ("unchanged", "budget", None)
     assert with_budget.to_json()["path"] is None
@@ -154,7 +154,7 @@ def test_what_cannot_be_confirmed_leaves_nothing(crash, tmp_path, monkeypatch):
     assert not path.exists()
 
 
-def test_a_crash_that_does_not_come_again_is_told(crash, monkeypatch):
+def test_a_crash_that_does_not_come_again_is_reported(crash, monkeypatch):
     runs = SimpleNamespace(
         most_steps=9, count=3, steps=30, first=lambda specs, *, again=False: None, close=lambda: None
     )  # fmt: skip

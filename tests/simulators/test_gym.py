@@ -116,7 +116,7 @@ def fall(simulator, steps=100):
         ({"termination": True}, "terminated"),
     ],
 )
-def test_the_crash_rule_says_when_and_why(tmp_path, crash, says):
+def test_the_crash_rule_states_when_and_why(tmp_path, crash, says):
     simulator = simulator_of(tmp_path, "Tray-v0", crash=crash)
     step = fall(simulator)
     (contact,) = simulator.scene().contacts
@@ -235,7 +235,7 @@ def make_straying():
     return Straying()
 
 
-def test_observations_that_the_environment_does_not_promise_are_told_once(tmp_path):
+def test_observations_that_the_environment_does_not_promise_are_reported_once(tmp_path):
     simulator = simulator_of(tmp_path, f"{__name__}:make_straying")
     for _ in range(2):
         simulator.reset(seed=1)
@@ -257,7 +257,7 @@ agent = "random"
 """
 
 
-def test_a_hunt_tells_it_in_its_summary(shell):
+def test_a_hunt_reports_it_in_its_summary(shell):
     source = Path(__file__).read_text(encoding="utf-8")
     body = source.partition("class Straying")[2].partition("\n\n\ndef test_")[0]
     (shell.folder / "straying.py").write_text(
@@ -286,7 +286,7 @@ gymnasium.register("Near-v0", entry_point=Near)
 
 
 @pytest.mark.parametrize(("danger", "most"), [("-info.left", 1 / 1.25), ("info.share", 0.875), ("info.other", None)])
-def test_where_no_scene_says_it_the_environment_names_its_danger(tmp_path, danger, most):
+def test_where_no_scene_states_it_the_environment_names_its_danger(tmp_path, danger, most):
     scenario = scenario_of("Near-v0")
     simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), tmp_path)
     for _ in range(2):  # of an episode, nothing is left in the next

@@ -19,7 +19,7 @@ def test_in_a_hook_of_another_repository_a_folder_is_still_of_its_own(tmp_path, 
     assert git(tmp_path / "here", "rev-parse", "--absolute-git-dir") == f"{tmp_path}/here/.git\n".encode()
 
 
-def test_a_name_that_would_be_folders_elsewhere_is_left_out_and_told(tmp_path):
+def test_a_name_that_would_be_folders_elsewhere_is_excluded_and_reported(tmp_path):
     """A snapshot is refused that has one, as it might be unpacked anywhere; a hunt is not, as its project has one."""
     for name in ("unit-x2d\\x2d1.service", "kept.txt"):
         (tmp_path / name).write_text("")

@@ -34,7 +34,7 @@ disturbances = st.builds(
 
 
 @given(st.lists(disturbances).map(tuple), st.lists(disturbances).map(tuple), st.none() | st.floats(-1e9, 0))
-def test_a_disturbed_trial_survives_json_and_can_be_told(planned, happened, likely):
+def test_a_disturbed_trial_survives_json_and_can_be_reported(planned, happened, likely):
     spec = TrialSpec(3, 1, {}, {}, 9, disturbances=planned)
     result = TrialResult(spec, Outcome.SURVIVED, steps=9, disturbances=happened, log_likelihood=likely)
     data = json.loads(json.dumps(result.to_json(), allow_nan=False))
@@ -80,7 +80,7 @@ def test_words(disturbance, words):
     assert disturbance.words == words
 
 
-def test_what_had_an_effect_began_by_the_end_with_somebody_there():
+def test_what_had_an_effect_began_by_the_end_with_an_actor_there():
     there, nobody = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego", "b"), Disturbance(3, "ahead", "brake", 4.0, 2.0)
     result = TrialResult(TrialSpec(3, 1, {}, {}, 9), Outcome.COLLISION, steps=5)
     assert in_effect(result, [nobody, there]).disturbances == (there,)

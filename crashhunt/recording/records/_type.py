@@ -89,7 +89,7 @@ class RecordType:
     Args:
         tag: its number in the black box; from `FIRST_ASIDE` on it is no evidence. Never given twice.
         name: for people, and for the place of a value.
-        topic: of its messages in a log; ``{agent}`` stands for the agent whose number is the record's ``aux``.
+        topic: of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's ``aux``.
         form: how it looks there. A type that came after the first eleven is text or bytes, so that a crashhunt that
             does not know it can read the record and count it in the digest; what people want to see of it is a view.
         read: adds a record, given as ``aux`` and payload, to what has been read so far.
@@ -116,10 +116,10 @@ def scene_texts(*fields: str) -> Difference:
     """Return a comparison of some fields of the scenes."""
 
     def difference(left: StepRecord, right: StepRecord, _: AgentChannel | None) -> Divergence | None:
-        if left.scene is None or right.scene is None:  # which the step tells
+        if left.scene is None or right.scene is None:  # which the step reports
             return None
         for field in fields:
-            # As text, in which a speed that nobody knows, NaN, equals itself.
+            # As text, in which an unknown speed, NaN, equals itself.
             was, now = str(getattr(left.scene, field)), str(getattr(right.scene, field))
             if was != now:
                 return Divergence(step=left.step, agent="", field=f"scene.{field}", recorded=was, replayed=now)
