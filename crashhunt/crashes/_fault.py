@@ -367,14 +367,14 @@ def fault_of(bundle: Bundle, recording: Recording | None = None) -> Fault:
     time_s = hit.time_s if end_s - found.prologue.step_length_s <= hit.time_s <= end_s else end_s
     return fault_in(
         Case(
-            hit.agent,
-            hit.other,
-            scenes,
-            time_s,
-            scenes[0].time_s,
-            lanes,
-            events,
-            _right_of_way_of(bundle),
+            agent=hit.agent,
+            other=hit.other,
+            scenes=scenes,
+            time_s=time_s,
+            began_s=scenes[0].time_s,
+            lanes=lanes,
+            events=events,
+            right_of_way=_right_of_way_of(bundle),
             lane=hit.lane,
         )
     )

@@ -181,7 +181,7 @@ def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_agai
     report = json.loads(out)
     assert (report["outcomes"], report["crashes"], report["unanswered"]) == ({"invalid": 1, "survived": 1}, [], 1)
     assert (
-        "Answers are missing from 1 trial: processes were killed from outside. Run the same command to run it again."
+        "1 trial has incomplete answers: processes were killed from outside. Run the same command to run it again."
         in err
     )
     again = shell.crashhunt(*words).json
