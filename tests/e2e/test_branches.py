@@ -69,7 +69,7 @@ def test_a_hunt_stops_at_what_a_branch_has_found(shell):
         f"Trial {int(first[:6])} did not crash, but a copy of it did. The crash reproduces from the start." in done.err
     )
     assert f"Replay it:  crashhunt replay h/branches/{first}" in done.err
-    assert "log-likelihood of those that were drawn" in done.err
+    assert "log-likelihood of exactly these disturbances" in done.err
     anew = shell.crashhunt(*asked, "--overwrite", "--deterministic").json
     assert (anew["stopped_because"], anew["copied"]) == ("crash", f"h/branches/{first}")
     assert anew["trials_run"] < 9
