@@ -1,4 +1,4 @@
-from ._counts import Counts as Counts, CountsData as CountsData, Run as Run
+from ._counts import Counts as Counts, Run as Run
 from ._engine import FUTURES as FUTURES, WhatIfOptions as WhatIfOptions, what_if as what_if
 from ._interventions import (
     Disturb as Disturb,

@@ -201,6 +201,7 @@ def test_ctrl_c_counts_the_runs_that_ended(toy):
         assert running.returncode == (0 if more else 130), err
         assert "Traceback" not in err
         assert f"  interrupted: {why}, after " in out
+        assert "(those before the first run that had not finished)" in out
         assert int(out.split(" of ")[1].split(" runs")[0]) > 0
 
 
@@ -254,7 +255,8 @@ def test_runs_that_are_killed_or_differ_before_the_step_do_not_count(crash, monk
 def test_crash_of_an_earlier_version_takes_changes_and_names_what_needs_todays_code(toy, name):
     bundle = str(Path(__file__).with_name("bundles") / f"{name}.zip")
     done = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", "--futures", "--times", "2", expect=2)
-    assert "is too old for this change; add --code current" in done.err
+    assert "the crashhunt in the snapshot of this crash is too old for this change" in done.err
+    assert done.err.endswith("add --code current\n")
     assert done.err.count("\n") == 1
     found = toy.crashhunt("whatif", bundle, "--trust", "--from-step", "3", *SPEED, "speed=5", "--json").json
     assert (found["runs"], found["crashed"], found["from_step"], found["code"]) == (1, 0, 3, "current")
