@@ -27,7 +27,7 @@ from crashhunt.executors._environment import has_fork_server, snapshot_environme
 from crashhunt.executors._fork_server import fork_zygote
 from crashhunt.executors._pool import PoolExecutor
 from crashhunt.executors._postmortem import Attempt, damaged, hung, result_of_death, where_it_is
-from crashhunt.executors._protocol import Notes
+from crashhunt.executors._protocol import Notes, run_trials
 from crashhunt.executors._supervisor import LostTrialError, Supervisor, UnfitZygoteError, with_escape
 from crashhunt.executors._time_limits import START_UP_S, ImportKilledError, has_hung, import_died
 from crashhunt.trial import TrialResult, TrialSpec
@@ -288,12 +288,8 @@ def run_alone(
         CrashhuntError: it cannot be run.
     """
     with closing(FreshProcessExecutor(settings)) as executor:
-        executor.submit(spec)
-        while True:
-            for result in executor.completed(_STOP_CHECK_INTERVAL_S):
-                return result
-            if stopped():
-                return None
+        runs = run_trials(executor, [spec], stopped=stopped, check_every_s=_STOP_CHECK_INTERVAL_S)
+        return next((result for _, result in runs), None)
 
 
 class SharedExecutors:

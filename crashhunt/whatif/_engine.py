@@ -23,19 +23,21 @@ import numpy as np
 from crashhunt.base.errors import UsageError, WorkerError
 from crashhunt.base.temporary import temporary_folder
 from crashhunt.recording import first_divergence
-from crashhunt.replays import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, is_todays, prepare, up_to
+from crashhunt.replays import ReplayOptions, is_todays, prepare, up_to
 from crashhunt.trial import EVERYBODY, Outcome, Reseeding
 from crashhunt.whatif._counts import Counts, Run
 from crashhunt.whatif._interventions import LeaveOut, Reseed, SetArguments
+from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle
-    from crashhunt.replays import Code, Ended, Rerun
+    from crashhunt.replays import Code, Rerun
     from crashhunt.trial import TrialSpec
     from crashhunt.whatif._interventions import Intervention
+    from crashhunt.whatif._reruns import Ended
 
 
 __all__ = ["FUTURES", "WhatIfOptions", "future_seed", "what_if"]

@@ -14,9 +14,10 @@ import crashhunt
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import find_bundle
 from crashhunt.recording import first_divergence
-from crashhunt.replays import ReplayOptions, Reruns, prepare, up_to
+from crashhunt.replays import ReplayOptions, prepare, up_to
 from crashhunt.trial import KILLED, Failure, Outcome, Reseeding
 from crashhunt.whatif import Reseed, WhatIfOptions, _engine, what_if
+from crashhunt.whatif._reruns import Reruns
 
 SPEED = ("--agent", "crashhunt.agents:KeepLaneWithSpeed", "--arg")
 
@@ -218,8 +219,8 @@ def test_python_counts_as_the_command_does(crash):
 class Tampered(Reruns):
     """Runs of which some are changed on the way."""
 
-    def run(self, specs, *, recorded=True):
-        for ended in super().run(specs, recorded=recorded):
+    def run(self, specs, **options):
+        for ended in super().run(specs, **options):
             if ended.place == 1:
                 failure = Failure(KILLED, "killed from outside 3 times", exit_code=-9)
                 killed = replace(ended.result, outcome=Outcome.INVALID, failure=failure)

@@ -19,8 +19,8 @@ from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, partner, signature_of_fault
 from crashhunt.plans import read_settings
 from crashhunt.recording import read_lanes
-from crashhunt.replays._prepare import StoppedError
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
+from crashhunt.whatif._reruns import StoppedError
 from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
-    from crashhunt.replays._prepare import Ended, Rerun, Reruns
+    from crashhunt.replays import Rerun
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
+    from crashhunt.whatif._reruns import Ended, Reruns
     from crashhunt.world import Scene
 
 
