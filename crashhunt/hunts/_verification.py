@@ -457,7 +457,7 @@ class Audit:
                 recorded=found.recorded,
                 replayed=found.replayed,
             )
-        if (was.outcome, was.digest) != (now.outcome, now.digest):
+        if not was.is_identical_run(now):
             return Difference(
                 trial=number,
                 step=now.steps,
@@ -536,7 +536,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
             if now.was_killed_from_outside:
                 continue
             left.discard(now.spec.number)
-            if (was.outcome, was.digest) != (now.outcome, now.digest):
+            if not was.is_identical_run(now):
                 difference = Difference(
                     trial=now.spec.number,
                     step=None,

@@ -7,8 +7,11 @@ does not count, and the counts say why: it would answer a question about another
 Invariant: which runs count depends on their numbers only. Runs end in the order of their lengths, and crashed runs are
 short. Where the runs are stopped, only those before the first unfinished number count.
 
-Warm workers keep the simulator as it is after its set-up, and each run is a fork of that. Forks at the step itself
-would be cheaper, but would show nothing about the steps before.
+Cost: a run is a fork of a simulator that has been set up, so only its steps are simulated. Measured on a busy machine,
+one run at a time: 72 ms per run of 148 steps on loop, 108 ms per run of 392 steps on merge. The trial itself takes 45
+and 91 ms of that. A fork 20 steps before the end would cost about 9 ms and save all steps before it. The runs would be
+about 1.7 and 3.5 times as fast: 50 futures would take 3.4 s each instead of 4.7 s and 6.8 s, start-up included.
+It is not built: the steps before the fork would be verified once, while now each counted run is verified by itself.
 """
 
 from __future__ import annotations

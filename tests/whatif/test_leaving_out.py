@@ -19,7 +19,7 @@ def search():
     found = object.__new__(_Search)
     found._spec = SPEC
     found._hit = SimpleNamespace(collider="ego", victim="x")
-    found.__dict__["_states"] = [b"\0" * 8] * 9
+    found._recording = Recorded()
     return found
 
 
