@@ -29,9 +29,9 @@ from towns import TOWNS, make_town
 
 from crashhunt.crashes import ending_of, fault_of, list_bundles, overruled_trial
 from crashhunt.replays import ReplayOptions, Rerun, prepare
-from crashhunt.replays._causes import _Search
-from crashhunt.replays._prepare import Reruns
 from crashhunt.trial import KINDS, Disturbance, Outcome
+from crashhunt.whatif._causes import _Search
+from crashhunt.whatif._reruns import Reruns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.crashes._encounter import Encounter, last_escape
+from crashhunt.recording import has_same_scenes
 from crashhunt.trial import Escape, Outcome, Overruled
 
 if TYPE_CHECKING:
@@ -182,11 +183,7 @@ def ending_of(
     """
     hit = result.collision
     assert hit is not None
-    # The run must be bit-identical up to the override, otherwise it does not answer the question.
-    if rerun_recording.steps < after or any(
-        recording.scene(step).frame[1].tobytes() != rerun_recording.scene(step).frame[1].tobytes()
-        for step in range(after + 1)
-    ):
+    if not has_same_scenes(recording, rerun_recording, after):
         return "diverged"
     if rerun.outcome is Outcome.COLLISION and rerun.collision is not None:
         same = {rerun.collision.collider, rerun.collision.victim} == {hit.collider, hit.victim}

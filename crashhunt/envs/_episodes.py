@@ -133,6 +133,24 @@ class Episodes:
             info["outcome"] = str(finding.outcome) if finding is not None else "finished"
         return episode.observations[self.agent], episode.rewards[self.agent], terminated, info
 
+    def require_branch(self, *, reseeded: bool) -> None:
+        """Check that there can be copies of the running episode.
+
+        Raises:
+            SimulatorError: no episode runs.
+            UsageError: the copies are to be re-seeded, and the simulator does not support that.
+        """
+        if self._episode is None or self._episode.result is not None or self.agent not in self._simulator.agents:
+            raise SimulatorError("no episode is running, so there is nothing to branch", fix="call reset")
+        _raise_error(self._episode)
+        if reseeded and self._simulator.why_no_reseeding:
+            raise UsageError(f"branch cannot re-seed: {self._simulator.why_no_reseeding}", fix="leave seed out")
+
+    def reseed(self, seed: int) -> None:
+        """Give SUMO's random generators another seed from the next step on."""
+        assert self._episode is not None
+        self._episode.reseed(seed)
+
     def picture(self) -> NDArray[np.generic]:
         """Return the scene from above, uint8, shape (540, 960, 3)."""
         from crashhunt.recording import lane_borders

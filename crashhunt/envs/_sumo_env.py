@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import os
 import weakref
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import numpy as np
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_of
@@ -17,7 +19,6 @@ from crashhunt.envs._process import RemoteEpisodes
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
 __all__ = ["SumoEnv"]
@@ -88,7 +89,7 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self.action_space = self._episodes.action_space
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._episodes.step_length_s))}
-        self._steps = -1
+        self._steps, self._is_copy = -1, False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -99,6 +100,10 @@ class SumoEnv(gymnasium.Env[Any, Any]):
             seed: Seed of the environment's generator, which draws the seeds of this and of all later episodes.
             options: ``{"arguments": {name: value}}``: scenario arguments that differ from their defaults.
         """
+        if self._is_copy:
+            raise UsageError(
+                "a copy of an episode cannot be reset", fix="reset the original, or make a new environment"
+            )
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31))
         self._steps = 0
@@ -115,6 +120,38 @@ class SumoEnv(gymnasium.Env[Any, Any]):
         self._steps += 1
         truncated = not terminated and self._max_steps is not None and self._steps >= self._max_steps
         return observation, reward, terminated, truncated, info
+
+    def branch(self, n: int, *, seed: int | None = None) -> list[SumoEnv]:
+        """Return independent copies of the running episode, each in a fork of the process of this environment.
+
+        Each copy continues where this environment is. With the same actions, copies without a ``seed`` return
+        bit-identical observations. Copies may be branched again, and outlive this environment. Close each of them.
+
+        Args:
+            n: how many, at least 1.
+            seed: from which each copy gets another seed for SUMO's random generators, so that drivers behave
+                differently; when vehicles depart stays as planned. None to keep the state of the generators.
+
+        Raises:
+            UsageError: this environment runs in the user's process, or SUMO's generators cannot be re-seeded.
+            SimulatorError: no episode is running, or its process cannot be forked.
+        """
+        if n < 1:
+            raise UsageError(f"n is {n}", fix="branch at least 1 copy")
+        if seed is not None and seed < 0:
+            raise UsageError(f"seed is {seed}", fix="give 0 or more")
+        if not isinstance(self._episodes, RemoteEpisodes):
+            message = "only an environment with a process of its own can be branched"
+            raise UsageError(message, fix="make it with process=True")
+        seeds: list[int | None] = [None] * n
+        if seed is not None:
+            seeds = [int(one) >> 1 for one in np.random.SeedSequence(seed).generate_state(n)]
+        found = []
+        for episodes in self._episodes.branch(seeds):
+            env = copy.copy(self)
+            env._episodes, env._is_copy = episodes, True
+            found.append(env)
+        return found
 
     def render(self) -> NDArray[np.generic] | None:
         """Return the scene from above if ``render_mode`` is ``rgb_array``; otherwise None.

@@ -13,7 +13,7 @@ from crashhunt.base.json_types import ErrorData, ErrorWords
 from crashhunt.plans import SizesItself, executor_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
@@ -39,6 +39,7 @@ __all__ = [
     "SizesItself",
     "ToForkServer",
     "make_executor",
+    "run_trials",
 ]
 
 
@@ -261,3 +262,50 @@ def make_executor(word: str, settings: WorkerSettings, *, parallel: int, recycle
     except Exception as error:  # code of the user
         raise blamed(f"the executor {word!r} cannot be made", error) from error
     return made
+
+
+# Trials of one caller, from the first to the last.
+
+_STOP_CHECK_INTERVAL_S = 0.5
+
+
+def run_trials(
+    executor: Executor,
+    specs: Sequence[TrialSpec],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    needed: Callable[[int], bool] = lambda _: True,
+    check_every_s: float = _STOP_CHECK_INTERVAL_S,
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yield the place among the specifications and the result of each trial, as the trials end.
+
+    Trials that have not ended when the caller stops asking are cancelled.
+
+    Args:
+        executor: runs the trials, and no others meanwhile.
+        specs: of the trials, in ascending order of their numbers.
+        stopped: called before each wait for results, so at least once; True ends the loop, and it may raise.
+        needed: whether the trial at a place is still needed, asked after each result. Where a trial is not, the trials
+            after it are not either.
+        check_every_s: the longest time between two calls of ``stopped``, in s of wall time.
+
+    Raises:
+        CrashhuntError: no trial can be run, for a reason that has nothing to do with it.
+    """
+    places = {spec.number: place for place, spec in enumerate(specs)}
+    try:
+        for spec in specs:
+            executor.submit(spec)
+        while places and not stopped():
+            for result in list(executor.completed(check_every_s)):
+                place = places.pop(result.spec.number, None)
+                if place is None:
+                    continue  # cancelled, here or by an earlier caller
+                yield place, result
+                needless = [number for number, other in places.items() if not needed(other)]
+                if needless:
+                    executor.cancel(above=min(needless) - 1)
+                    places = {number: other for number, other in places.items() if number < min(needless)}
+    finally:
+        if places:
+            executor.cancel()

@@ -86,7 +86,7 @@ def keep_near_misses(again: TrialReruns) -> tuple[Bundle, ...]:
             if now.was_killed_from_outside:
                 what = f"trial {now.spec.number}, a near miss, was {now.summary}"
                 again.notes.append(f"{what}: it has no bundle until the same command is run again")
-            elif (was.outcome, was.digest) == (now.outcome, now.digest):
+            elif was.is_identical_run(now):
                 one.write(was, confirmed=True)
             else:
                 again.failed.append(now)

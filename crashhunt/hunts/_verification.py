@@ -8,6 +8,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
@@ -15,7 +16,14 @@ from crashhunt.base.errors import BundleError, CrashhuntError, UntrustedError
 from crashhunt.base.temporary import remove_at_once, remove_scratch
 from crashhunt.crashes import is_bundle_made_here, is_snapshot_trusted, write_bundle
 from crashhunt.episode import WorkerSettings, scratch_of
-from crashhunt.executors import FreshProcessExecutor, PoolExecutor, SharedExecutors, read_map, snapshot_executor
+from crashhunt.executors import (
+    FreshProcessExecutor,
+    PoolExecutor,
+    SharedExecutors,
+    read_map,
+    run_trials,
+    snapshot_executor,
+)
 from crashhunt.hunts._next_trials import settings_again
 from crashhunt.hunts._reports import AuditReport, Difference
 from crashhunt.recording import Recording, first_divergence, read_black_box
@@ -109,7 +117,7 @@ class Confirmation:
 
 # Trials of a hunt that are run again in fresh processes, by the code that they ran with, for their recordings.
 
-_LOOK_EVERY_S = 0.1  # how late Ctrl-C may be
+_STOP_CHECK_S = 0.1  # how late Ctrl-C may be
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,13 +173,9 @@ class TrialReruns:
             try:
                 again = settings_again(self.settings, snapshot, scratch)
                 with closing(snapshot_executor(again, parallel=self.parallel)) as executor:
-                    waiting = len(group)
-                    for spec in group:
-                        executor.submit(spec)
-                    while waiting and not len(self.stops):
-                        for result in executor.completed(_LOOK_EVERY_S):
-                            waiting -= 1
-                            yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
+                    stopped = partial(bool, self.stops)
+                    for _, result in run_trials(executor, group, stopped=stopped, check_every_s=_STOP_CHECK_S):
+                        yield Again(result=result, runs=self, snapshot=digest, scratch=scratch, folder=folder)
             finally:
                 remove_scratch(scratch)
 
@@ -453,7 +457,7 @@ class Audit:
                 recorded=found.recorded,
                 replayed=found.replayed,
             )
-        if (was.outcome, was.digest) != (now.outcome, now.digest):
+        if not was.is_identical_run(now):
             return Difference(
                 trial=number,
                 step=now.steps,
@@ -532,7 +536,7 @@ def _finish(again: TrialReruns, numbers: Sequence[int]) -> tuple[AuditReport, li
             if now.was_killed_from_outside:
                 continue
             left.discard(now.spec.number)
-            if (was.outcome, was.digest) != (now.outcome, now.digest):
+            if not was.is_identical_run(now):
                 difference = Difference(
                     trial=now.spec.number,
                     step=None,

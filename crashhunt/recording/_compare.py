@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from crashhunt.recording._recording import Recording
     from crashhunt.recording.records._type import Difference
 
-__all__ = ["first_divergence", "values_around"]
+__all__ = ["first_divergence", "has_same_scenes", "values_around"]
 
 
 def first_divergence(recorded: Recording, replayed: Recording) -> Divergence | None:
@@ -80,3 +80,20 @@ def _differences(agents: tuple[AgentChannel, ...]) -> list[tuple[Difference, Age
     kinds = [(kind.per_agent, kind.difference) for kind in RECORD_TYPES.values() if kind.difference is not None]
     of_agents = [(difference, agent) for agent in agents for per_agent, difference in kinds if per_agent]
     return [*of_agents, *((difference, None) for per_agent, difference in kinds if not per_agent)]
+
+
+def has_same_scenes(recorded: Recording, rerun: Recording, step: int) -> bool:
+    """Return whether the scenes of a run are bit-identical to the recorded ones up to and including a step.
+
+    Where a change begins after this step, only such a run says something about the recorded trial. Observations and
+    actions are not compared: other versions may record them in another form.
+
+    Args:
+        recorded: the recording of the trial, which reaches the step.
+        rerun: the recording of the run.
+        step: the last step to compare.
+    """
+    return rerun.steps >= step and all(
+        recorded.scene(number).frame[1].tobytes() == rerun.scene(number).frame[1].tobytes()
+        for number in range(step + 1)
+    )

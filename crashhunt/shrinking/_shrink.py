@@ -11,7 +11,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.temporary import remove_at_once, temporary_folder
 from crashhunt.crashes import is_bundle_made_here, signature_of, write_bundle
 from crashhunt.episode import scratch_of
-from crashhunt.executors import FreshProcessExecutor, read_map
+from crashhunt.executors import read_map, run_alone
 from crashhunt.replays import ReplayOptions, confirm, prepare
 from crashhunt.shrinking._runs import Runs, is_same
 from crashhunt.shrinking._stages import Ended, Form, Search
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.replays import Rerun
-    from crashhunt.trial import TrialResult, TrialSpec, Value
+    from crashhunt.trial import TrialSpec, Value
 
 __all__ = ["Shrunk", "shrink", "shrunk_name"]
 
@@ -244,19 +244,13 @@ def _kept(small: Bundle) -> Bundle:
 def _run_fresh(rerun: Rerun, spec: TrialSpec) -> Bundle:
     bundle = rerun.bundle
     with temporary_folder("shrink") as scratch:
-        executor = FreshProcessExecutor(replace(rerun.worker, scratch=scratch))
-        try:
-            executor.submit(spec)
-            results: list[TrialResult] = []
-            while not results:
-                results = list(executor.completed(1.0))
-        finally:
-            executor.close()
-        if results[0].was_killed_from_outside:
-            raise CrashhuntError(f"a trial was {results[0].summary}", fix="run the same command again", where=bundle.id)
+        result = run_alone(replace(rerun.worker, scratch=scratch), spec)
+        assert result is not None  # it is never stopped
+        if result.was_killed_from_outside:
+            raise CrashhuntError(f"a trial was {result.summary}", fix="run the same command again", where=bundle.id)
         trial = scratch_of(scratch, spec.number)
         return write_bundle(
-            bundle.hunt, results[0], trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
+            bundle.hunt, result, trial, hunt_seed=bundle.hunt_seed, snapshot=bundle.snapshot,
             lanes=read_map(scratch, trial), name=shrunk_name(bundle.id), authenticate=is_bundle_made_here(bundle),
         )  # fmt: skip
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.shrinking._runs import OutOfTimeError, StoppedError
+from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part, Scripting, can_be_scripted
 from crashhunt.shrinking._search import fewest, plainest
 from crashhunt.trial import EVERYBODY, OF_AGENT
+from crashhunt.whatif import StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = ["CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "in_turn", "steps_of", "why_not"]
+__all__ = [
+    "CELLS", "HELD", "KINDS", "OF_AGENT", "Disturbance", "Kind", "Manoeuvre", "in_turn", "steps_of", "why_not",
+]  # fmt: skip
 
 _DIGITS = 9  # decimal places of a duration in s, so that three steps of 0.1 s are 0.3 s
 
@@ -75,6 +77,9 @@ HELD: Mapping[str, Kind] = {
     "gone": Kind("", "{vehicle} is taken off the road"),
 }
 """The holds of other vehicles for counterfactual runs: hunts never draw them, and each names its vehicle."""
+
+Manoeuvre = Literal["brake", "left", "right", "keep_lane", "keep_speed"]
+"""What an agent can be overruled with: it brakes, changes lanes to a side and brakes, or keeps its lane or speed."""
 
 OF_AGENT = frozenset(name for name, kind in KINDS.items() if kind.of_agent)
 """The types that affect the agent itself and need no support by the simulator."""

@@ -216,6 +216,10 @@ class TrialResult(Serializable):
         """The category of an outcome that an oracle has added; None for the outcomes that every hunt has."""
         return self.outcome.category if self.outcome.is_own else None
 
+    def is_identical_run(self, other: TrialResult) -> bool:
+        """Return whether two runs had the same outcome and bit-identical steps."""
+        return (self.outcome, self.digest) == (other.outcome, other.digest)
+
     @property
     def was_killed_from_outside(self) -> bool:
         """Whether processes of the trial were killed from outside in every attempt, so that its outcome is unknown."""

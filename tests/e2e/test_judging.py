@@ -9,10 +9,11 @@ import pytest
 
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of, with_judgement
 from crashhunt.errors import UsageError
-from crashhunt.replays import ReplayOptions, judge, prepare
-from crashhunt.replays._avoidability import Search
-from crashhunt.replays._causes import _Search
+from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
+from crashhunt.whatif import judge
+from crashhunt.whatif._avoidability import Search
+from crashhunt.whatif._causes import _Search
 
 HUNT = ("--scenario", "toy", "--arg", "speed=14", "--seed", "1")
 

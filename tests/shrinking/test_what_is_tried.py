@@ -10,10 +10,11 @@ from hypothesis import given, strategies as st
 
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.shrinking import _scripting, _stages, fewest, plainest
-from crashhunt.shrinking._runs import OutOfTimeError, StoppedError
+from crashhunt.shrinking._runs import OutOfTimeError
 from crashhunt.shrinking._scripting import Part
 from crashhunt.shrinking._stages import Search
 from crashhunt.trial import EVERYBODY, Disturbance, Escape, TrialSpec
+from crashhunt.whatif import StoppedError
 from crashhunt.world import Actor, Roster, Scene
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +17,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError
 from crashhunt.crashes import INTERRUPTED, Factor, LaneMap, LeftOut, Why, partner, signature_of_fault
 from crashhunt.plans import read_settings
-from crashhunt.recording import read_lanes
-from crashhunt.replays._prepare import StoppedError
+from crashhunt.recording import has_same_scenes, read_lanes
 from crashhunt.trial import Choice, Constant, Disturbance, Outcome, Overruled
+from crashhunt.whatif._reruns import StoppedError
 from crashhunt.world import first_contact
 
 if TYPE_CHECKING:
@@ -30,8 +29,9 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Without
     from crashhunt.recording import Recording
-    from crashhunt.replays._prepare import Ended, Rerun, Reruns
+    from crashhunt.replays import Rerun
     from crashhunt.trial import Distribution, TrialResult, TrialSpec, Value
+    from crashhunt.whatif._reruns import Ended, Reruns
     from crashhunt.world import Scene
 
 
@@ -275,7 +275,7 @@ class _Search:
         into = ""
         if asked.inside:
             step = int(given)
-            if recording is None or not self._alike(recording, step):
+            if recording is None or not has_same_scenes(self._recording, recording, step):
                 return LeftOut(given, "unclear")
             if asked.factor.kind == "other":
                 held = asked.runs[place][1].disturbances[-1]
@@ -296,17 +296,6 @@ class _Search:
         if was is None or now is None:
             return was is now and signature_of_fault(result) == signature_of_fault(self._result)
         return {was.collider, was.victim} == {now.collider, now.victim}
-
-    def _alike(self, recording: Recording, step: int) -> bool:
-        """Whether a run was bit-identical up to a step."""
-        return recording.steps >= step and all(
-            self._states[number] == recording.scene(number).frame[1].tobytes() for number in range(step + 1)
-        )
-
-    @cached_property
-    def _states(self) -> list[bytes]:
-        """The scene after each step, as raw bytes."""
-        return [scene.frame[1].tobytes() for scene in self._recording.scenes()]
 
     def _into(self, recording: Recording, held: str, step: int) -> str:
         """Return the actor into which a vehicle with held speed drove, except in the examined collision."""

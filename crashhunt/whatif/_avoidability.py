@@ -17,9 +17,10 @@ from crashhunt.crashes import (
     slowing,
     visible_from,
 )
-from crashhunt.replays._causes import find_why
-from crashhunt.replays._prepare import NotUnderstoodError, ReplayOptions, Reruns, StoppedError, prepare
+from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.trial import Outcome
+from crashhunt.whatif._causes import find_why
+from crashhunt.whatif._reruns import NotUnderstoodError, Reruns, StoppedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
     from crashhunt.base.watching import Watch
     from crashhunt.crashes import Bundle, Ending
     from crashhunt.recording import Recording
-    from crashhunt.replays._prepare import Ended, Rerun
+    from crashhunt.replays import Rerun
     from crashhunt.trial import TrialResult
+    from crashhunt.whatif._reruns import Ended
 
 
 __all__ = ["CannotError", "Search", "Tried", "judge"]
