@@ -225,7 +225,10 @@ class Nearness(Observer):
             named = self._simulator.named_danger
             danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
         driven = self._driven
-        return replace(result, closest=closest, danger=danger, driven_m=driven.driven_m, driven_s=driven.driven_s)
+        return replace(
+            result, closest=closest, danger=danger, driven_m=driven.driven_m, driven_s=driven.driven_s,
+            step_length_s=driven.step_length_s,
+        )  # fmt: skip
 
     def _take_in(self) -> None:
         frames = self._take_frames()

@@ -241,6 +241,7 @@ def _result(
         setup_steps=(header.setup_steps or None) if header is not None else None,
         driven_m=driven.driven_m,
         driven_s=driven.driven_s,
+        step_length_s=recording.prologue.step_length_s if recording is not None and scenes else None,
     )
     return in_effect(result, recording.disturbances if recording is not None else ())
 

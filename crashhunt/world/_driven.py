@@ -41,7 +41,7 @@ class DrivenMeter:
     """
 
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
-        self._dt = step_length_s
+        self.step_length_s = self._dt = step_length_s
         self._last: dict[str, float | None] = dict.fromkeys(agents)  # speed in the last scene; None where it was absent
         self._speeds, self._steps, self._seen = 0.0, 0, False
 

@@ -20,6 +20,7 @@ def test_ledger_has_the_distance_and_time_of_each_valid_trial(toy):
     found = results(toy.folder / "h")
     assert len(found) == 6
     for trial in found:
+        assert trial["step_length_s"] == 0.1
         assert trial["driven_s"] == pytest.approx(trial["steps"] * 0.1)
         assert 0 < trial["driven_m"] < 60 * trial["driven_s"]
 
