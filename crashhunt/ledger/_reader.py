@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import Shape
 
 
-__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn"]
+__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn", "UntilRate"]
 
 
 # The shapes of what a ledger says besides trials.

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from typing import Any
 
+    from crashhunt.ledger import UntilRate
     from crashhunt.trial import TrialResult
 
 __all__ = [
@@ -330,6 +331,10 @@ class BarWatch:
         if decided and self.sequence.invalid_share <= MAX_INVALID_SHARE:
             self.verdict = "below" if test.events < self.bar * test.exposure else "above"
             self.decided_at = unit[-1].number
+
+    def noted(self) -> UntilRate:
+        """Return what the ledger says of it."""
+        return {"bar": f"{self.bar!r}/{self.per}", "decided_at": self.decided_at, "verdict": self.verdict}
 
     def interval(self, *, running: bool = False) -> Interval | None:
         """Return the certain interval.

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from crashhunt.rates import CrashRate, Interval, RatePart
+    from crashhunt.rates import BarWatch, CrashRate, Interval, RatePart
 
-__all__ = ["describe_rates", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
+__all__ = ["describe_rates", "describe_watch", "format_interval", "format_rate", "rates_page", "write_rates_csv"]
 
 _PER = {"trial": "per trial", "hour": "per hour", "1000km": "per 1,000 km"}
 _REASONS = {
@@ -59,6 +59,16 @@ def format_interval(interval: Interval) -> str:
     return f"{least}at most {format_rate(interval.high)}"
 
 
+def describe_watch(watch: BarWatch) -> str:
+    """Return the running interval of a hunt with a bar, in a line."""
+    bar = f"bar {format_rate(watch.bar)} {_PER[watch.per]}: {watch.verdict}"
+    found = watch.interval(running=True)
+    if found is None:
+        return f"rate: not known yet; {bar}"
+    trials = f"{_count(watch.counter.crashes, 'crash', 'crashes')} in {_count(watch.counter.trials, 'trial', 'trials')}"
+    return f"rate: {format_interval(found)} {_PER[watch.per]} ({trials}); {bar}"
+
+
 def describe_rates(rates: Sequence[CrashRate]) -> str:
     """Return rates for people: the answer first, then what it rests on."""
     lines: list[str] = []
@@ -91,12 +101,14 @@ def _of_hunt(rates: list[CrashRate]) -> list[str]:
         each = [f"{count} {_REASONS[reason]}" for reason, count in first.excluded.items()]
         lines.append(f"  not counted: {', '.join(each)}")
     lines += [line for rate in rates for line in _part_lines(rate)]
-    lines += [
-        f"  {rate.verdict}: the bar is {format_rate(rate.bar)} {_PER[rate.per]}"
-        for rate in rates
-        if rate.bar is not None
-    ]
+    lines += [f"  {_verdict(rate.verdict, rate.bar)} {_PER[rate.per]}" for rate in rates if rate.bar is not None]
     return lines
+
+
+def _verdict(verdict: str, bar: float) -> str:
+    if verdict == "undecided":
+        return f"undecided: more trials are needed to compare with the bar of {format_rate(bar)}"
+    return f"certainly {verdict} the bar of {format_rate(bar)}"
 
 
 def _answer(rate: CrashRate | RatePart) -> str:

@@ -120,3 +120,62 @@ def test_disturbed_and_undisturbed_crashes_are_reported_apart(toy):
     assert sum(part["crashes"] for part in rate["parts"]) == rate["crashes"]
     (rate,) = rates(toy, "h", "--by", "disturbance")
     assert {part["name"] for part in rate["parts"]} <= {"undisturbed", "brake"}
+
+
+# --- run --until-rate
+
+
+def until(toy, folder, workers, trials, rate, *words, expect):
+    options = ("--until-rate", rate, "--json", *words)
+    return toy.crashhunt("run", folder, workers, trials, *HUNT, *options, expect=expect).json
+
+
+def test_hunt_ends_once_the_rate_is_certainly_below_or_above(toy):
+    calm = ("--arg", "speed=2", "--set", "gap_m=40")
+    done = toy.crashhunt("run", "calm", "2", "0", "20", "--scenario", "toy", *calm, "--until-rate", "0.1/trial")
+    assert "certainly below the bar of 0.10 per trial" in done.out
+    (rate,) = rates(toy, "calm", "--bar", "0.1/trial")
+    assert (rate["crashes"], rate["estimate"], rate["verdict"]) == (0, 0.0, "below")
+    assert rate["units"] * 0.1 < 3.6
+    found = until(toy, "wild", "2", "0", "0.001/trial", expect=1)
+    assert (found["stopped_because"], found["rate"]["verdict"]) == ("rate", "above")
+    assert found["rate"]["certain"]["low"] >= 0.001
+
+
+def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
+    found = until(toy, "h", "2", "0", "0.3/trial", "--most", "6", expect=3)
+    assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 6, "undecided")
+
+
+def test_workers_decide_at_the_same_trial(toy):
+    found = []
+    for workers in ("1", "3"):
+        until(toy, workers, workers, "0", "40/hour", expect=1)
+        found.append([{**rate, "dir": ""} for rate in rates(toy, workers, "--per", "hour")])
+    assert found[0] == found[1]
+    assert found[0][0]["crashes"] > 0
+
+
+def test_resumed_hunt_decides_as_one_that_was_never_interrupted(toy):
+    whole = until(toy, "whole", "1", "0", "0.02/trial", expect=1)["rate"]
+    first = until(toy, "parts", "2", "0", "0.02/trial", "--most", "1", expect=3)["rate"]
+    assert first["units"] == 1
+    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    trials = len(results(toy.folder / "parts"))
+    assert until(toy, "parts", "2", "0", "0.02/trial", expect=1)["rate"] == {**whole, "dir": "parts"}
+    assert len(results(toy.folder / "parts")) == trials  # decided before, so nothing runs
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--until-rate", "3/trial"), "--until-rate is 3/trial; give a rate above 0"),
+        (("--until-rate", "3/hour", "--sampler", "guided"), "leave --sampler guided out"),
+        (("--until-rate", "3/hour", "--seeds", "2"), "leave --seeds out"),
+        (("--until-rate", "3/hour", "--distinct", "2"), "leave --distinct out"),
+        (("--most", "9"), "--most is 9 without --until-rate"),
+    ],
+)
+def test_option_that_contradicts_a_bar_is_refused(toy, words, says):
+    done = toy.crashhunt("run", "h", "1", "5", *HUNT, *words, expect=2)
+    assert says in done.err

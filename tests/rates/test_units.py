@@ -69,9 +69,7 @@ def test_only_trials_of_the_plain_origin_count():
 
 
 def test_units_of_a_hunt_with_few_traffics_are_traffics():
-    rule = CountingRule(
-        max_steps=100, traffics=5, planned=42
-    )  # the last round is incomplete
+    rule = CountingRule(max_steps=100, traffics=5, planned=42)  # the last round is incomplete
     trials = [trial(number, crashed=number % 5 == 2) for number in range(42)]
     found = counted(trials, rule)
     assert (found.units, found.trials, found.crashes) == (5, 40, 8)
