@@ -32,7 +32,7 @@ from crashhunt.recording import (
 )
 from crashhunt.simulators import LeavesOut, NamesDanger, NamesObservations, PlaysPaths, TellsEvents
 from crashhunt.trial import Outcome
-from crashhunt.world import ApproachMeter, DangerMeter
+from crashhunt.world import ApproachMeter, DangerMeter, DrivenMeter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -172,7 +172,7 @@ _AT_ONCE = 2048  # scenes
 
 
 class Nearness(Observer):
-    """Measures the closest approach and the danger, and adds them to the result.
+    """Measures the closest approach, the criticality and the driven distance, and adds them to the result.
 
     Args:
         take_frames: returns the scenes since it was last called, such as `BlackBox.take_frames`: there they lie as
@@ -186,6 +186,7 @@ class Nearness(Observer):
         self._take_frames = take_frames
         self._meter = ApproachMeter(())
         self._dangers = DangerMeter((), 1.0)
+        self._driven = DrivenMeter((), 1.0)
         self._simulator: object = None
         self._waiting: list[Frame] = []  # for the closest approach, of which so many at a time cost least
 
@@ -201,6 +202,7 @@ class Nearness(Observer):
         self._meter = ApproachMeter(episode.names)
         self._simulator = episode.simulator
         self._dangers = DangerMeter(episode.names, episode.simulator.step_length_s)
+        self._driven = DrivenMeter(episode.names, episode.simulator.step_length_s)
 
     def scene(self, step: int, scene: Scene, rewards: tuple[float, ...]) -> None:
         """Take in what there is, now and then."""
@@ -210,7 +212,7 @@ class Nearness(Observer):
                 self._measure()
 
     def end(self, result: TrialResult) -> TrialResult:
-        """Add the closest approach and the danger."""
+        """Add the closest approach, the criticality and the driven distance."""
         closest = self.closest
         if result.collision is not None and "overlap" in result.collision.seen_by:
             closest = replace(closest, gap_m=0.0, time_to_collision_s=0.0)  # perhaps between two scenes
@@ -222,12 +224,17 @@ class Nearness(Observer):
         if danger is None and supports(self._simulator, NamesDanger):
             named = self._simulator.named_danger
             danger = None if named is None or math.isnan(named) else min(max(named, 0.0), 1.0)
-        return replace(result, closest=closest, danger=danger)
+        driven = self._driven
+        return replace(
+            result, closest=closest, danger=danger, driven_m=driven.driven_m, driven_s=driven.driven_s,
+            step_length_s=driven.step_length_s,
+        )  # fmt: skip
 
     def _take_in(self) -> None:
         frames = self._take_frames()
         self._waiting += frames
         self._dangers.add(frames)
+        self._driven.add(frames)
 
     def _measure(self) -> None:
         waiting, self._waiting = self._waiting, []

@@ -24,7 +24,8 @@ from crashhunt.hunts._retention import keep_near_misses, prune_bundles
 from crashhunt.hunts._state import HEARTBEAT_S, HuntDirectory, copies_to_come, draws_independently, ledger_owner
 from crashhunt.hunts._verification import Audit, AuditsLeft, Confirmation, TrialReruns, VerificationRuns
 from crashhunt.ledger import Ledger
-from crashhunt.plans import core_of, disturber, parallel_here, sampler_of
+from crashhunt.plans import core_of, disturber, parallel_here, rate_of, sampler_of
+from crashhunt.rates import BarWatch, CountingRule, make_rate
 from crashhunt.snapshots import Snapshot, SnapshotOptions, take_snapshot
 from crashhunt.trial import Outcome, TrialResult
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from crashhunt.executors import Executor
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.scenario import Scenario
 
@@ -139,6 +141,7 @@ class Hunt:
         progress.nearest = ledger.nearest_miss()
         before = ledger.facts()
         progress.resume(list_bundles(self.directory), settings.run, before)
+        progress.rate = _bar_watch(settings, ledger)
         lag, alike = self._lag(before), not finished or draws_independently(before, settings)
         worker_settings = settings_of_workers(settings, snapshot, self._place.scratch)
         self._audits_left = AuditsLeft(ledger, before, worker_settings)
@@ -160,6 +163,7 @@ class Hunt:
             copies=copies_to_come(settings),
             audits_left=self._audits_left.numbers or before.get("audits_left"),
             lag=lag if sampler.learns and settings.run.deterministic else None,
+            until_rate=None if progress.rate is None else progress.rate.noted(),
         )
         runs_again = TrialReruns(
             place=self._place,
@@ -191,7 +195,7 @@ class Hunt:
         copies = VerificationRuns(runs_again, self._disturber)
         self._copied = CopiedCrashes(copies, progress, trials)
         self._copied.resume()
-        stopped: StoppedBecause = "distinct" if settings.run.keep_going else "crash"
+        stopped: StoppedBecause = progress.why_stopped(keep_going=settings.run.keep_going)
         if not progress.is_done:
             stopped = self._hunt(runs_again, ledger, trials, snapshot, progress, finished, watch)
         prune_bundles(ledger, progress, settings.run)
@@ -208,7 +212,7 @@ class Hunt:
         # A suite and a rerun resume what was interrupted; otherwise crashes would stay unconfirmed for good.
         ledger.enter("interrupted" if self._stops else stopped, reason, **progress.noted())
         crashes = sorted(progress.crashes, key=lambda bundle: (bundle.result.steps, bundle.result.spec.number))
-        unanswered = 0 if stopped in ("crash", "distinct") else len(self._unanswered)
+        unanswered = 0 if stopped in ("crash", "distinct", "rate") else len(self._unanswered)
         return HuntReport(
             directory=self.directory,
             settings=settings,
@@ -229,6 +233,7 @@ class Hunt:
             branches=branches,
             copied=progress.ended_by_copy,
             unanswered=unanswered,
+            rate=_rate_of(self.directory, progress.rate, stopped),
         )
 
     def _hunt(
@@ -297,7 +302,7 @@ class Hunt:
                 watch(self._status(progress, "auditing"))
                 self._listen(executor, audit, ledger, progress, wait_s=_TICK_S)
             if progress.last_wanted is not None:
-                return "distinct" if run.keep_going else "crash"
+                return progress.why_stopped(keep_going=run.keep_going)
         except CrashhuntError as error:  # name the file that the user can correct
             mine, theirs = worker_settings.scenario.origin, self.scenario.origin
             if mine not in error.where:
@@ -362,6 +367,8 @@ class Hunt:
             return
         crashed = result.outcome in settings.crash_on
         progress.count(result, crashed=crashed)
+        if progress.rate is not None:
+            progress.rate.add(result)
         if crashed:
             if progress.kinds is not None:
                 self._save(result, ledger, snapshot, progress)
@@ -421,7 +428,32 @@ class Hunt:
             branched=progress.branched,
             not_fully_asked=progress.not_fully_asked,
             search=progress.searching.status(),
+            rate=progress.rate,
         )
+
+
+def _bar_watch(settings: HuntSettings, ledger: Ledger) -> BarWatch | None:
+    """Return what watches the rate, with the trials that ended in earlier runs; None where there is no bar."""
+    if not settings.run.until_rate:
+        return None
+    bar, per = rate_of(settings.run.until_rate)
+    rule = CountingRule(max_steps=settings.max_steps, agents=max(1, len(settings.agents)), planned=settings.trials)
+    watch = BarWatch(rule, bar, per, settings.crash_on)
+    for data in ledger.plain_results():
+        watch.add(data)
+    return watch
+
+
+def _rate_of(directory: Path, watch: BarWatch | None, stopped: StoppedBecause) -> CrashRate | None:
+    """Return the rate that a hunt with a bar ends with."""
+    if watch is None:
+        return None
+    why_not = "" if stopped in ("rate", "all_trials") else "the number of trials was not fixed ahead"
+    found = make_rate(
+        str(directory), watch.per, watch.counter, watch.sequence, confidence=100 * (1 - watch.alpha),
+        why_no_estimate=why_not, bar=watch.bar,
+    )  # fmt: skip
+    return replace(found, verdict=watch.verdict)
 
 
 def _under_way(parallel: int) -> int:

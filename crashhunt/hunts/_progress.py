@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
     from crashhunt.crashes import Bundle, Signature
     from crashhunt.executors import Executor, NodeFigures
-    from crashhunt.hunts._reports import AuditReport
+    from crashhunt.hunts._reports import AuditReport, StoppedBecause
     from crashhunt.ledger import Facts, Noted
     from crashhunt.plans import RunSettings
+    from crashhunt.rates import BarWatch
     from crashhunt.recording import BlackBoxHeader
     from crashhunt.trial import TrialResult
 
@@ -265,6 +266,7 @@ class HuntStatus:
         branched: how many branches of trials of this run have crashed.
         not_fully_asked: of how many trials of this run a question to their copies has no answer.
         search: which strategies have had trials in this run, and when the greatest danger grew.
+        rate: that is watched until it is certainly on one side of a bar; None where there is no bar.
     """
 
     phase: str
@@ -286,6 +288,7 @@ class HuntStatus:
     branched: int = 0
     not_fully_asked: int = 0
     search: SearchStatus = field(default_factory=SearchStatus)
+    rate: BarWatch | None = None
 
     @property
     def seconds_left(self) -> float:
@@ -325,6 +328,7 @@ class Progress:
     nodes: tuple[NodeFigures, ...] | None = None
     kinds: Kinds | None = None
     searching: Searching = field(default_factory=Searching)
+    rate: BarWatch | None = None
 
     def resume(self, crashes: list[Bundle], run: RunSettings, before: Facts) -> None:
         """Take in what was saved before."""
@@ -371,6 +375,8 @@ class Progress:
     @property
     def last_wanted(self) -> int | None:
         """The number of the trial with which the hunt has found what it is after; None where the hunt continues."""
+        if self.rate is not None and self.rate.decided_at is not None:
+            return self.rate.decided_at
         found = self.found.keys() | self.copied.keys()
         return min(found) if found else self.kinds.until if self.kinds is not None else None
 
@@ -382,7 +388,15 @@ class Progress:
     @property
     def is_done(self) -> bool:
         """Whether the hunt had found what it is after before it began."""
+        if self.rate is not None:
+            return self.rate.decided_at is not None
         return bool(self.crashes or self.copied) if self.kinds is None else self.kinds.until is not None
+
+    def why_stopped(self, *, keep_going: bool) -> StoppedBecause:
+        """Why a hunt stops that has found what it is after."""
+        if self.rate is not None:
+            return "rate"
+        return "distinct" if keep_going else "crash"
 
     @property
     def unsaved(self) -> TrialResult | None:
@@ -416,7 +430,8 @@ class Progress:
         failed = self.failed_steps + sum(result.steps + result.other_steps for result in self.failed)
         in_vain: Noted = {"failed_steps": failed} if failed else {}
         audits: Noted = {} if self.audit is None else {"audits_left": self.audits_left or None}
-        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain}
+        bar: Noted = {} if self.rate is None else {"until_rate": self.rate.noted()}
+        return {"heartbeat": time.time(), **audits, **nodes, **kinds, **in_vain, **bar}
 
     def about_kinds(self) -> tuple[tuple[Group, ...] | None, float | None, int | None]:
         """Return the last three of `HuntStatus`."""

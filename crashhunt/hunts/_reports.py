@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle, Group
     from crashhunt.ledger import KindData
     from crashhunt.plans import HuntSettings
+    from crashhunt.rates import CrashRate
     from crashhunt.trial import Disturbance
 
 __all__ = [
@@ -179,7 +180,7 @@ def kind_data(group: Group) -> KindData:
     }
 
 
-StoppedBecause = Literal["crash", "distinct", "all_trials", "interrupted", "no_valid_trial", "time"]
+StoppedBecause = Literal["crash", "distinct", "rate", "all_trials", "interrupted", "no_valid_trial", "time"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +207,7 @@ class HuntReport:
         branches: the result of the branches; None without ``--branch``.
         copied: the crash of a copy that ended the hunt. It was confirmed by a run from the start.
         unanswered: number of trials that the same command runs again, because they or their copies were killed.
+        rate: the rate, compared with the bar of ``until_rate``; None where there is no bar.
     """
 
     directory: Path
@@ -227,6 +229,7 @@ class HuntReport:
     branches: BranchReport | None = None
     copied: Bundle | None = None
     unanswered: int = 0
+    rate: CrashRate | None = None
 
     def to_json(self) -> JsonObject:
         """Return the shape that ``run --json`` prints."""
@@ -257,4 +260,6 @@ class HuntReport:
             found["at_fault"] = list(self.at_fault)
         if self.copied is not None:
             found["copied"] = str(self.copied.path)
+        if self.rate is not None:
+            found["rate"] = self.rate.to_json()
         return found

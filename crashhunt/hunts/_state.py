@@ -174,7 +174,7 @@ HEARTBEAT_S = 1.0  # every so often a hunt says in its ledger that it is alive
 _SILENCE_S = 60.0  # without a heartbeat, the owner on another machine counts as dead
 _ENDED: dict[str, State] = {
     "crash": "crashed", "distinct": "crashed", "all_trials": "finished", "no_valid_trial": "error",
-    "interrupted": "interrupted", "time": "finished", "error": "error", "queued": "queued",
+    "rate": "finished", "interrupted": "interrupted", "time": "finished", "error": "error", "queued": "queued",
 }  # fmt: skip
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crashhunt.ledger._schema import Shape
 
 
-__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn"]
+__all__ = ["Facts", "KindData", "LedgerReader", "Noted", "Owner", "Seal", "Turn", "UntilRate"]
 
 
 # The shapes of what a ledger says besides trials.
@@ -44,6 +44,14 @@ class Owner(TypedDict):
     host: str
     pid: int
     started: int
+
+
+class UntilRate(TypedDict):
+    """Where a hunt with ``--until-rate`` stands; ``decided_at`` is the number of a trial, or None."""
+
+    bar: str
+    decided_at: int | None
+    verdict: str
 
 
 class Noted(TypedDict, total=False):
@@ -71,6 +79,8 @@ class Noted(TypedDict, total=False):
         newest_kind: when the last new one came, in s since the epoch; None if none or unknown.
         audits_left: the trials that were to be run again for the audit, and have not been; None where there is none.
         failed_steps: how many steps were simulated to confirm something that was not confirmed.
+        until_rate: ``bar``, as it was given, ``decided_at``, the number of the trial that decided, and ``verdict``;
+            None where the hunt has no bar.
     """
 
     owner: Owner | None
@@ -94,6 +104,7 @@ class Noted(TypedDict, total=False):
     audits_left: list[int] | None
     failed_steps: int
     dropped: dict[str, list[int]]
+    until_rate: UntilRate | None
 
 
 class Facts(Noted, total=False):

@@ -23,9 +23,11 @@ __all__ = [
     "at_least",
     "check_duration",
     "check_probe",
+    "check_rate",
     "declared",
     "declared_options",
     "option",
+    "rate_of",
     "seconds_of",
     "within",
 ]
@@ -242,3 +244,37 @@ def check_probe(text: str) -> str:
     if check_duration(text):
         return "give a time above 0, such as 4s, or leave it out"
     return "" if not text or sys.platform == "linux" else "leave it out: processes are copied on Linux only"
+
+
+# ``--until-rate RATE/UNIT`` and ``--bar RATE/UNIT``: how often an agent may crash.
+
+RatePer = Literal["trial", "hour", "1000km"]
+_RATE = re.compile(r"(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)\s*/\s*(trial|hour|1000\s?km)")
+
+
+def rate_of(text: str) -> tuple[float, RatePer]:
+    """Return the rate and what it is per, of ``1e-3/trial``, ``2/hour`` or ``5/1000km``.
+
+    >>> rate_of("2/hour")
+    (2.0, 'hour')
+
+    Raises:
+        ValueError: the text is no such rate, or the rate is not above 0, or not below 1 per trial.
+    """
+    found = _RATE.fullmatch(text.strip())
+    if found is None:
+        raise ValueError(f"{text!r} is no rate")
+    value, per = float(found[1]), cast(RatePer, found[2].replace(" ", ""))
+    if not 0 < value < (1 if per == "trial" else math.inf):
+        raise ValueError(f"{text!r} is out of range")
+    return value, per
+
+
+def check_rate(text: str) -> str:
+    """Return what to give instead of a text that is no rate; empty where it is one, or empty."""
+    try:
+        if text:
+            rate_of(text)
+    except ValueError:
+        return "give a rate above 0, such as 1e-3/trial (below 1), 2/hour or 5/1000km"
+    return ""

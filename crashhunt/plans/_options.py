@@ -22,6 +22,7 @@ from crashhunt.plans._declaration import (
     at_least,
     check_duration,
     check_probe,
+    check_rate,
     declared,
     declared_options,
     option,
@@ -174,6 +175,18 @@ class RunOptions(_Options):
         "them; 0: never stop for that",
         flag="--distinct", metavar="N", check=at_least(0, zero="never"),
     )  # fmt: skip
+    until_rate: str = option(
+        "", "a rate, such as ``1e-3/trial``, ``2/hour`` or ``5/1000km``: end once the agent certainly crashes less, or "
+        "more, often",
+        help="end once the agent certainly crashes less, or more, often than this, such as 1e-3/trial, 2/hour or "
+        "5/1000km; collects all crashes, and TRIALS may be 0; exit code 0: below, 1: above, 3: undecided",
+        unset="run all trials", flag="--until-rate", metavar="RATE", check=check_rate,
+    )  # fmt: skip
+    most: int = option(
+        0, "with ``until_rate``, how many trials it has at most; 0: as many as TRIALS says",
+        help="with --until-rate: run N trials at most; 0: as many as TRIALS says",
+        flag="--most", metavar="N", check=at_least(0, zero="as many as TRIALS says"),
+    )  # fmt: skip
     keep: int = option(
         0, "number of bundles to keep of each crash type, those of the shortest crashes; 0: all",
         help="keep only the N shortest bundles of each crash type; the ledger keeps all crashes. Requires "
@@ -243,10 +256,15 @@ class RunOptions(_Options):
             UsageError: one is none.
         """
         found = super().checked()
-        if found.keep and not (found.keep_going or found.distinct or found.only_at_fault):
+        if found.most and not found.until_rate:
+            raise UsageError(f"--most is {found.most} without --until-rate", fix="give TRIALS, or --until-rate as well")
+        if found.until_rate and (found.distinct or found.only_at_fault):
+            other = "--distinct" if found.distinct else "--only-at-fault"
+            raise UsageError(f"--until-rate and {other} both end a hunt", fix=f"leave {other} out")
+        if found.keep and not (found.keep_going or found.distinct or found.only_at_fault or found.until_rate):
             message = f"--keep {found.keep} requires a hunt that continues after a crash"
             raise UsageError(message, fix="give --keep-going or --distinct as well")
-        return replace(found, keep_going=True) if found.distinct else found
+        return replace(found, keep_going=True) if found.distinct or found.until_rate else found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -137,10 +137,18 @@ class Request(TrialOptions, Subject):
                 raise UsageError(f"{name} is {value!r}", fix="give a whole number")
             if fix := check(value):
                 raise UsageError(f"{name} is {value}", fix=fix)
-        if not self.trials and not self.run.duration:
+        if not self.trials and not self.run.duration and not self.run.until_rate:
             raise UsageError("TRIALS is 0", fix="give at least 1, or 0 (no limit) and a time with --for")
         checked = super().checked()
-        return replace(checked, run=self.run.checked())
+        run = self.run.checked()
+        if run.until_rate and (checked.sampler != "random" or checked.seeds):
+            option = "--seeds" if checked.seeds else f"--sampler {checked.sampler}"
+            raise UsageError(
+                f"--until-rate needs trials that are drawn independently, and {option} does not draw them so",
+                fix=f"leave {option} out",
+            )
+        limits = [limit for limit in (self.trials, run.most) if limit]
+        return replace(checked, run=run, trials=min(limits, default=0))
 
 
 def request_of(asked: HuntOptions, *, trials: int, max_steps: int, parallel: int = 1) -> Request:

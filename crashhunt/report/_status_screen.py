@@ -14,6 +14,7 @@ from rich.text import Text
 
 from crashhunt.base.text import one_line
 from crashhunt.recording import Phase
+from crashhunt.report._rate import describe_watch
 from crashhunt.trial import Outcome, without_folder
 
 if TYPE_CHECKING:
@@ -90,6 +91,8 @@ class Watcher:
         if status.disturbed is not None and status.crashes:
             outcomes += Text(f"   {_disturbed(status)}")
         rows.append(outcomes or Text("no trial has finished", style="dim"))
+        if status.rate is not None:
+            rows.append(Text(describe_watch(status.rate), no_wrap=True, overflow="ellipsis"))
         if status.kinds:
             kinds = Text(f"{describe_kinds(status)}: ", no_wrap=True, overflow="ellipsis")
             each = "; ".join(f"{kind.count} {kind.signature}" for kind in status.kinds)
@@ -230,6 +233,8 @@ def _line(status: HuntStatus) -> str:
         line += f"; {describe_kinds(status)}"
     if status.phase == "hunting" and status.nodes is not None:
         line += f"; connected nodes: {len(status.nodes)}" if status.nodes else "; no node is connected"
+    if status.rate is not None:
+        line += f"; {describe_watch(status.rate)}"
     return line
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import in_lines
+from crashhunt.report._rate import describe_rates
 from crashhunt.report._status_screen import format_arguments, format_seconds
 from crashhunt.report._words import (
     by_likelihood,
@@ -100,6 +101,8 @@ def describe_hunt(report: HuntReport, program: str = "crashhunt") -> str:
     if report.stopped_because == "distinct":
         found, wanted = len(report.kinds or ()), report.settings.run.distinct
         lines.append(f"Found {found} crash types (--distinct {wanted}).")
+    if report.rate is not None:
+        lines += describe_rates([report.rate]).splitlines()
     if report.copied is not None:
         number = report.copied.result.spec.number
         lines.append(f"Trial {number} did not crash, but a copy of it did. The crash reproduces from the start.")

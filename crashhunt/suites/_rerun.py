@@ -206,7 +206,7 @@ def _replace_invalid(hunt: Path, state: HuntState) -> int:
         return 0
     with closing(Ledger(hunt / layout.LEDGER, writable=True)) as ledger:
         # With --only-at-fault, crashes of others' and their kinds are not what it was after.
-        if ledger.facts().get("state") in ("crash", "distinct") or (done and not run.only_at_fault):
+        if ledger.facts().get("state") in ("crash", "distinct", "rate") or (done and not run.only_at_fault):
             return 0
         return ledger.replace([result.spec.number for result in ledger.results(outcomes=(str(Outcome.INVALID),))])
 

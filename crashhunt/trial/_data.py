@@ -49,7 +49,9 @@ def check_plain(data: JsonObject) -> None:
     typed(data.get("events") or {}, dict.fromkeys(data.get("events") or (), int))
     for planned in (data.get("disturbances"), spec.get("disturbances")):
         check_disturbances(planned)
-    typed_where_there(data, dict.fromkeys(("log_likelihood", "danger"), float | None))
+    typed_where_there(
+        data, dict.fromkeys(("log_likelihood", "danger", "driven_m", "driven_s", "step_length_s"), float | None)
+    )
     typed_where_there(data, {"setup_steps": int | None})
     parts = (data.get("collision"), data.get("failure"), data.get("escape"), data.get("event"))
     check_parts(data.get("closest", {}), *parts)

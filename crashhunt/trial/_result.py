@@ -174,6 +174,9 @@ class TrialResult(Serializable):
         branches: The results of branches; None if there were none.
         setup_steps: Number of steps before the first step, such as a warm-up of traffic; None if they were not counted.
             If trials share a warm-up, the first of them counts it.
+        driven_m: Distance that the agents drove after the warm-up, all together, in m; None if it is not known.
+        driven_s: Time that the agents drove, all together, in s of simulation time; None if it is not known.
+        step_length_s: Step length of the simulator, in s; None if it is not known.
     """
 
     spec: TrialSpec
@@ -198,11 +201,15 @@ class TrialResult(Serializable):
     branches: Branches | None = field(default=None, metadata=OMIT_DEFAULT)
     setup_steps: int | None = field(default=None, metadata=OMIT_DEFAULT)
     why_no_escape: str = field(default="", metadata=OMIT_DEFAULT)
+    driven_m: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    driven_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
+    step_length_s: float | None = field(default=None, metadata={**OMIT_DEFAULT, **null_is(None)})
 
     json_keys = (
         "steps", "sim_time_s", "digest", "wall_s", "setup_s", "worker", "kept", "outcome", "category?", "spec",
         "closest", "collision", "failure", "escape", "event", "events", "disturbances", "log_likelihood", "danger",
-        "stress", "branches", "setup_steps", "why_no_escape",
+        "stress", "branches", "setup_steps", "why_no_escape", "driven_m", "driven_s",
+        "step_length_s",
     )  # fmt: skip
 
     @classmethod
