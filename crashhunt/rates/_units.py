@@ -89,15 +89,15 @@ Unit: TypeAlias = tuple[TrialFacts, ...]
 def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
     """Return what a rate needs to know of a result."""
     return TrialFacts(
-        result.spec.number,
-        not result.was_killed_from_outside,
-        result.outcome is not Outcome.INVALID,
-        result.outcome in crash_on,
-        result.steps,
-        result.driven_s,
-        result.driven_m,
-        result.step_length_s,
-        result.spec.origin,
+        number=result.spec.number,
+        has_ended=not result.was_killed_from_outside,
+        valid=result.outcome is not Outcome.INVALID,
+        crashed=result.outcome in crash_on,
+        steps=result.steps,
+        driven_s=result.driven_s,
+        driven_m=result.driven_m,
+        step_length_s=result.step_length_s,
+        origin=result.spec.origin,
     )
 
 
@@ -105,16 +105,16 @@ def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple
     """Return the same of a trial as a ledger has it."""
     spec, failure = data["spec"], data.get("failure") or {}
     return TrialFacts(
-        spec["number"],
-        failure.get("kind") != KILLED,
-        data["outcome"] != Outcome.INVALID,
-        data["outcome"] in crash_on,
-        data["steps"],
-        data.get("driven_s"),
-        data.get("driven_m"),
-        data.get("step_length_s"),
-        spec.get("origin", ""),
-        tags,
+        number=spec["number"],
+        has_ended=failure.get("kind") != KILLED,
+        valid=data["outcome"] != Outcome.INVALID,
+        crashed=data["outcome"] in crash_on,
+        steps=data["steps"],
+        driven_s=data.get("driven_s"),
+        driven_m=data.get("driven_m"),
+        step_length_s=data.get("step_length_s"),
+        origin=spec.get("origin", ""),
+        tags=tags,
     )
 
 

@@ -38,7 +38,7 @@ def crash(tmp_path_factory):
     (directory / layout.HUNT).write_text("# how it was asked\n")
     code = b"x = 1\n"
     files = {"code/agent.py": described(code)}
-    digest = digest_of_described(files, says=[["code"], {}])
+    digest = digest_of_described(files, plain_data=[["code"], {}])
     snapshot = directory / layout.SNAPSHOTS / digest
     (snapshot / "code").mkdir(parents=True)
     (snapshot / "code" / "agent.py").write_bytes(code)

@@ -88,7 +88,7 @@ def rewrite_snapshot(snapshot, *, keep_name=False):
         manifest["files"][name] = describe_files((snapshot / name).parent)[Path(name).name]
     manifest["described"] = {name: describe_files(snapshot)[name] for name in manifest["described"]}
     (snapshot / "manifest.json").write_text(json.dumps({**manifest, "integrity": digest_of_data(manifest)}))
-    digest = digest_of_described(manifest["files"], says=[manifest["paths"], manifest["argument_files"]])
+    digest = digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"]])
     if not keep_name:
         snapshot.rename(snapshot.with_name(digest))
     return digest
